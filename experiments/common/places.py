@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
-__all__ = ["ANATOMIES", "CONF", "EXPERIMENTS", "GATE_RECORDS"]
+__all__ = ["ANATOMIES", "CHECKOUT", "CONF", "EXPERIMENTS", "GATE_RECORDS"]
 
 _PACKAGE = Path(__file__).resolve().parent.parent
+
+CHECKOUT = _PACKAGE.parent
+"""Where ``examples`` and ``results`` lie in a checkout; an installation has neither."""
 
 CONF = next(
     (place for place in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if place.is_dir()),
@@ -18,5 +21,5 @@ EXPERIMENTS = CONF / "experiment"
 ANATOMIES = tuple(sorted({path.stem for path in (CONF / "valve").glob("*.yaml")} - {"folder"}))
 """The anatomies that ship; ``folder`` is whatever a case folder holds."""
 
-GATE_RECORDS = _PACKAGE.parent / "results" / "records" / "gate.jsonl"
+GATE_RECORDS = CHECKOUT / "results" / "records" / "gate.jsonl"
 """Kept records of the gate in a checkout; an installation has none."""

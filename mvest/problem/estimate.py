@@ -48,7 +48,7 @@ class StudyResult:
     ----------
     parameters : tuple of str, (p,)
     tissue : mapping
-        Region -> fixed ratios.
+        Region -> fixed ratios; empty for a model that knows none.
     observation : Observed or None
         None if it could not be simulated.
     filtered : Estimate or None
@@ -139,14 +139,14 @@ class StudyResult:
 
     @property
     def moduli(self) -> tuple[Modulus, ...]:
-        """All moduli that follow from the estimated E_f through the fixed ratios."""
+        """All moduli that follow from the estimated E_f through the fixed ratios of the tissue."""
         if self.estimate is None or self.std is None:
             return ()
         truth = None if self.truth is None else self.truth.values
         moduli = []
         for k, parameter in enumerate(self.parameters):
             kind, _, region = parameter.partition(".")
-            if kind != "E_f":
+            if kind != "E_f" or region not in self.tissue:
                 continue
             unit = self.tissue[region].material(1.0)
             for name, factor in (("E_f", 1.0), ("E_perp", unit.E_p), ("G", unit.G)):

@@ -1,4 +1,4 @@
-"""One's own program from configuration to an estimate, and what is said where it cannot be."""
+"""One's own program, or functions of a file, from configuration to an estimate."""
 
 import sys
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from experiments.common.records.record import read_record
-from experiments.studies.external.findings import Findings
+from experiments.common.study import Job
+from experiments.studies.external import STUDY, ExternalSettings, ModelSettings, Settings
 from mvest.external import write_points
+from tests.experiments.configured import composed, plain
 from tests.external.programs import SPRINGS, springs
 
 M = np.array([0.8, 2.5])
@@ -46,38 +48,43 @@ def run(run, tmp_path):
 def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     status, out, err = run()
     assert status == 0, err
-    record = read_record(tmp_path / "here" / "result.json", Findings)
+    record = read_record(tmp_path / "here" / "result.json")
+    (found,) = record.estimates
     # Data without noise; the prior's weight is that of 0.01 mm against 3 N/mm, about 1e-3.
-    np.testing.assert_allclose(record.findings.estimate, M, rtol=2e-3)
+    np.testing.assert_allclose([one.estimate for one in found.unknowns], M, rtol=2e-3)
     # The covariance of least squares, from the derivatives by hand.
     _, H = springs(*M)
-    np.testing.assert_allclose(
-        record.findings.std, NOISE * np.sqrt(np.diagonal(np.linalg.inv(H.T @ H))), rtol=0.02
-    )
-    program = record.findings.program
-    assert program.runs == 5 * record.forward_solves
-    assert not program.own_jacobian
+    expected = NOISE * np.sqrt(np.diagonal(np.linalg.inv(H.T @ H)))
+    np.testing.assert_allclose([one.std for one in found.unknowns], expected, rtol=0.02)
+    rows = record.table_of().rows
+    assert [row["unit"] for row in rows] == ["N/mm", "N/mm"]
+    runs = rows[0]["runs"]
+    assert runs == 5 * record.forward_solves
+    assert rows[0]["own derivatives"] is False
+    # Two points that are predicted as they were observed, but for the prior.
+    assert 0 < found.distance_mm.mean < NOISE
+    assert found.innovation.nis_band[0] < found.innovation.nis_band[1]
     names = {path.name for path in (tmp_path / "here").iterdir()}
-    assert {"external.csv", "external.md", "external_iterates.png", "fitted.csv", "done"} <= names
+    assert {"external.csv", "external.md", "external.png", "fitted.csv", "done"} <= names
     assert "N/mm" in out
-    assert "differences of its predictions" in out
     # The runs are kept: the same study again starts no program.
     status, out, err = run()
-    record = read_record(tmp_path / "here" / "result.json", Findings)
-    assert (status, record.findings.program.runs) == (0, 0)
-    assert record.findings.program.reused == program.runs
+    record = read_record(tmp_path / "here" / "result.json")
+    (row, _) = record.table_of().rows
+    assert (status, row["runs"], row["served again"]) == (0, 0, runs)
 
 
 def test_a_program_that_was_edited_is_run_again(run, tmp_path):
     run()
-    first = read_record(tmp_path / "here" / "result.json", Findings)
+    first = read_record(tmp_path / "here" / "result.json")
     # Twice as stiff springs: half the moduli explain what is observed.
     source = (tmp_path / "solve.py").read_text().replace("(p[", "(2 * p[")
     (tmp_path / "solve.py").write_text(source)
     assert run()[0] == 0
-    second = read_record(tmp_path / "here" / "result.json", Findings)
-    np.testing.assert_allclose(second.findings.estimate, M / 2, rtol=2e-3)
-    assert second.findings.program.reused == 0
+    second = read_record(tmp_path / "here" / "result.json")
+    found = [one.estimate for one in second.estimates[0].unknowns]
+    np.testing.assert_allclose(found, M / 2, rtol=2e-3)
+    assert second.table_of().rows[0]["served again"] == 0
     assert second.provenance.config_hash != first.provenance.config_hash
 
 
@@ -100,10 +107,10 @@ def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
     (tmp_path / "solve.py").write_text("import sys; sys.exit('out of licences')")
     status, _, err = run()
     assert status == 1
-    record = read_record(tmp_path / "here" / "result.json", Findings)
+    record = read_record(tmp_path / "here" / "result.json")
     assert record.status == "failed"
     assert "out of licences" in record.detail
-    assert record.findings.estimate is None
+    assert [row["estimate"] for row in record.table_of().rows] == [None, None]
     assert "out of licences" in err
     status, _, err = run(check="true")
     assert status == 2
@@ -134,3 +141,91 @@ def test_a_wrong_request_is_told_in_one_line(run, without, changed, message):
     assert status == 2
     assert message in err
     assert len(err.strip().splitlines()) == 1
+
+
+MODELS = """
+import numpy as np
+from mvest import Prediction
+
+t = np.arange(1.0, 7.0)
+
+
+def straight(slope):
+    return lambda m: Prediction(slope * t * m[0], slope * t[:, None])
+"""
+
+
+def test_several_models_estimate_from_what_one_of_them_predicts(tmp_path):
+    (tmp_path / "models.py").write_text(MODELS)
+    values = plain(composed("experiment=external", "parameters=[k]", "filter.initial=[2.0]"))
+    values["truth"]["values"] = [3.0]
+    straight = f"{tmp_path}/models.py:straight"
+    about = ExternalSettings(
+        models={
+            "one": ModelSettings(python=straight),
+            "other": ModelSettings(python=straight, settings={"slope": 2.0}),
+        },
+        settings={"slope": 1.0},
+        data=("one",),
+        prior_std=(3.0,),
+        noise_mm=0.01,
+    )
+    result = STUDY.run(Job(values, Settings(external=about), tmp_path))
+    (one,), (other,) = (record.unknowns for record in result.estimates)
+    # Errors of 0.01 mm, seen.
+    assert one.estimate != 3.0
+    assert one.estimate == pytest.approx(3.0, abs=4 * one.std)
+    assert one.truth == 3.0
+    assert other.estimate == pytest.approx(one.estimate / 2, rel=1e-4)
+    rows = result.tables[""].rows
+    assert rows[1]["apart"] == pytest.approx(-0.5, rel=1e-4)
+    assert "runs" not in rows[1]
+
+
+@pytest.mark.parametrize(
+    ("python", "message"), [("absent.py:f", "no such file"), ("models.py:f", "'f'")]
+)
+def test_a_function_that_is_not_there_is_told(run, tmp_path, python, message):
+    (tmp_path / "models.py").write_text(MODELS)
+    status, _, err = run("command", **{"external.python": python})
+    assert status == 2
+    assert message in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_the_sheet_is_estimated_by_two_codes(run, tmp_path):
+    pytest.importorskip("skfem")
+    status, _, err = run(
+        "command",
+        *("parameters", "external.prior_std", "external.units", "external.observation"),
+        **{
+            "experiment": "models",
+            "external.settings": "{cells: [2,1], layers: 1, observed: [2,3], load_steps: 1}",
+            "external.noise_mm": "0.001",
+            "external.data": "[scikit-fem]",
+            "filter.initial": "[3.5,2.0]",
+        },
+    )
+    assert status == 0, err
+    record = read_record(tmp_path / "here" / "result.json")
+    own, second, other, program, alone = record.estimates
+    assert all(one.converged for one in record.estimates)
+    # The data's own code finds the truth, to its standard deviations; errors of 1 µm are seen.
+    for unknown in second.unknowns:
+        assert unknown.estimate != unknown.truth
+        assert abs(unknown.estimate - unknown.truth) < 4 * unknown.std
+    assert [k.estimate for k in own.unknowns] == pytest.approx([4.0, 1.5], rel=0.01)
+
+    def apart(one):
+        pairs = zip(one.unknowns, second.unknowns, strict=True)
+        return max(abs(k.estimate / known.estimate - 1) for k, known in pairs)
+
+    # A program is the library behind files (another process may add up in another order), and its
+    # differences are derivatives. Another law is another model.
+    assert apart(program) < 1e-12
+    assert apart(alone) < 1e-3
+    assert apart(other) > 0.03
+    rows = {row["model"]: row for row in record.table_of().rows}
+    assert rows["scikit-fem as a program"]["runs"] == program.forward_solves
+    assert rows["the same, by differences"]["runs"] == 5 * alone.forward_solves
+    assert rows["scikit-fem"]["apart"] == 0.0

@@ -1,15 +1,34 @@
 """Two finite-element codes that share nothing but the problem, and the filters that use them."""
 
+import importlib.util
+import sys
+
 import numpy as np
 import pytest
 
-from experiments.studies.models.sheet.own import OwnSheet
-from experiments.studies.models.sheet.second import LAWS, SecondSheet
-from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
+from mvest.external import RunRequest, read_answer, write_request
+from mvest.external.differences import Differences
+from mvest.external.model import ProcessModel
+from mvest.external.process import Command
+from tests.places import ROOT
 
 pytest.importorskip("skfem")
+
+FILE = ROOT / "examples" / "sheet.py"
+
+
+def _imported():
+    spec = importlib.util.spec_from_file_location("example_sheet", FILE)
+    module = sys.modules["example_sheet"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+EXAMPLE = _imported()
+LAWS, PARAMETERS = EXAMPLE.LAWS, EXAMPLE.PARAMETERS
+OwnSheet, SecondSheet, Sheet = EXAMPLE.OwnSheet, EXAMPLE.SecondSheet, EXAMPLE.Sheet
 
 TINY = Sheet(cells=(2, 2), observed=(4, 3), load_steps=2)
 M = np.array([4.0, 1.5])
@@ -136,3 +155,47 @@ def test_an_inadmissible_sheet_is_refused(change):
         Sheet(**change)
     with pytest.raises(ConfigurationError, match="st_venant_kirchhoff"):
         SecondSheet(TINY, "hooke")
+
+
+def sheet_program(folder, **settings):
+    """The tiny sheet as a program."""
+    return ProcessModel(
+        Command((sys.executable, str(FILE), "{request}", "{folder}"), {}, 60.0),
+        folder,
+        PARAMETERS,
+        len(TINY.points),
+        units=("MPa", "MPa"),
+        settings={"cells": [2, 2], "observed": [4, 3], "load_steps": 2, **settings},
+        differences=Differences("central", 1e-3, processes=2),
+        reuse=False,
+    )
+
+
+def test_the_program_predicts_what_the_library_predicts(tmp_path):
+    expected = SecondSheet(TINY)(M)
+    program = sheet_program(tmp_path)
+    answer = program(M)
+    assert answer.converged, answer.reason
+    # Another process may add up in another order; files that lose digits would show at 1e-7.
+    np.testing.assert_allclose(answer.y, expected.y, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(answer.jacobian, expected.jacobian, rtol=1e-10, atol=1e-12)
+    alone = sheet_program(tmp_path, derivatives=False)
+    found = alone(M)
+    assert (program.runs, alone.runs) == (1, 5)
+    # Central differences of a relative step s err by about s^2.
+    size = np.abs(expected.jacobian).max()
+    np.testing.assert_allclose(found.jacobian, expected.jacobian, atol=1e-5 * size)
+
+
+def test_what_the_program_is_asked_wrongly_it_says(tmp_path, capsys):
+    assert EXAMPLE.main(["request.json"]) == 2
+    assert EXAMPLE.main([str(tmp_path / "absent.json"), str(tmp_path)]) == 2
+    assert "absent.json is missing" in capsys.readouterr().err
+
+
+def test_the_program_passes_on_a_failure(tmp_path):
+    settings = {"length": 24.0, "cells": [2, 2], "observed": [2, 3], "law": "biot"}
+    request = RunRequest(PARAMETERS, ("MPa", "MPa"), (-1.0, 1.0), 6, settings=settings)
+    write_request(tmp_path, request)
+    assert EXAMPLE.main([str(tmp_path / "request.json"), str(tmp_path)]) == 0
+    assert "expected positive moduli" in read_answer(tmp_path, request).reason

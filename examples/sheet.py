@@ -1,4 +1,18 @@
-r"""The sheet in scikit-fem: an independent library as a model of the same filters.
+r"""One thin sheet in two finite-element codes: a model of one's own for the filters, by example.
+
+The sheet occupies ``[0, length] x [0, width] x [0, thickness]``. The sides x = 0, y = 0 and
+y = width are clamped, the side x = length is free, as a leaflet hangs on its annulus and ends in a
+free edge; it is pressed from below. Two regions, before and behind the middle of the length, have a
+Young's modulus each. `OwnSheet` predicts it with this project's mechanics, `SecondSheet` with
+scikit-fem. The two share nothing but the numbers in `Sheet`: element, strains, load, tangent and
+derivatives are written twice, from different formulas. Run as a program, this file is the second
+one, asked through files by the contract of `mvest.external`; without arguments it says how far the
+codes are apart:
+
+    python sheet.py REQUEST FOLDER
+    python sheet.py
+
+``experiment=models`` estimates the moduli with each of them from the data of each.
 
 scikit-fem gives the mesh, the triquadratic shape functions, the quadrature, the numbering of the
 unknowns, the loaded face and the evaluation at points; written here is what a user of any such
@@ -26,19 +40,164 @@ gives :math:`du/dE = -K^{-1} \, \partial r / \partial E` from the tangent K of t
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from experiments.studies.models.sheet.sheet import Sheet, inadmissible
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.prediction import Prediction
+from mvest.external.contract import read_request, write_answer
+from mvest.mechanics.blocks import box, outer_faces
+from mvest.mechanics.body import simulate_body
+from mvest.mechanics.law.moduli import TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
+from mvest.units import mmhg_to_mpa
+from mvest.valve.mesh.solid_mesh import SolidMesh, embed
 
-__all__ = ["LAWS", "SecondSheet"]
+__all__ = ["LAWS", "PARAMETERS", "OwnSheet", "SecondSheet", "Sheet", "main", "own", "second"]
+
+PARAMETERS = ("E.annulus", "E.edge")
+"""Young's moduli in MPa of the half beside the clamped side and of the half with the free edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """The sheet, its load, its mesh and where it is looked at.
+
+    Attributes
+    ----------
+    length, width, thickness : float
+        mm.
+    poisson : float
+        Of both regions.
+    pressure_mmHg : float
+        On the lower face, following it as it turns.
+    cells : (int, int)
+        Along length and width. The first is even, so that the regions meet between cells.
+    layers : int
+        Cells through the thickness.
+    observed : (int, int)
+        Observed points of the midsurface along length and width.
+    load_steps : int
+        Equal steps in which the pressure rises.
+    """
+
+    length: float = 24.0
+    width: float = 16.0
+    thickness: float = 1.0
+    poisson: float = 0.45
+    pressure_mmHg: float = 120.0
+    cells: tuple[int, int] = (8, 6)
+    layers: int = 1
+    observed: tuple[int, int] = (8, 7)
+    load_steps: int = 4
+
+    def __post_init__(self) -> None:
+        for name in ("length", "width", "thickness"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"sheet {name} = {value} mm, expected > 0")
+        if not -1 < self.poisson < 0.5:
+            raise InputError(f"sheet poisson = {self.poisson}, expected -1 < poisson < 0.5")
+        if not np.isfinite(self.pressure_mmHg):
+            raise InputError(f"sheet pressure_mmHg = {self.pressure_mmHg}, expected a number")
+        if len(self.cells) != 2 or min(self.cells) < 1 or self.cells[0] % 2:
+            raise InputError(f"sheet cells = {self.cells}, expected two > 0, the first even")
+        if len(self.observed) != 2 or min(self.observed) < 1:
+            raise InputError(f"sheet observed = {self.observed}, expected two > 0")
+        for name in ("layers", "load_steps"):
+            if getattr(self, name) < 1:
+                raise InputError(f"sheet {name} = {getattr(self, name)}, expected at least 1")
+
+    @property
+    def pressure(self) -> float:
+        """MPa."""
+        return mmhg_to_mpa(self.pressure_mmHg)
+
+    @property
+    def points(self) -> FloatArray:
+        """Observed points of the midsurface ``(n, 3)`` mm, none of them on a clamped side."""
+        x = np.linspace(0.0, self.length, self.observed[0] + 1)[1:]
+        y = np.linspace(0.0, self.width, self.observed[1] + 2)[1:-1]
+        grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        return np.column_stack([grid, np.full(len(grid), 0.5 * self.thickness)])
+
+
+def inadmissible(moduli: FloatArray) -> Prediction | None:
+    """The failed prediction for moduli that belong to no elastic solid; None where they may."""
+    if moduli.shape != (2,):
+        raise InputError(f"{moduli.size} moduli of the sheet, expected 2")
+    if np.all(np.isfinite(moduli)) and np.all(moduli > 0):
+        return None
+    return Prediction.failed(
+        ", ".join(f"{n} = {v:g} MPa" for n, v in zip(PARAMETERS, moduli, strict=True))
+        + ": expected positive moduli"
+    )
+
+
+class OwnSheet:
+    """Positions ``(3 n,)`` mm of the sheet's observed points from its two moduli (MPa).
+
+    An observation model of the filters (`mvest.estimation.ObservationModel`): coordinates
+    follow one another point by point, the Jacobian ``(3 n, 2)`` mm/MPa is exact.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    element : str
+        ``hex18``, the solid-shell of the valve, or ``hex27``, the triquadratic brick.
+    """
+
+    def __init__(self, sheet: Sheet, element: str = "hex18") -> None:
+        self.sheet, self.element = sheet, element
+        size = (sheet.length, sheet.width, sheet.thickness)
+        self.nodes, self.elements = box(element, (*sheet.cells, sheet.layers), size)
+        faces = outer_faces(self.elements, element)
+        self._under = faces[np.all(np.isclose(self.nodes[faces][:, :, 2], 0.0), axis=1)]
+        x, y = self.nodes[:, 0], self.nodes[:, 1]
+        held = np.isclose(x, 0.0) | np.isclose(y, 0.0) | np.isclose(y, sheet.width)
+        self._fixed = np.flatnonzero(held)
+        centre = self.nodes[self.elements].mean(axis=1)
+        self._region = (centre[:, 0] > 0.5 * sheet.length).astype(np.int64)
+        fibre = np.tile([1.0, 0.0, 0.0], (len(self.nodes), 1))
+        mesh = SolidMesh(
+            self.nodes, self.elements, element, self._region, ("0", "1"), fibre, self._under
+        )
+        self._observe = embed(mesh, sheet.points)
+
+    def __call__(self, moduli: FloatArray, /) -> Prediction:
+        """Predict the observed positions and their derivatives."""
+        refused = inadmissible(moduli)
+        if refused is not None:
+            return refused
+        sheet = self.sheet
+        loads = np.arange(1, sheet.load_steps + 1) / sheet.load_steps
+        pressed = simulate_body(
+            self.nodes,
+            self.elements,
+            self.element,
+            material=[TransverselyIsotropic.isotropic(float(E), sheet.poisson) for E in moduli],
+            region=self._region,
+            fixed_nodes=self._fixed,
+            pressure_faces=self._under,
+            pressure=[(0.0, 0.0), (1.0, sheet.pressure)],
+            times=loads,
+            static=True,
+            parameters=[Parameter(f"E_f.{k}", float(E)) for k, E in enumerate(moduli)],
+        )
+        if not pressed.converged:
+            return Prediction.failed(f"own sheet: {pressed.reason.value}")
+        y = self._observe(pressed.frames[-1]).ravel()
+        derivatives = [self._observe(d).ravel() for d in pressed.sensitivities[-1]]
+        return Prediction(y, np.column_stack(derivatives))
+
 
 MAX_ITERATIONS = 30
 TOLERANCE = 1e-10
@@ -112,7 +271,7 @@ LAWS: dict[str, Callable[..., tuple[FloatArray, FloatArray]]] = {
 class SecondSheet:
     """Positions ``(3 n,)`` mm of the sheet's observed points from its two moduli (MPa).
 
-    As :class:`experiments.studies.models.sheet.own.OwnSheet`, by scikit-fem. Arrays have the axes
+    As `OwnSheet`, by scikit-fem. Arrays have the axes
     (element, quadrature point, ...), nodal ones ``(N, 3)``.
 
     Parameters
@@ -268,3 +427,70 @@ def _gradients(basis: Any) -> FloatArray:
 def _unknowns(dofs: IntArray) -> IntArray:
     """Numbers ``(e, 3 n)`` of the displacements at nodes ``(e, n)``, xyz last."""
     return np.asarray(3 * dofs[:, :, None] + np.arange(3)).reshape(len(dofs), -1)
+
+
+def own(element: str = "hex18", **about: Any) -> OwnSheet:
+    """The sheet in this project's mechanics, from plain settings."""
+    return OwnSheet(_sheet(about), element)
+
+
+def second(law: str = "biot", thickness_points: int = 3, **about: Any) -> SecondSheet:
+    """The sheet in scikit-fem, from plain settings."""
+    return SecondSheet(_sheet(about), law, thickness_points)
+
+
+def _sheet(about: dict[str, Any]) -> Sheet:
+    return Sheet(**{k: tuple(v) if isinstance(v, list | tuple) else v for k, v in about.items()})
+
+
+def agreement(cells: tuple[int, int], layers: int) -> dict[str, tuple[float, float]]:
+    """How far predictions are from those of scikit-fem with the Biot law on the same mesh.
+
+    Returns the largest distance of a point (mm) and the relative difference of the derivatives, at
+    4 and 1.5 MPa. The same elements are triquadratic bricks with the same quadrature.
+    """
+    sheet = Sheet(cells=cells, layers=layers, load_steps=2)
+    at = np.array([4.0, 1.5])
+    usual, alike = SecondSheet(sheet)(at), SecondSheet(sheet, thickness_points=2)(at)
+    pairs = {
+        "this project, the same elements": (OwnSheet(sheet, "hex27")(at), alike),
+        "this project, solid-shells": (OwnSheet(sheet)(at), usual),
+        "scikit-fem, St. Venant-Kirchhoff": (SecondSheet(sheet, "st_venant_kirchhoff")(at), usual),
+    }
+    return {
+        name: (
+            float(np.linalg.norm((one.y - other.y).reshape(-1, 3), axis=1).max()),
+            float(np.linalg.norm(one.jacobian - other.jacobian) / np.linalg.norm(other.jacobian)),
+        )
+        for name, (one, other) in pairs.items()
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Answer one request; the exit status.
+
+    Its settings are those of `second`, and with ``derivatives`` false no derivatives are given.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    if not given:
+        for cells, layers in (((4, 4), 1), ((6, 4), 2), ((8, 6), 2), ((8, 6), 3)):
+            for name, (distance, slope) in agreement(cells, layers).items():
+                print(f"{cells}, {layers} layers, {name}: {distance:.2g} mm, {100 * slope:.2g} %")
+        return 0
+    if len(given) != 2:
+        sys.stderr.write("expected two arguments, the request and the folder of the answer\n")
+        return 2
+    try:
+        request, folder = read_request(Path(given[0])), Path(given[1])
+        settings = dict(request.settings)
+        wanted = settings.pop("derivatives", True) and request.jacobian
+        prediction = second(**settings)(np.array(request.values))
+        write_answer(folder, prediction, request.names if wanted else None)
+    except MvestError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

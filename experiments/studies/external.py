@@ -1,0 +1,369 @@
+"""Any model behind the filters: a program asked through files, or a function in a file of Python.
+
+It estimates its parameters from observed positions. Of several models each estimates from what the
+first ones predict for known parameters.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from experiments.common.building.filters import build_filter
+from experiments.common.places import CHECKOUT
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.schema import NOT_HASHED, InputFile, Reads, build, contents
+from experiments.common.study import Job, Result, Results, Study
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation.estimate import Filter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.prediction import ObservationModel, predict
+from mvest.estimation.transform import Transform
+from mvest.external.contract import read_points, write_points
+from mvest.external.differences import Differences
+from mvest.external.model import ProcessModel
+from mvest.external.process import Command, files_of_command
+from mvest.problem.estimate import StudyResult
+from mvest.problem.record import EstimateRecord, record_of, spread
+from mvest.reporting.tables import Column, table
+from mvest.typing import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["STUDY", "ExternalSettings", "ModelSettings", "Settings"]
+
+Values = Mapping[str, Any]
+
+FITTED = "fitted.csv"
+"""Where a single model puts the observed points at its estimate."""
+
+
+def _command(value: tuple[str, ...], beside: Values) -> Any:
+    files = contents(files_of_command(value, beside.get("environment") or {}))
+    return [*value, files] if value else value
+
+
+def _python(value: str, _: Values) -> Any:
+    file = _file(value)
+    return value if file is None else [value.rpartition(":")[2], contents(file)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelSettings:
+    """A program (mvest/external/README.md), or a function in a file of Python."""
+
+    command: Annotated[tuple[str, ...], Reads(_command)] = ()  # program and arguments, no shell
+    # FILE:FUNCTION, which is called with the settings and returns the model.
+    python: Annotated[str | None, Reads(_python)] = None
+    apart: bool = False  # FILE is run as a program instead, with the request and its folder
+    settings: dict[str, Any] = field(default_factory=dict)  # given to the model as they are
+    environment: dict[str, str] = field(default_factory=dict)  # beside what this process has
+    # Files and folders after whose change runs are done anew, beside those in the command.
+    inputs: Annotated[tuple[str, ...], Reads(contents)] = ()
+    time_limit_s: Annotated[float, Field(ge=0.01, le=2_592_000)] = 600.0  # of one run
+    differences: str = "central"  # or forward, or none: the program must give jacobian.csv
+    relative_step: Annotated[float, Field(ge=1e-15, le=1)] = 1e-3  # of a parameter
+    floor: Annotated[float, Field(ge=0, le=1e12)] = 0.0  # size of a parameter that may be zero
+    processes: Annotated[int, Field(ge=1, le=1024), NOT_HASHED] = 1  # runs at a time
+    reuse: bool = True  # finished runs serve again
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExternalSettings(ModelSettings):
+    """The model, or several, and what is observed."""
+
+    folder: Annotated[str | None, NOT_HASHED] = None  # of runs; null: in the folder of the job
+    observation: InputFile = None  # .csv x,y,z (mm), one row per observed point
+    points: InputFile = None  # .csv x,y,z (mm), reference positions that programs are given
+    units: tuple[str, ...] = ()  # of the parameters; empty: not stated
+    prior_std: tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...] = ()  # of the parameters
+    # SD of the error of each observed coordinate
+    noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
+    models: dict[str, ModelSettings] = field(default_factory=dict)  # several, with their settings
+    data: tuple[str, ...] = ()  # those of them that predict observations from truth.values
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    external: ExternalSettings = field(default_factory=ExternalSettings)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What every estimate of a run has in common; the variance is of a coordinate, mm²."""
+
+    about: ExternalSettings
+    names: tuple[str, ...]
+    truth: dict[str, float]
+    variance: float
+    filter: Filter
+    transform: Transform
+    prior: Gaussian
+    folder: Path
+
+
+def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
+    """The task of a configuration.
+
+    Raises
+    ------
+    MvestError
+        If a setting is missing or inadmissible.
+    """
+    names = tuple(values["parameters"])
+    for key, instead in (("P0", "external.prior_std"), ("R", "external.noise_mm")):
+        if values["filter"][key] is not None:
+            raise ConfigurationError(f"filter.{key} is given; expected {instead} in its place")
+    if about.units and len(about.units) != len(names):
+        raise ConfigurationError(
+            f"external.units = {list(about.units)}, expected one for each of {', '.join(names)}"
+        )
+    std, noise = np.array(about.prior_std, dtype=float), about.noise_mm
+    if std.shape != (len(names),) or not np.all(np.isfinite(std) & (std > 0)):
+        raise ConfigurationError(
+            f"external.prior_std = {list(about.prior_std)}, expected one standard deviation > 0 "
+            f"for each of {', '.join(names)}"
+        )
+    if noise is None or not (np.isfinite(noise) and noise > 0):
+        raise ConfigurationError(f"external.noise_mm = {noise}, expected a number > 0 (mm)")
+    settings = {**values["filter"], "P0": (std**2).tolist()}
+    truth = dict(zip(names, map(float, values["truth"]["values"]), strict=False))
+    filter_, transform, prior = build_filter(settings, names, positive=True)
+    return Task(about, names, truth, float(noise) ** 2, filter_, transform, prior, folder)
+
+
+def model_of(task: Task, name: str, count: int) -> ObservationModel:
+    """One of the configured models, of ``count`` observed points.
+
+    Raises
+    ------
+    MvestError
+        If the program, a file or a setting is inadmissible.
+    """
+    about = task.about
+    source = about.models.get(name, about)
+    settings, command = {**about.settings, **source.settings}, source.command
+    if source.python is not None:
+        file, function = _file(source.python), source.python.rpartition(":")[2]
+        if file is None:
+            raise ConfigurationError(
+                f"python = {source.python}: no such file, expected FILE:FUNCTION"
+            )
+        command = (sys.executable, str(file), "{request}", "{folder}")
+        if not source.apart:
+            found = runpy.run_path(str(file))
+            if function not in found:
+                raise ConfigurationError(
+                    f"python = {source.python}: no function {function!r} there"
+                )
+            return found[function](**settings)
+    if not command:
+        raise ConfigurationError(
+            "external.command is not given; expected the program and its arguments, such as "
+            '[python,"{here}/solve.py","{request}","{folder}"]'
+        )
+    steps = source.relative_step, source.floor, source.processes
+    return ProcessModel(
+        Command(command, source.environment, source.time_limit_s),
+        task.folder / "runs" if about.folder is None else Path(about.folder),
+        task.names,
+        count,
+        units=about.units or None,
+        points=None if about.points is None else _points(about.points, "points"),
+        settings=settings,
+        differences=None
+        if source.differences == "none"
+        else Differences(source.differences, *steps),
+        reuse=source.reuse,
+        inputs=tuple(map(Path, source.inputs)),
+    )
+
+
+def _file(python: str) -> Path | None:
+    """The file of a FILE:FUNCTION, from where the command was typed or from the checkout."""
+    name = python.rpartition(":")[0]
+    places = (Path(name).absolute(), CHECKOUT / name)
+    return next((place for place in places if place.is_file()), None)
+
+
+def _points(file: str | None, what: str) -> FloatArray:
+    if file is None:
+        raise ConfigurationError(
+            f"external.{what} is not given; expected a .csv file with the columns x,y,z (mm)"
+        )
+    try:
+        return read_points(Path(file))
+    except InputError as error:
+        raise ConfigurationError(f"external.{what} = {file}: {error}") from error
+
+
+def run(job: Job[Settings]) -> Result:
+    """Estimate with each model from each observation.
+
+    Raises
+    ------
+    MvestError
+        If a setting or a file is inadmissible.
+    """
+    about = job.settings.external
+    task = task_of(about, job.values, job.folder)
+    (job.folder / FITTED).unlink(missing_ok=True)
+    data = {} if about.data else {"observation": _points(about.observation, "observation")}
+    for name in about.data:
+        exact = predict(model_of(task, name, 0), np.array([*task.truth.values()]))
+        if not exact.converged:
+            return Result(status="failed", reason=f"{name}: {exact.reason}")
+        # The same errors for all, so that estimates differ by the models alone.
+        errors = np.random.default_rng(job.values["seed"]).standard_normal(exact.y.size)
+        data[name] = (exact.y + np.sqrt(task.variance) * errors).reshape(-1, 3)
+    records: dict[tuple[str, str], EstimateRecord] = {}
+    programs: dict[tuple[str, str], dict[str, Any]] = {}
+    for seen, y in data.items():
+        for name in about.models or ("model",):
+            model = model_of(task, name, len(y))
+            records[seen, name] = _estimate(f"{name}, from {seen}", model, y, task)
+            if isinstance(model, ProcessModel):
+                about_runs = {"runs": model.runs, "served again": model.reused}
+                programs[seen, name] = about_runs | {"own derivatives": model.own_jacobian}
+    rows = [
+        {"data": seen, "model": name}
+        | {key: row.get(key) for key in SHOWN}
+        | {"apart": _apart(row["estimate"], records.get((seen, seen)), k)}
+        | programs.get((seen, name), {})
+        for (seen, name), record in records.items()
+        for k, row in enumerate(record.rows())
+    ]
+    estimates = tuple(records.values())
+    return Result(
+        tables={"": table(rows, **(dict.fromkeys(rows[0], "") | COLUMNS))},
+        estimates=estimates,
+        status="converged" if any(one.converged for one in estimates) else "failed",
+        reason=estimates[0].reason,
+        detail=estimates[0].detail,
+        forward_solves=sum(one.forward_solves or 0 for one in estimates),
+    )
+
+
+SHOWN = (
+    *("parameter", "unit", "prior_mean", "prior_std", "estimate", "std", "truth", "relative_error"),
+    *("reason", "iterations", "forward_solves", "distance_mean", "distance_max", "nis"),
+)
+"""What the table takes of the rows of a record."""
+
+COLUMNS = {
+    "prior_mean": Column(std="prior_std", label="prior"),
+    "estimate": Column(digits=".3f", std="std"),
+    "relative_error": Column(digits="+.2%", label="error"),
+    "reason": Column(hidden=True),
+    "forward_solves": Column(label="predictions"),
+    "distance_mean": Column("mm"),
+    "distance_max": Column("mm"),
+    "apart": Column(digits="+.2%", label="apart from the data's own model"),
+}
+
+
+def _apart(value: float | None, own: EstimateRecord | None, k: int) -> float | None:
+    """By what share an estimate is off what the model that made the data finds."""
+    other = None if own is None else own.unknowns[k].estimate
+    return value / other - 1 if value is not None and other else None
+
+
+def _estimate(title: str, model: ObservationModel, y: FloatArray, task: Task) -> EstimateRecord:
+    """The record of one estimate from positions ``(n, 3)`` mm."""
+    began = time.perf_counter()
+    with SolveBar(title, 0, TYPICAL_SOLVES, task.names) as bar:
+        found = task.filter(
+            model,
+            task.prior,
+            y.ravel(),
+            task.variance,
+            names=task.names,
+            transform=task.transform,
+            on_iterate=bar.iterate,
+        )
+    took = time.perf_counter() - began
+    ended = found.why, found.detail, found.converged, took
+    record = record_of(StudyResult(task.names, {}, None, found, None, *ended), case=title)
+    units = zip(record.unknowns, task.about.units or [""] * len(task.names), strict=True)
+    changes: dict[str, Any] = {
+        "unknowns": tuple(
+            one.model_copy(update={"unit": unit, "truth": task.truth.get(one.name)})
+            for one, unit in units
+        )
+    }
+    if found.prediction is not None:
+        fitted = found.prediction.y.reshape(-1, 3)
+        changes["distance_mm"] = spread(np.linalg.norm(fitted - y, axis=1))
+        if not task.about.models:
+            write_points(task.folder / FITTED, fitted)
+    return record.model_copy(update=changes)
+
+
+def check_external(values: Values, folder: Path) -> str:
+    """Run the program once at the initial values, and compare its derivatives with differences.
+
+    Raises
+    ------
+    MvestError
+        If a setting or a file is inadmissible, or the program gives no prediction.
+    """
+    task = task_of(build(ExternalSettings, values["external"]), values, folder)
+    y, m = _points(task.about.observation, "observation"), task.prior.mean
+    model = model_of(task, "model", len(y))
+    found = predict(model, m)
+    if not found.converged:
+        raise InputError(f"at the initial values: {found.reason}")
+    distance = np.linalg.norm(found.y.reshape(-1, 3) - y, axis=1)
+    derivatives = "derivatives: by differences, the program gives none"
+    if not isinstance(model, ProcessModel) or model.own_jacobian:
+        by = model.by_differences(m, found.y) if isinstance(model, ProcessModel) else "a function"
+        derivatives = f"derivatives: the model's own; not compared with differences: {by}"
+        if not isinstance(by, str):
+            off = np.linalg.norm(found.jacobian - by, axis=0) / np.linalg.norm(by, axis=0)
+            shares = ", ".join(f"{n} {100 * d:.2g} %" for n, d in zip(task.names, off, strict=True))
+            derivatives = f"derivatives: the program's own; apart from differences by {shares}"
+    return (
+        f"{len(y)} points; at the initial values they are {distance.mean():.3g} mm (mean) and "
+        f"{distance.max():.3g} mm (largest) from the observed ones\n{derivatives}\nIn order"
+    )
+
+
+def figure(results: Results) -> Figure | None:
+    """Each parameter, iterate by iterate, with each model."""
+    from mvest.reporting.style import COLOURS, GREY, MARKERS, SMALL, panels
+
+    drawn = [one for one in results.first.estimates if one.iterates]
+    if not drawn:
+        return None
+    whole, axes = panels(1, len(drawn[0].unknowns), 4.2)
+    for k, unknown in enumerate(drawn[0].unknowns):
+        for n, one in enumerate(drawn):
+            style = {"color": COLOURS[n % 6], "marker": MARKERS[n % 6], "fillstyle": "none"}
+            axes[0, k].plot([at[k] for at in one.iterates], label=one.case, **style)
+        if unknown.truth is not None:
+            axes[0, k].axhline(unknown.truth, color=GREY, linestyle="--", label="truth")
+        unit = f" ({unknown.unit})" if unknown.unit else ""
+        axes[0, k].set(xlabel="iteration", ylabel=unknown.name + unit)
+    lines, names = axes[0, 0].get_legend_handles_labels()
+    whole.legend(lines, names, loc="outside upper center", ncols=2, frameon=False, fontsize=SMALL)
+    return whole
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run,
+    figure=figure,
+    captions={"": "Parameters after each iteration, with each model."},
+    checks=lambda: (check_external,),
+)

@@ -1,1 +1,0 @@
-"""One sheet in two finite-element codes."""
