@@ -69,13 +69,17 @@ from mvest.valve.anatomy.template import Template
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STUDY", "ImagedPlace", "make_imaged_patient", "run_imaged_patient"]
+__all__ = ["STUDY", "make_imaged_patient", "run_imaged_patient"]
 
 Values = Mapping[str, Any]
 Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, how it was imaged, and how many anatomies were drawn for it."""
 
-VOLUME, TRUTH, HIDDEN = "volume.seq.nrrd", "truth", "hidden.json"
+VOLUME, HIDDEN, TRUTH = "volume.seq.nrrd", "hidden", "hidden/truth"
+"""In the folder of a patient: the file that an estimator is given, the folder that it cannot open,
+with the truth and the cases of better geometries, and what no estimation is given."""
+
+REVEALED = "hidden.json"
 KNOWN, SEGMENTED = "known", "segmented"
 """Folders of the better geometries, and what a record calls the estimates from them."""
 
@@ -110,27 +114,6 @@ class Settings:
     personal: PersonalSettings
 
 
-@dataclass(frozen=True, slots=True)
-class ImagedPlace:
-    """Where an imaged patient lies: the file that an estimator is given, and what it cannot open.
-
-    Hidden are the truth, and the cases of the better geometries.
-    """
-
-    volume: Path
-    hidden: Path
-
-    @classmethod
-    def within(cls, root: Path) -> ImagedPlace:
-        """The places in the folder of a patient."""
-        return cls(root / VOLUME, root / "hidden")
-
-    @property
-    def truth(self) -> Path:
-        """Folder of what no estimation is given."""
-        return self.hidden / TRUTH
-
-
 # -- run ------------------------------------------------------------------------------------------
 def run_imaged_patient(job: Job[Settings]) -> Result:
     """Simulate, estimate from the volume and from better geometries, reveal.
@@ -142,12 +125,14 @@ def run_imaged_patient(job: Job[Settings]) -> Result:
     """
     values, folder = job.values, job.folder
     place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
-    hidden = read_mapping(place.truth / HIDDEN)
+    hidden = read_mapping(place / TRUTH / REVEALED)
     given = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
-    found = {"": estimated_or_reason(given, folder, place.volume, place.hidden)}
+    found = {"": estimated_or_reason(given, folder, place / VOLUME, place / HIDDEN)}
     for name in (KNOWN, SEGMENTED):
         (folder / name).mkdir(exist_ok=True)
-        found[name] = estimated_or_reason(values, folder / name, place.hidden / name, place.truth)
+        found[name] = estimated_or_reason(
+            values, folder / name, place / HIDDEN / name, place / TRUTH
+        )
     main = found[""]
     run = found[KNOWN] if isinstance(main, str) else main
     if isinstance(run, str):
@@ -197,8 +182,8 @@ def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
 # -- the patient ----------------------------------------------------------------------------------
 def make_imaged_patient(
     values: Values, patient: PatientSettings | None, echo: EchoSettings
-) -> ImagedPlace:
-    """Simulate and image the configured patient, unless that was done: where it lies.
+) -> Path:
+    """Simulate and image the configured patient, unless that was done: the folder where it lies.
 
     Raises
     ------
@@ -219,17 +204,15 @@ def make_imaged_patient(
     }
     store = Store(values["paths"]["outputs"])
     entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+    return entry.get_or_make(
+        lambda: _simulate(values, patient, echo),
+        lambda root, made: _write(root, made, patient, described),
+    )
 
-    def write(root: Path, made: Made) -> None:
-        _write(ImagedPlace.within(root), made, patient, described)
 
-    return entry.get_or_make(lambda: _simulate(values, patient, echo), write)
-
-
-def _place(root: Path) -> ImagedPlace:
-    place = ImagedPlace.within(root)
-    read_mapping(place.truth / HIDDEN)
-    return place
+def _place(root: Path) -> Path:
+    read_mapping(root / TRUTH / REVEALED)
+    return root
 
 
 def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> Made:
@@ -250,20 +233,20 @@ def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> M
     return made, probe, simulate_volume(made.valve, acquisition, probe, values["seed"]), draws
 
 
-def _write(place: ImagedPlace, imaged: Made, patient: PatientSettings, described: Values) -> None:
+def _write(place: Path, imaged: Made, patient: PatientSettings, described: Values) -> None:
     made, probe, volume, draws = imaged
-    place.truth.mkdir(parents=True)
+    (place / TRUTH).mkdir(parents=True)
     # The source of what is simulated names the patient; a file has its name alone.
-    write_sequence_nrrd(place.volume, volume)
+    write_sequence_nrrd(place / VOLUME, volume)
     frames = CaseFrames(0, made.closed, float(made.pressure_mmHg[made.closed]))
     true = true_sequence(made.valve, probe)
-    write_case(place.hidden / KNOWN, _known_case(true, frames, patient))
+    write_case(place / HIDDEN / KNOWN, _known_case(true, frames, patient))
     segmented = _segmented_case(
         true, frames, patient, float(volume.spacing.max()), described["seed"]
     )
-    write_case(place.hidden / SEGMENTED, segmented)
+    write_case(place / HIDDEN / SEGMENTED, segmented)
     write_json(
-        place.truth / HIDDEN,
+        place / TRUTH / REVEALED,
         {
             "values": dict(made.hidden.values),
             "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,6 +58,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["FINE_MM", "STUDY", "DoorSettings", "arrive", "drawn_leaflets", "run_surfaces"]
+
+KINDS = ("vertices", "surfaces", "slicerheart", "labels")
+"""Of doors, in the order of tables."""
 
 POSE = Rotation.from_euler("xz", [1.0, 0.4]).as_matrix()
 SHIFT = np.array([31.0, -12.0, 140.0])
@@ -222,63 +225,53 @@ def arrive(
     MvestError
         If there is no such door, or what was exported is refused.
     """
-    if door.kind not in DOORS:
-        raise ConfigurationError(f"door.kind = {door.kind!r}, expected one of {', '.join(DOORS)}")
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
+    patient = Arrived(case, opened, replace(closed, vertices=positions))
     drawn = closed.vertices if door.seen_with_errors else positions
-    true = replace(closed, vertices=positions)
     closed = replace(closed, vertices=drawn, free_edge=drawn[case.free_edge], corresponds=False)
-    if door.kind in ("slicerheart", "labels"):
-        # Leaflets, annulus and tips are drawn in one image.
-        tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
-        closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)
-    return DOORS[door.kind](Arrived(case, opened, true), closed, door, folder)
+    if door.kind == "vertices":
+        return patient
+    if door.kind == "surfaces":
+        return replace(patient, case=replace(case, frames=(opened, closed)))
+    if door.kind not in KINDS:
+        raise ConfigurationError(f"door.kind = {door.kind!r}, expected one of {', '.join(KINDS)}")
+    # Leaflets, annulus and tips are drawn in one image.
+    tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
+    closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)
+    seen = (_in_lps(opened), _in_lps(closed))
+    through = _through_slicerheart if door.kind == "slicerheart" else _through_labels
+    imported = replace(through(patient, seen, door, folder), simulated=True)
+    return Arrived(imported, _in_lps(opened), _in_lps(patient.closed))
 
 
-def _vertices(patient: Arrived, _closed: Frame, _door: DoorSettings, _folder: Path) -> Arrived:
-    return patient
-
-
-def _surfaces(patient: Arrived, closed: Frame, _door: DoorSettings, _folder: Path) -> Arrived:
-    return replace(patient, case=replace(patient.case, frames=(patient.opened, closed)))
-
-
-def _slicerheart(patient: Arrived, closed: Frame, door: DoorSettings, folder: Path) -> Arrived:
-    export = folder / "slicerheart"
-    frames = {"MD": _in_lps(patient.opened), "MS": _in_lps(closed)}
+def _through_slicerheart(
+    patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
+) -> ValveCase:
     annulus = patient.opened.annulus[:, :2] - patient.opened.annulus[:, :2].mean(axis=0)
     landmarks = {name: int(np.argmax(annulus @ np.array(to))) for name, to in LANDMARKS.items()}
-    write_slicerheart(export, frames, patient.case.surface, landmarks)
-    options = SlicerheartOptions(pressure_mmHg=closed.pressure_mmHg, std_mm=door.std_mm)
-    return _posed(patient, import_slicerheart(export, options))
+    phases = dict(zip(("MD", "MS"), frames, strict=True))
+    _write_slicerheart(folder / "slicerheart", phases, patient.case.surface, landmarks)
+    options = SlicerheartOptions(pressure_mmHg=frames[1].pressure_mmHg, std_mm=door.std_mm)
+    return import_slicerheart(folder / "slicerheart", options)
 
 
-def _labels(patient: Arrived, closed: Frame, door: DoorSettings, folder: Path) -> Arrived:
+def _through_labels(
+    patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
+) -> ValveCase:
+    thickness = patient.case.surface.thickness
     if door.voxel_mm is None:
         raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
-    frames = [_in_lps(patient.opened), _in_lps(closed)]
-    files = [folder / f"{frame.name}.nii.gz" for frame in frames]
-    for frame, file in list(zip(frames, files, strict=True))[: 1 + door.closed]:
-        write_label_map(file, frame, patient.case.surface.thickness, door.voxel_mm)
+    opened, closed = (folder / f"{frame.name}.nii.gz" for frame in frames)
     tips = [tuple(frame.papillary_tips.ravel().tolist()) for frame in frames]
     options = LabelsOptions(tips=tips[0], observer_mm=0.0)
+    _write_label_map(opened, frames[0], thickness, door.voxel_mm)
     if not door.closed:
-        imported = import_labels(files[0], options)
-        case = _with_closed(imported, frames[1], door.std_mm, folder / "by_hand")
-        return _posed(patient, case)
-    options = replace(
-        options, closed=str(files[1]), tips_closed=tips[1], pressure_mmHg=closed.pressure_mmHg
-    )
-    return _posed(patient, import_labels(files[0], options))
-
-
-DOORS: dict[str, Callable[[Arrived, Frame, DoorSettings, Path], Arrived]] = {
-    "vertices": _vertices,
-    "surfaces": _surfaces,
-    "slicerheart": _slicerheart,
-    "labels": _labels,
-}
-"""Kind of a door -> what it makes of a patient, whose closed frame was drawn so."""
+        imported = import_labels(opened, options)
+        return _with_closed(imported, frames[1], door.std_mm, folder / "by_hand")
+    _write_label_map(closed, frames[1], thickness, door.voxel_mm)
+    pressure = frames[1].pressure_mmHg
+    both = replace(options, closed=str(closed), tips_closed=tips[1], pressure_mmHg=pressure)
+    return import_labels(opened, both)
 
 
 def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:
@@ -316,13 +309,8 @@ def _in_lps(frame: Frame) -> Frame:
     return replace(frame, papillary_tips=tips @ POSE.T + SHIFT, **moved)
 
 
-def _posed(patient: Arrived, case: ValveCase) -> Arrived:
-    true = (_in_lps(frame) for frame in (patient.opened, patient.closed))
-    return Arrived(replace(case, simulated=True), *true)
-
-
 # -- exports --------------------------------------------------------------------------------------
-def write_slicerheart(
+def _write_slicerheart(
     folder: Path,
     frames: Mapping[str, Frame],
     surface: LeafletSurface,
@@ -330,22 +318,8 @@ def write_slicerheart(
 ) -> None:
     """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
 
-    Parameters
-    ----------
-    folder : Path
-        Which does not exist.
-    frames : mapping of str to Frame
-        Phase (MD, MS, ...) -> midsurface, LPS mm; tips antero-lateral first.
-    surface : LeafletSurface
-        With the leaflets' names and thickness: the atrial side of one lies half its mean from the
-        midsurface.
-    landmarks : mapping of str to int
-        Which points of the annulus they are.
-
-    Raises
-    ------
-    ConfigurationError
-        If PyVista is not installed.
+    Frames by phase (MD, MS, ...) are midsurfaces (LPS mm; tips antero-lateral first); the atrial
+    side of a leaflet lies half its mean thickness from them. Landmarks are points of the annulus.
     """
     import pandas as pd
 
@@ -418,19 +392,10 @@ def _write_points(file: Path, points: Sequence[FloatArray]) -> None:
     file.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
 
 
-def write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_mm: float) -> None:
-    """Write thick leaflets as a NIfTI of labels: 1 anterior, 2 posterior, 0 elsewhere.
+def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_mm: float) -> None:
+    """Write thick leaflets (LPS mm) as a NIfTI of labels: 1 anterior, 2 posterior, 0 elsewhere.
 
     A voxel belongs to the leaflets if more than half of it does, to the larger part of the two.
-
-    Parameters
-    ----------
-    file : Path
-    frame : Frame
-        Midsurface, LPS mm; its regions are anterior and posterior.
-    thickness_mm : ndarray
-        ``(n,)``
-    voxel_mm : float
     """
     import nibabel
 
@@ -530,7 +495,7 @@ def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:
     """Record and estimate of each run, by patient and way."""
 
     def place(record: Record) -> tuple[str, int, str]:
-        kind = list(DOORS).index(str(record.numbers["kind"]))
+        kind = KINDS.index(str(record.numbers["kind"]))
         return record.estimates[0].case, kind, str(record.numbers["geometry"])
 
     runs = [one for one in results.records.values() if one.estimates]

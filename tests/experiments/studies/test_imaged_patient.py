@@ -14,14 +14,16 @@ from experiments.common.study import Job, Results
 from experiments.results.keep import publish, records_of
 from experiments.studies import imaged_patient
 from experiments.studies.imaged_patient import (
+    HIDDEN,
     KNOWN,
     SEGMENTED,
     STUDY,
-    ImagedPlace,
+    VOLUME,
     figure,
     keep,
     summary,
 )
+from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
 from mvest.personalisation.error_budget import EVERYTHING, IMAGES
 from mvest.problem.record import EstimateRecord, Unknown
@@ -34,19 +36,13 @@ TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
 RATIOS = {"marginal": [1.01, 0.99], "basal": [0.96]}
 
 
-def test_what_is_hidden_lies_together(tmp_path):
-    place = ImagedPlace.within(tmp_path)
-    assert place.truth.parent == place.hidden
-    assert place.hidden not in place.volume.parents
-
-
 @pytest.fixture
 def place(tmp_path):
     """A patient who was simulated and imaged."""
-    place = ImagedPlace.within(tmp_path / "patient")
-    place.truth.mkdir(parents=True)
+    place = tmp_path / "patient"
+    (place / TRUTH_FOLDER).mkdir(parents=True)
     hidden = {"stated": {}, "values": TRUTH, "anatomies_drawn": 2, "chord_ratios": RATIOS}
-    (place.truth / "hidden.json").write_text(json.dumps(hidden))
+    (place / TRUTH_FOLDER / "hidden.json").write_text(json.dumps(hidden))
     return place
 
 
@@ -57,15 +53,17 @@ def estimated(tmp_path, place, monkeypatch):
 
     def run(volume: Any, known: Any, segmented: Any) -> Any:
         left = {
-            place.volume: (volume, place.hidden),
-            place.hidden / KNOWN: (known, place.truth),
-            place.hidden / SEGMENTED: (segmented, place.truth),
+            place / VOLUME: (volume, place / HIDDEN),
+            place / HIDDEN / KNOWN: (known, place / TRUTH_FOLDER),
+            place / HIDDEN / SEGMENTED: (segmented, place / TRUTH_FOLDER),
         }
 
         def blindly(values, folder, case, sealed):
             given.append(case)
             found, hidden = left[case]
             # What an estimation starts from is open to it, and the truth is not.
+            assert hidden not in case.parents
+            assert (place / TRUTH_FOLDER).is_relative_to(hidden)
             assert sealed == hidden
             if isinstance(found, str):
                 raise InputError(found)
