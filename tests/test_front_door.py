@@ -63,16 +63,21 @@ def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     mvest.write_case(tmp_path / "case", made_up_case(0.01, displaced=False))
     case = mvest.read_case(tmp_path / "case")
     assert isinstance(case, mvest.ValveCase)
-    settings = mvest.PersonaliseSettings(
+    found = mvest.personalise(case)
+    assert found.result.converged
+    own = mvest.PersonaliseSettings(
         tuple(
             mvest.Prior(name, mean, 2.0) for name, mean in ((MODULI[0], 6.23), (MODULI[1], 2.09))
         ),
         mvest.MechanicsSettings(TISSUE),
     )
-    found = mvest.personalise(case, settings)
-    assert found.result.converged
-    assert found.result.estimate is not None
-    assert found.result.estimate.shape == (2,)
+    moduli_alone = mvest.personalise(case, own)
+    assert moduli_alone.result.estimate is not None
+    assert moduli_alone.result.estimate.shape == (2,)
+    written = mvest.report(moduli_alone, tmp_path / "report")
+    assert {"unknowns.csv", "report.html"} <= {path.name for path in written}
+    record = mvest.record_of_case(moduli_alone)
+    assert [modulus.estimate for modulus in record.moduli] == moduli_alone.result.estimate.tolist()
 
 
 def simulated_volume(folder: Path) -> Path:

@@ -23,8 +23,6 @@ from mvest.personalisation.result import Personalised
 from mvest.personalisation.settings import PersonaliseSettings
 from mvest.typing import FloatArray
 
-__all__ = ["personalise"]
-
 
 def personalise(
     case: ValveCase,

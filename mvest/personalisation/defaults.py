@@ -22,8 +22,6 @@ from mvest.personalisation.settings import (
 )
 from mvest.problem.registration import REGISTRATION
 
-__all__ = ["default_settings"]
-
 UNKNOWNS = (
     Prior("E_f.anterior", 6.23, 3.1),
     Prior("E_f.posterior", 2.09, 1.05),

@@ -58,8 +58,6 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.clinical import clinical_measurements
 
-__all__ = ["arrays_of_case", "label_of", "record_of_case"]
-
 Rows = tuple[Row, ...]
 
 LABELS = {

@@ -27,16 +27,6 @@ from mvest.quantities import (
     Value,
 )
 
-__all__ = [
-    "CaseMesh",
-    "PaperSettings",
-    "PersonaliseSettings",
-    "PressureErrors",
-    "Prior",
-    "Treatment",
-    "with_stiffening",
-]
-
 STIFFENS = "stiffening."
 """How the names of unknowns begin that say how far a leaflet's tissue stiffens."""
 

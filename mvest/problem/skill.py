@@ -17,19 +17,6 @@ from mvest.mechanics.parameters import is_positive
 from mvest.problem.record import Unknown
 from mvest.problem.registration import REGISTRATION
 
-__all__ = [
-    "GENERIC",
-    "HALF",
-    "PRIOR",
-    "PRIOR_STD",
-    "generic_guess",
-    "log_width",
-    "prior_alone",
-    "score",
-    "share_bounds",
-    "skill",
-]
-
 GENERIC, PRIOR = "generic guess", "prior alone"
 """What tables call the two."""
 

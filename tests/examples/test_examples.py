@@ -17,7 +17,7 @@ from tests.places import ROOT
 
 EXAMPLES = ROOT / "examples"
 GALLERY = sorted((EXAMPLES / "gallery").glob("plot_*.py"))
-QUICK = ("plot_1_template", "plot_6_own_model", "plot_9_case")
+QUICK = ("plot_1_template", "plot_6_own_model")
 """Those that take a second; all run whenever the documentation is built."""
 
 

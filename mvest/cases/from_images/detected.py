@@ -39,9 +39,6 @@ from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.table import read_numbers
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["CASE", "IMAGES", "DetectedValve", "called", "detect_in_volume", "image_step",
-           "read_for_case", "write_detected"]  # fmt: skip
-
 IMAGES, CASE = "images", "case"
 """Folders of measures, surfaces and landmarks, and of the case."""
 

@@ -10,8 +10,6 @@ from mvest.errors import InputError
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE
 from mvest.imaging.volume import Modality
 
-__all__ = ["LEAFLETS", "ImagedSettings"]
-
 LEAFLETS = ("anterior", "posterior")
 """Order of ``thickness_mm``."""
 

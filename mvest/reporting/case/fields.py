@@ -18,8 +18,6 @@ from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["CaseFields", "case_fields", "read_case_fields", "turn_of"]
-
 POINTS = "observed_points_"
 SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
 """Arrays of positions, which turn with the valve."""

@@ -31,17 +31,6 @@ from mvest.reporting.figures import COLOURS, DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
-__all__ = [
-    "case_figure",
-    "corner_colours",
-    "distance_top",
-    "estimates_figure",
-    "figure3_caption",
-    "fitted_figure",
-    "frames_figure",
-    "shapes_figure",
-]
-
 HIGH_QUANTILE = 0.99
 PRIOR, POSTERIOR, WITHOUT = "0.75", COLOURS[0], COLOURS[1]
 TWO_SIDED = 1.96

@@ -39,8 +39,6 @@ from mvest.reporting.markup import ended, number
 from mvest.reporting.page import TEMPLATES, rendered
 from mvest.reporting.pictures import embedded
 
-__all__ = ["REPORT", "UNKNOWNS", "report"]
-
 REPORT, UNKNOWNS = "report.html", "unknowns.csv"
 SCRIPT = TEMPLATES / "case_report.js"
 FULL_WIDTH_INCHES = 8.6

@@ -11,8 +11,6 @@ from mvest.problem.verdict import NONE
 from mvest.reporting.markup import ended
 from mvest.reporting.tables import Column, Table, table
 
-__all__ = ["estimate_text", "frame_table", "report_tables", "unknown_table"]
-
 HIDDEN = Column(hidden=True)
 
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}

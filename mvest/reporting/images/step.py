@@ -13,8 +13,6 @@ from mvest.reporting.figures import save_figure_with
 from mvest.reporting.images.figures import measures_figure
 from mvest.reporting.images.montage import montage_figure
 
-__all__ = ["draw_candidate", "write_image_step"]
-
 CAPTIONS = {
     "montage": "The valve as it was detected, drawn on the volume.",
     "measures_over_time": (
