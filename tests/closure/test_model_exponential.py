@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError, MaterialError
+from mvest.estimation import Gaussian, IteratedFilter, Log
+from mvest.estimation.information.consistency import chi_square_band
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.regional import RegionalLaw
@@ -17,6 +19,7 @@ from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, Tissu
 from mvest.mechanics.valve_system import material_law
 from tests.closure.test_model import (
     CLOSING,
+    MODULI,
     OPEN,
     SMALL,
     TINY,
@@ -181,3 +184,22 @@ def test_settings_name_the_law_and_bring_its_coefficients():
         LINEAR.coefficients({})
     with pytest.raises(MaterialError, match="c1 = -1"):
         MIXED["anterior"].coefficients({"c1": -1.0})
+
+
+def test_either_law_is_fitted_to_the_same_data_and_the_right_one_fits():
+    truth, noise = np.array([0.03, 0.02]), 0.002
+    right, wrong = (
+        model_of(OPEN, names, **TINY) for names in (("mu.anterior", "mu.posterior"), MODULI)
+    )
+    right.settings = replace(right.settings, tissue=BOTH)
+    y = right(truth).y
+    y = y + np.random.default_rng(1).normal(0, noise, y.shape)
+    found, misfit = {}, {}
+    for name, model, start in (("right", right, [0.02, 0.03]), ("wrong", wrong, [5.0, 3.0])):
+        prior = Gaussian.from_variance(start, np.square(start))
+        found[name] = IteratedFilter()(model, prior, y, noise**2, transform=Log())
+        assert found[name].converged
+        misfit[name] = np.mean((found[name].prediction.y - y) ** 2) / noise**2
+    assert np.all(np.abs(found["right"].mean - truth) < 4 * found["right"].std)
+    _, high = np.divide(chi_square_band(y.size), y.size)
+    assert misfit["right"] < high < misfit["wrong"] / 2

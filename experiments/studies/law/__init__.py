@@ -1,1 +1,0 @@
-"""Two material laws on the same valve."""

@@ -1,1 +1,0 @@
-"""A stiff patch of a leaflet."""
