@@ -27,6 +27,7 @@ from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.record import EstimateRecord, Unknown, record_of
 from mvest.problem.registration import unit_of
+from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.measures import contact_reach
 from mvest.valve.measure.annulus import annulus_plane
@@ -183,16 +184,8 @@ def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
     """The last observed and fitted frame, as those of a case (`mvest.reporting.case.fields`)."""
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
-    valve, surface = twin.valve, twin.valve.surface
     return {
-        "triangles": surface.triangles.astype(np.int32),
-        "region": surface.region.astype(np.int8),
-        "rest": surface.vertices.astype(np.float32),
-        "annulus": valve.annulus.astype(np.int32),
-        "free_edge": valve.free_edge.astype(np.int32),
-        "frames": np.array(result.observation.frames[-1:]),
-        "seen": np.array([True]),
-        "tips": np.stack([valve.papillary_tips] * 2).astype(np.float32),
+        **valve_fields(twin.valve, result.observation.frames[-1:]),
         "observed": result.observation.positions[-1:].astype(np.float32),
         "fitted": result.fitted[-1:].astype(np.float32),
         "distance_fitted": np.asarray(result.distance, dtype=np.float64)[None],

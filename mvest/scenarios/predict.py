@@ -105,6 +105,51 @@ class PredictedScenario:
             low = 0.0
         return float(low), float(high)
 
+    def against(self, own: Sample, same: Sample) -> dict[str, dict[str, float | bool | None]]:
+        """Every measure beside that of the true valve, which no estimate knows.
+
+        Parameters
+        ----------
+        own, same : Sample
+            With the true parameters on a mesh of its own, and on the mesh of the estimate, where
+            only the uncertainty of the parameters is left.
+
+        Returns
+        -------
+        dict
+            Measure -> its ``estimate``, standard deviations to first order and of the ``samples``,
+            their ``mean`` and 95 % interval (``low``, ``high``), the ``mesh_error`` and the
+            ``wide_`` interval with it, both truths, and whether the intervals hold them; None where
+            one of these is not known.
+        """
+        rows: dict[str, dict[str, float | bool | None]] = {}
+        for name, value in self.at_estimate.measures.items():
+            spread, (low, high) = self.spread(name), self.interval(name)
+            on_own, on_same = (sample.measures.get(name) for sample in (own, same))
+            rows[name] = {
+                "estimate": value,
+                "first_order_std": self.first_order.get(name),
+                "mean": spread.mean,
+                "std": spread.std,
+                "low": spread.low,
+                "high": spread.high,
+                "samples": spread.count,
+                "mesh_error": self.mesh_error(name),
+                "wide_low": low,
+                "wide_high": high,
+                "truth_own_mesh": on_own,
+                "inside_own_mesh": _inside(spread.low, on_own, spread.high),
+                "truth_same_mesh": on_same,
+                "inside_same_mesh": _inside(spread.low, on_same, spread.high),
+                "inside_wide": _inside(low, on_own, high),
+            }
+        return rows
+
+
+def _inside(low: float, true: float | None, high: float) -> bool | None:
+    """Whether an interval holds the truth; None where one of them is not known."""
+    return None if true is None or not np.isfinite(high - low) else bool(low <= true <= high)
+
 
 def closed_valve(
     model: ClosureModel, m: FloatArray, *, sensitivities: bool = False

@@ -6,17 +6,19 @@ report can say so instead of drawing something else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.errors import InputError
 from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import Valve
 
 POINTS = "observed_points_"
 SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
@@ -110,6 +112,21 @@ class CaseFields:
     def chords(self, points: FloatArray, frame: int) -> FloatArray:
         """Ends ``(c, 2, 3)`` of the chordae; ``frame`` counts the reference frame as 0."""
         return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
+
+
+def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Arrays of a valve for `case_fields`, to which shapes in frames that were seen are added."""
+    surface = valve.surface
+    return {
+        "triangles": surface.triangles.astype(np.int32),
+        "region": surface.region.astype(np.int8),
+        "rest": surface.vertices.astype(np.float32),
+        "annulus": valve.annulus.astype(np.int32),
+        "free_edge": valve.free_edge.astype(np.int32),
+        "frames": np.array(frames),
+        "seen": np.ones(len(frames), dtype=bool),
+        "tips": np.stack([valve.papillary_tips] * (1 + len(frames))).astype(np.float32),
+    }
 
 
 def read_case_fields(path: Path, *, turned: bool = True) -> CaseFields:

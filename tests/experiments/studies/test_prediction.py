@@ -4,25 +4,18 @@ In place of the mechanics there is a stretch that is known in closed form; that 
 scenarios is checked in tests/prediction.
 """
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.studies.prediction import study as prediction
-from experiments.studies.prediction.figure import PANELS, prediction_figure
-from experiments.studies.prediction.findings import Findings
-from experiments.studies.prediction.report import (
-    SHOWN,
-    coverage,
-    prediction_words,
-    write_prediction,
-)
+from experiments.common.records.record import read_record
+from experiments.common.study import Results
+from experiments.studies import prediction
+from experiments.studies.prediction import DRAWN, PREDICTED, PRESCRIBED, coverage_table
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import build_system
-from tests.experiments.runner.logged import logged
 
 SMALL = (
     "experiment=prediction",
@@ -76,83 +69,81 @@ def buckled(self, m, *, sensitivities=True, every_frame=False):
 def run(run_here, monkeypatch):
     monkeypatch.setattr(prediction, "MEASURED_ON", (24, 7))
     monkeypatch.setattr(ClosureModel, "close", stretched)
-    return lambda *arguments: run_here(*SMALL, *arguments, findings=Findings)
+
+    def call(*arguments):
+        status, _, folder, said = run_here(*SMALL, *arguments)
+        file = folder / "result.json"
+        return status, read_record(file) if file.is_file() else None, folder, said
+
+    return call
+
+
+TITLES = ["as observed", "160 mmHg", "ring −20 % AP", "clip at A2–P2", "ring −10 % and clip"]
 
 
 def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):
     status, record, folder, said = run()
     assert status == 0, said.err
-    findings = record.findings
-    assert [len(p.scenarios) for p in findings.patients] == [5, 5]
-    patient = findings.patients[0]
-    assert list(patient.scenarios) == ["observed", "pressure", "ring", "clip", "both"]
-    for found in patient.scenarios.values():
-        assert found.failure == found.truth_failure == ""
-        assert len(found.sampled) == found.samples == 4
-        for row in found.measures.values():
-            assert row.low <= row.mean <= row.high
-            inside = row.low <= row.truth_own_mesh <= row.high
-            assert row.inside_own_mesh == inside
-            # Nothing is narrower for knowing of the mesh.
-            assert row.wide_low <= row.low <= row.high <= row.wide_high
-            if row.mesh_error > 1e-3 * abs(row.estimate):
-                assert row.wide_high > row.high
+    rows = record.table_of().rows
+    assert list(dict.fromkeys(row["scenario"] for row in rows)) == TITLES
+    assert [row["samples"] for row in rows] == [4] * 70 + [2] * 70
+    assert {row["measure"] for row in rows} >= PREDICTED.keys() | PRESCRIBED.keys()
+    for row in rows:
+        assert row["low"] <= row["mean"] <= row["high"]
+        assert row["inside_own_mesh"] == (row["low"] <= row["truth_own_mesh"] <= row["high"])
+        # Nothing is narrower for including the mesh's error.
+        assert row["wide_low"] <= row["low"] <= row["high"] <= row["wide_high"]
+        if row["mesh_error"] > 1e-3 * abs(row["estimate"]):
+            assert row["wide_high"] > row["high"]
+    found = {(row["scenario"], row["measure"]): row for row in rows if row["patient"] == 1}
     # The same stretch on either mesh: the truth is one, but its stress has other sample points.
-    row = patient.scenarios["observed"].measures["ap_diameter_mm"]
-    assert row.truth_own_mesh == pytest.approx(row.truth_same_mesh, rel=1e-3)
+    own = found["as observed", "ap_diameter_mm"]
+    assert own["truth_own_mesh"] == pytest.approx(own["truth_same_mesh"], rel=1e-3)
     # 160 in place of 120 mmHg: a third more stretch of y and as much of its logarithm's spread.
-    more = patient.scenarios["pressure"].measures["ap_diameter_mm"]
-    assert more.first_order_std == pytest.approx(4 / 3 * row.first_order_std, rel=1e-3)
-    assert more.estimate > row.estimate
+    more = found["160 mmHg", "ap_diameter_mm"]
+    assert more["first_order_std"] == pytest.approx(4 / 3 * own["first_order_std"], rel=1e-3)
+    assert more["estimate"] > own["estimate"]
     # The truth was drawn about the configured values, and is another for each patient.
-    truths = np.array([p.truth for p in findings.patients])
+    truths = np.array([[one.truth for one in e.unknowns[:3]] for e in record.estimates])
     assert np.all(np.abs(np.log(truths / [6.23, 2.09, 1.0])) < [0.8, 0.8, 0.04])
     assert not np.any(truths[0] == truths[1])
-    for one in findings.patients:
-        off = np.abs(np.subtract(one.estimate, one.truth))
-        assert np.all(off < 4 * np.array(one.std))
-        assert np.all(off > 0)
-    assert set(SHOWN) <= set(findings.measures)
-    assert coverage(findings, "tenting_height_mm", "own")[1] == 10
-    assert coverage(findings, "tenting_height_mm", "wide")[1] == 10
-
-    assert logged(folder)["forward_solves"] == record.forward_solves
-    assert not (folder / "prediction.png").exists()
-    write_prediction(folder, {"prediction": record}, {})
-    text = (folder / "prediction.md").read_text()
-    assert "All 30 samples gave a closed valve." in text
-    table = (folder / "prediction.csv").read_text().splitlines()
-    assert len(table) == 1 + 10 * len(findings.measures)
-    # Without a check nothing is said of the mesh's error, and with a failed one that it is missing.
-    said = prediction_words(replace(record, findings=without_mesh_error(findings)))
-    assert "not the error of the mesh" in said
-    assert "truth inside |" not in said
-    assert "]°, true" in said
-    assert "]°" not in text
-    figure = prediction_figure(findings, folder / "fields.npz")
+    for estimate in record.estimates:
+        for one in estimate.unknowns[:3]:
+            assert 0 < abs(one.estimate - one.truth) < 4 * one.std
+    assert len(record.table_of("parameters")) == 6
+    held = {row["measure"]: row for row in record.table_of("coverage").rows}
+    assert held["tenting height (mm)"]["without_mesh_error_of"] == 10
+    assert held["tenting height (mm)"]["with_mesh_error_of"] == 10
+    assert record.numbers["samples"] == 30
+    assert len(record.table_of("not_closed")) == 0
+    assert len(record.table_of("stress_by_mesh")) == 1
+    first = record.table_of("first_patient")
+    assert len(first) == len(PREDICTED) + len(PRESCRIBED)
+    assert list(first.readable()[0]) == [
+        "measure",
+        *(name for title in TITLES for name in (title, f"{title}, truth")),
+    ]
+    figure = prediction.figure(
+        Results({"prediction": record}, {"prediction": folder / "fields.npz"})
+    )
     valves, dots = figure.subfigs
-    assert [axes.get_title().split("\n")[0] for axes in valves.axes] == list(
-        findings.scenarios.values()
-    )
-    assert [axes.get_ylabel() for axes in dots.axes] == [label for _, label in PANELS]
+    assert [axes.get_title().split("\n")[0] for axes in valves.axes] == TITLES
+    assert [axes.get_title(loc="left") for axes in dots.axes] == [PREDICTED[name] for name in DRAWN]
 
 
-def without_mesh_error(findings):
-    """The same of a run that asked for none."""
-    unknown = {"wide_low": None, "wide_high": None, "inside_wide": None}
-
-    def narrower(scenario):
-        rows = {name: replace(row, **unknown) for name, row in scenario.measures.items()}
-        return replace(scenario, measures=rows)
-
-    patients = tuple(
-        replace(one, scenarios={name: narrower(s) for name, s in one.scenarios.items()})
-        for one in findings.patients
-    )
-    return replace(findings, check_mesh=(), patients=patients)
+def test_without_a_check_the_intervals_are_those_of_the_samples(run):
+    status, record, _, said = run("prediction.patients=1", "prediction.check_mesh=[]")
+    assert status == 0, said.err
+    assert {row["wide_low"] for row in record.table_of().rows} == {None}
+    held = record.table_of("coverage").rows[-1]
+    assert held["with_mesh_error_of"] == 0
+    assert held["without_mesh_error_of"] > 0
+    first = record.table_of("first_patient").rows[0]
+    row = record.table_of().rows[0]
+    assert (first["as observed, low"], first["as observed, high"]) == (row["low"], row["high"])
 
 
-def test_samples_that_fail_are_told(run, monkeypatch):
+def test_samples_that_fail_are_stated(run, monkeypatch):
     def sometimes(self, m, **settings):
         fails = self.ties is not None and self.mesh.elements.shape[0] == 24
         return (buckled if fails else stretched)(self, m, **settings)
@@ -160,13 +151,15 @@ def test_samples_that_fail_are_told(run, monkeypatch):
     monkeypatch.setattr(ClosureModel, "close", sometimes)
     status, record, folder, _ = run("prediction.patients=1")
     assert status == 0
-    clip = record.findings.patients[0].scenarios["clip"]
-    assert clip.failure == StepReason.SINGULAR.value
-    assert clip.failures == (StepReason.SINGULAR.value,) * 4
-    assert clip.measures == {}
-    text = prediction_words(record)
-    assert f"clip at A2–P2: 4 of 4 samples ({StepReason.SINGULAR.value})" in text
-    prediction_figure(record.findings, folder / "fields.npz")
+    failed = [row for row in record.table_of("not_closed").rows if row["scenario"] == TITLES[3]]
+    assert [(row["valve"], row["count"]) for row in failed] == [
+        ("at the estimate", 1),
+        ("sample", 4),
+    ]
+    assert {row["reason"] for row in failed} == {StepReason.SINGULAR.value}
+    assert not [row for row in record.table_of().rows if row["scenario"] == TITLES[3]]
+    assert record.numbers["samples_not_closed"] == 8
+    prediction.figure(Results({"prediction": record}, {"prediction": folder / "fields.npz"}))
 
 
 def test_a_valve_that_cannot_be_simulated_is_recorded_as_a_failure(run, monkeypatch):
@@ -175,7 +168,30 @@ def test_a_valve_that_cannot_be_simulated_is_recorded_as_a_failure(run, monkeypa
     assert status == 1
     assert record.status == "failed"
     assert StepReason.SINGULAR.value in record.reason
-    assert "no prediction: " in prediction_words(record)
+    assert len(record.table_of()) == 0
+    assert [row["valve"] for row in record.table_of("not_closed").rows] == ["estimate"] * 2
+
+
+def test_an_interval_without_width_counts_only_where_it_misses():
+    def row(low, high, truth, measure="gap_mm2"):
+        return {
+            "measure": measure, "low": low, "high": high, "truth_own_mesh": truth,
+            "truth_same_mesh": None, "inside_same_mesh": None, "wide_low": low - 0.5,
+            "wide_high": high + 0.5, "inside_own_mesh": low <= truth <= high,
+            "inside_wide": low - 0.5 <= truth <= high + 0.5,
+        }  # fmt: skip
+
+    rows = [
+        row(8.0, 12.0, 9.0),  # holds
+        row(0.0, 1.0, 5.0, "other"),
+        row(0.0, 0.0, 0.0),  # nothing to be wrong about, but with the mesh's error
+        row(0.0, 0.0, 1.5),  # misses
+        row(1.0, 2.0, 3.0) | {"inside_own_mesh": None},  # a truth that is not known
+    ]
+    gap = coverage_table(rows).rows[0]
+    assert (gap["without_mesh_error"], gap["without_mesh_error_of"]) == (1, 2)
+    assert (gap["with_mesh_error"], gap["with_mesh_error_of"]) == (2, 4)
+    assert (gap["same_mesh"], gap["same_mesh_of"]) == (0, 0)
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,0 @@
-"""What an estimated valve would do."""

@@ -1,0 +1,136 @@
+"""Predicted closed valves seen from the atrium, with measures and their intervals below.
+
+Leaflets are midsurfaces, which lie a thickness apart where they touch; the slit between them is
+drawn as tissue, and what is left open in the colour of blood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from mvest.errors import InputError
+from mvest.reporting.case.drawing import (
+    ATRIUM,
+    BLOOD,
+    TISSUE,
+    draw_valve,
+    leaflet_colours,
+    name_leaflets,
+    paint_gap,
+    same_scale,
+)
+from mvest.reporting.case.fields import read_case_fields
+from mvest.reporting.style import COLOURS, SMALL, TEXT, plain_axes
+
+Row = Mapping[str, Any]
+
+OTHER = "0.55"
+"""Colour of further patients."""
+
+
+def scenarios_figure(
+    fields: Path,
+    rows: Sequence[Row],
+    labels: Mapping[str, str],
+    reach_mm: float,
+    failed: Mapping[str, str],
+) -> Figure:
+    """The first patient's valve by scenario, above dots with 95 % intervals of all patients.
+
+    Parameters
+    ----------
+    fields : Path
+        As `mvest.reporting.case.fields.read_case_fields` reads it: the frames are the titles of the
+        scenarios, the fitted shapes the closed valves, NaN where one did not close.
+    rows : sequence of mapping
+        ``patient``, ``scenario``, ``measure`` and what
+        `mvest.scenarios.predict.PredictedScenario.against` says of it.
+    labels : mapping
+        Measures to be drawn, six at most, and what readers call them.
+    reach_mm : float
+        Distance of midsurfaces within which leaflets touch.
+    failed : mapping
+        Title of a scenario -> why the valve did not close.
+
+    Raises
+    ------
+    InputError
+        If the fields cannot be read.
+    """
+    valve = read_case_fields(fields, turned=False)
+    if valve.fitted is None:
+        raise InputError(f"{fields}: no closed valves")
+    figure = Figure(figsize=(max(2.7 * len(valve.frames), 8.0), 8.6), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=[1.0, 1.75])
+    upper, lower = parts
+    panels = np.atleast_1d(upper.subplots(1, len(valve.frames)))
+    colours = leaflet_colours(valve.region)
+    patients = list(dict.fromkeys(row["patient"] for row in rows))
+    gaps = {
+        row["scenario"]: row["estimate"]
+        for row in rows
+        if row["measure"] == "gap_mm2" and row["patient"] == patients[0]
+    }
+    for axes, title, shape in zip(panels, valve.frames, valve.fitted, strict=True):
+        if not np.isfinite(shape).all():
+            axes.set_axis_off()
+            axes.set_title(f"{title}\nnot closed: {failed.get(title, '')}", fontsize=SMALL)
+            continue
+        draw_valve(axes, valve, shape, colours, ATRIUM, 0)
+        paint_gap(axes, valve, shape, 0, reach_mm)
+        axes.set_title(f"{title}\ngap {gaps[title]:.1f} mm²", fontsize=TEXT)
+    name_leaflets(panels[0], valve, ("anterior", "posterior"))
+    known = [shape for shape in valve.fitted if np.isfinite(shape).all()]
+    same_scale(list(panels), [*known, valve.rest], ATRIUM)
+    names = {"gap": BLOOD, "leaflets touch (between midsurfaces)": TISSUE}
+    handles = [Patch(color=colour, label=label) for label, colour in names.items()]
+    upper.legend(handles=handles, loc="lower right", fontsize=SMALL, frameon=False, ncols=2)
+    grid: Any = lower.subplots(2, 3)
+    for axes, (measure, label) in zip(grid.flat, labels.items(), strict=False):
+        _draw_measure(axes, [r for r in rows if r["measure"] == measure], valve.frames, patients)
+        axes.set_title(label, fontsize=SMALL, loc="left")
+    _draw_legend(lower, grid.flat[0])
+    title = "An estimated valve as observed and under changed conditions (simulated)"
+    figure.suptitle(f"{title}\n", fontsize=TEXT + 2)
+    return figure
+
+
+def _draw_measure(
+    axes: Any, rows: Sequence[Row], titles: Sequence[str], patients: Sequence[Any]
+) -> None:
+    plain_axes(axes)
+    for row in rows:
+        number = patients.index(row["patient"])
+        x = titles.index(row["scenario"]) - 0.12 + (0.14 + 0.13 * number if number else 0.0)
+        colour = OTHER if number else COLOURS[0]
+        for low, high, width in (("wide_low", "wide_high", 0.8), ("low", "high", 2.5)):
+            if row[low] is not None:
+                axes.plot([x, x], [row[low], row[high]], color=colour, lw=width)
+        axes.plot(x, row["estimate"], "o", color=colour, ms=5)
+        for truth, marker, shade, size in (
+            ("truth_own_mesh", "x", COLOURS[1], 6),
+            ("truth_same_mesh", "_", "black", 9),
+        ):
+            if row[truth] is not None:
+                axes.plot(x, row[truth], marker, color=shade, ms=size, zorder=4)
+    axes.set_xticks(range(len(titles)), titles, fontsize=SMALL, rotation=20, ha="right")
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+
+
+def _draw_legend(figure: Any, axes: Any) -> None:
+    for label, colour in (
+        ("estimate (drawn above), 95 %: thick samples, thin with the mesh", COLOURS[0]),
+        ("further simulated patients", OTHER),
+    ):
+        axes.errorbar([], [], yerr=[], fmt="o", color=colour, label=label)
+    axes.plot([], [], "x", color=COLOURS[1], label="true valve (its own mesh)")
+    axes.plot([], [], "_", color="black", label="true valve (same mesh)")
+    handles, labels = axes.get_legend_handles_labels()
+    where = "outside lower center"
+    figure.legend(handles, labels, loc=where, fontsize=SMALL, frameon=False, ncols=4)
