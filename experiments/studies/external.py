@@ -240,6 +240,7 @@ def run(job: Job[Settings]) -> Result:
         {"data": seen, "model": name}
         | {key: row.get(key) for key in SHOWN}
         | {"apart": _apart(row["estimate"], records.get((seen, seen)), k)}
+        | {"residual": record.innovation and record.innovation.residual_rms}
         | programs.get((seen, name), {})
         for (seen, name), record in records.items()
         for k, row in enumerate(record.rows())
@@ -261,7 +262,7 @@ SHOWN = (
 )
 """What the table takes of the rows of a record."""
 
-COLUMNS = {
+COLUMNS: dict[str, Column | str] = {
     "prior_mean": Column(std="prior_std", label="prior"),
     "estimate": Column(digits=".3f", std="std"),
     "relative_error": Column(digits="+.2%", label="error"),
@@ -270,7 +271,9 @@ COLUMNS = {
     "distance_mean": Column("mm"),
     "distance_max": Column("mm"),
     "apart": Column(digits="+.2%", label="apart from the data's own model"),
+    "residual": "mm",
 }
+"""The residual is the root mean square of a coordinate."""
 
 
 def _apart(value: float | None, own: EstimateRecord | None, k: int) -> float | None:
@@ -346,15 +349,21 @@ def figure(results: Results) -> Figure | None:
     drawn = [one for one in results.first.estimates if one.iterates]
     if not drawn:
         return None
+    # The colour is the model's, the line the data's.
+    models = list(dict.fromkeys(one.case.rpartition(", from ")[0] for one in drawn))
+    first = drawn[0].case.rpartition(", from ")[2]
     whole, axes = panels(1, len(drawn[0].unknowns), 4.2)
     for k, unknown in enumerate(drawn[0].unknowns):
-        for n, one in enumerate(drawn):
+        for one in drawn:
+            n = models.index(one.case.rpartition(", from ")[0])
             style = {"color": COLOURS[n % 6], "marker": MARKERS[n % 6], "fillstyle": "none"}
-            axes[0, k].plot([at[k] for at in one.iterates], label=one.case, **style)
+            line = "-" if one.case.endswith(first) else ":"
+            axes[0, k].plot([at[k] for at in one.iterates], line, label=one.case, **style)
         if unknown.truth is not None:
             axes[0, k].axhline(unknown.truth, color=GREY, linestyle="--", label="truth")
         unit = f" ({unknown.unit})" if unknown.unit else ""
         axes[0, k].set(xlabel="iteration", ylabel=unknown.name + unit)
+        axes[0, k].xaxis.get_major_locator().set_params(integer=True)
     lines, names = axes[0, 0].get_legend_handles_labels()
     whole.legend(lines, names, loc="outside upper center", ncols=2, frameon=False, fontsize=SMALL)
     return whole

@@ -16,8 +16,7 @@ from experiments.common.config import hash_of
 from experiments.common.schema import Reads, build
 from experiments.common.study import load_settings, study_names
 from experiments.run import main
-from experiments.studies.donor.settings import DonorSettings
-from experiments.studies.donor.study import build_donor
+from experiments.studies.imported import DonorSettings, recorded_valve
 from mvest.cases.importing.reference_heart import PARTS
 from mvest.cases.writer import write_case
 from mvest.external import write_points
@@ -26,7 +25,7 @@ from mvest.imaging.writing import write_sequence_nrrd
 from mvest.reading.json_file import read_mapping
 from tests.cases.from_images.test_imaged_case import sequence
 from tests.experiments.configured import composed, plain
-from tests.experiments.studies import test_donor
+from tests.experiments.studies import test_imported
 from tests.external.programs import SPRINGS, springs
 from tests.made_up_closure import made_up_case
 from tests.valve.io import recorded
@@ -216,10 +215,10 @@ def test_nothing_is_read_that_is_not_in_the_hash(given, monkeypatch, made):
 
 def test_of_a_recording_nothing_is_read_that_is_not_in_the_hash(given):
     recorded.write(given, recorded.skirt())
-    config = plain(composed(*test_donor.SMALL, f"donor.recording={given}"))
+    config = plain(composed(*test_imported.SMALL, f"donor.recording={given}"))
     with all_digested(given):
         first = hash_of(config)
-        build_donor(config, build(DonorSettings, config["donor"]))
+        recorded_valve(config, build(DonorSettings, config["donor"]))
     other = recorded.skirt()
     other["frames"] = other["frames"] + 1e-4
     recorded.write(given, other)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.studies.donor.settings import CITATION, DATA_VARIABLE
+from experiments.studies.imported import DATA_VARIABLE, DONOR_CITATION
 from mvest.errors import GeometryError, InputError
 from mvest.valve.io.abaqus.chords import trace_cables, truss_stiffness
 from mvest.valve.io.abaqus.deck import ElementSection, blocks_of
@@ -319,7 +319,7 @@ REAL = SetNames(
 def real_case(name: str) -> Recording:
     place = Path(os.environ.get(DATA_VARIABLE) or ROOT.parent / "shared" / "data" / "trivalve")
     if not (place / name).is_dir():
-        pytest.skip(f"needs the donor valve: {CITATION}; name its folder in {DATA_VARIABLE}")
+        pytest.skip(f"needs the donor valve: {DONOR_CITATION}; name its folder in {DATA_VARIABLE}")
     return read_recording(place / name, REAL)
 
 

@@ -1,1 +1,0 @@
-"""The recorded donor valve."""

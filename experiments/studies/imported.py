@@ -1,0 +1,539 @@
+"""Valves from outside: imported, closed, gated and estimated from.
+
+A recorded closure (``donor``) is fitted from its closed frame, from several starts. The shape of a
+reference heart (``heart``) is measured, meshed and closed, and moduli that were put in are
+estimated on it. Neither is part of this project; the messages say where they are from.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from experiments.common.building.anatomy import anatomy_of, build_mesh, folder_hash
+from experiments.common.building.closing import close_valve, draw_closing
+from experiments.common.building.closure import closure_model, mechanics_of
+from experiments.common.building.filters import build_filter
+from experiments.common.building.gate import anatomy_digest, gate_cases, gate_rows
+from experiments.common.building.twin import build_twin
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
+from experiments.common.schema import Reads, contents
+from experiments.common.study import Job, Result, Results, Study
+from mvest.cases.case import Role, ValveCase
+from mvest.cases.importing.reference_heart import (
+    CITATION,
+    ReferenceHeartOptions,
+    heart_files,
+    heart_parts,
+    import_reference_heart,
+)
+from mvest.cases.plausibility import free_orifice
+from mvest.cases.writer import write_case
+from mvest.closure.model import ClosureModel
+from mvest.closure.robustness import GATE_CASES, run_gate
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.wrappers import Remembered, SharedStart
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.observation.surfaces import mean_surface_distance
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import estimate
+from mvest.problem.problem import Problem
+from mvest.problem.record import EstimateRecord, record_of
+from mvest.reporting.tables import Column, Table, table
+from mvest.scenarios.scenario import plane_of
+from mvest.typing import FloatArray
+from mvest.units import mpa_to_mmhg
+from mvest.valve.geometry.surface_checks import enclosed_volume
+from mvest.valve.geometry.triangles import areas
+from mvest.valve.io.abaqus.leaflet_mesh import SetNames
+from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
+from mvest.valve.measure.annulus import measure_annulus
+from mvest.valve.measure.measurements import leaflet_length
+from mvest.valve.mesh.remesh import Remeshed, remesh
+from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
+from mvest.valve.mesh.structured import layered_wedges
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "DATA_VARIABLE",
+    "DONOR_CITATION",
+    "STUDY",
+    "DonorSettings",
+    "Recorded",
+    "recorded_valve",
+]
+
+Values = Mapping[str, Any]
+
+DATA_VARIABLE = "MVEST_TRIVALVE"
+"""Environment variable that names a checkout of the donor's data."""
+DONOR_CITATION = (
+    "Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w; data: "
+    "https://github.com/SoftTissueBiomechanicsLab/Texas_TriValve_1.1, licence CC BY 4.0"
+)
+
+
+def recording_folder(recording: str | None, case: str) -> Path:
+    """The folder of a case in a checkout of the donor's data.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message says where to get it.
+    """
+    folder = Path(recording or "") / case
+    if not recording or not folder.is_dir():
+        raise InputError(
+            f"donor valve: there is no folder {folder}. It is not part of this package: clone "
+            f"Texas TriValve 1.1 ({DONOR_CITATION}) and name the clone as donor.recording or in "
+            f"the environment variable {DATA_VARIABLE}"
+        )
+    return folder
+
+
+def _recording(value: str | None, beside: Values) -> Any:
+    try:
+        return contents(recording_files(recording_folder(value, str(beside.get("case", "")))))
+    except InputError:
+        # The study says where to get it.
+        return value
+
+
+def _parts(value: str, _: Values) -> Any:
+    try:
+        return contents([str(file) for file in heart_files(value)])
+    except InputError:
+        return value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DonorSettings:
+    """A recorded closure; names of sets are those of its input deck."""
+
+    # Checkout of the data.
+    recording: Annotated[str | None, Reads(_recording)] = None
+    case: str = ""  # folder in it, after which its deck and frames are called; empty: no donor
+    leaflets: dict[str, str] = field(default_factory=dict)  # name of a leaflet -> element set
+    annulus: str = ""  # node set
+    free_edge: str = ""  # node set
+    # Of the midsurface that is meshed and observed, and of that on which contact is sampled.
+    vertices: Annotated[int, Field(ge=0, le=100_000)] = 430
+    contact_vertices: Annotated[int, Field(ge=0, le=100_000)] = 3000
+    starts: tuple[Any, ...] = ()  # MPa, moduli from which each fit starts
+    # Of a modulus' logarithm from one closed state to the next.
+    largest_change: Annotated[float, Field(ge=0, le=10)] = 0.15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeartSettings:
+    """The shape of a reference heart."""
+
+    # The heart (GLB) or a folder with its parts; null: what the variable MVEST_HRA names.
+    source: Annotated[str | None, Reads(_parts)] = None
+    options: ReferenceHeartOptions = field(default_factory=ReferenceHeartOptions)
+    # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).
+    closures: dict[str, dict[str, float]] = field(default_factory=dict)
+    gate: tuple[str, ...] = ()  # variations of the gate
+    # Of each twin, what its truth has otherwise than the estimator's model (settings of truth).
+    twins: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    donor: DonorSettings = field(default_factory=DonorSettings)
+    heart: HeartSettings = field(default_factory=HeartSettings)
+
+
+def run(job: Job[Settings]) -> Result:
+    """Fit the recorded donor valve, or do everything of the reference heart.
+
+    Raises
+    ------
+    MvestError
+        If the data are absent (the message says where to get them) or a setting is inadmissible.
+    """
+    return _donor(job) if job.settings.donor.case else _heart(job)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """A recorded valve, ready to be closed; ``coarse`` is its midsurface as meshed and observed."""
+
+    recording: Recording
+    coarse: Remeshed
+    contact: Remeshed
+    mesh: SolidMesh
+    settings: MechanicsSettings
+    seen: FloatArray
+
+    def model(self, parameters: tuple[str, ...], **settings: Any) -> ClosureModel:
+        """A model of the open valve."""
+        coarse, contact = map(self.recording.valve, (self.coarse, self.contact))
+        return ClosureModel(coarse, contact, self.mesh, self.settings, parameters, **settings)
+
+    def distances(self, closed: FloatArray) -> dict[str, float]:
+        """Distances (mm) of closed positions ``(n, 3)`` from where they were recorded.
+
+        The surface's is the mean of the whole surface from the recorded one, both ways.
+        """
+        d, surface = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface
+        recorded = self.recording.frames[-1], self.recording.surface.triangles
+        return {
+            "mean": float(d.mean()),
+            "median": float(np.median(d)),
+            "rms": float(np.sqrt(np.mean(d**2))),
+            "max": float(d.max()),
+            "surface": mean_surface_distance(closed, surface.triangles, *recorded),
+        } | {
+            name: float(d[np.unique(surface.triangles[surface.region == k])].mean())
+            for k, name in enumerate(surface.region_names)
+        }
+
+
+def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
+    """Read, mesh and load the recorded valve as configured.
+
+    Raises
+    ------
+    MvestError
+        If the data are absent or a setting is inadmissible.
+    """
+    names = SetNames(donor.leaflets, donor.annulus, donor.free_edge)
+    recording = read_recording(recording_folder(donor.recording, donor.case), names)
+    settings = mechanics_of(config)
+    protocol = settings.protocol
+    if protocol.pressure_mmHg != 0 or protocol.curve:
+        raise ConfigurationError(
+            f"mechanics.protocol.pressure_mmHg = {protocol.pressure_mmHg}: the recording says how "
+            "large the pressure is and how it rises; leave it 0, without a curve"
+        )
+    # The pressure may rise otherwise than the motion.
+    shares, times = recording.pressure_share, recording.times / recording.times[-1] * protocol.ramp
+    together = np.allclose(shares, recording.phase, rtol=0, atol=1e-12)
+    curve = () if together else tuple(zip(times.tolist(), shares.tolist(), strict=True))
+    loaded = replace(protocol, pressure_mmHg=mpa_to_mmhg(recording.pressure), curve=curve)
+    unknown = [f"E_f.{name}" for name in recording.surface.region_names]
+    if sorted(unknown) != sorted(config["parameters"]):
+        raise ConfigurationError(
+            f"parameters = {config['parameters']}, expected one modulus for each leaflet: {unknown}"
+        )
+    coarse, contact = (
+        remesh(recording.surface, recording.annulus, recording.free_edge, count)
+        for count in (donor.vertices, donor.contact_vertices)
+    )
+    layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
+    mesh = layered_wedges(coarse.surface, onto=recording.surface, **layers).solid
+    seen = recording.positions(coarse.triangle, coarse.weights, -1)
+    return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
+
+
+def _donor(job: Job[Settings]) -> Result:
+    values, donor = job.values, job.settings.donor
+    parameters = tuple(values["parameters"])
+    filter_, transform, prior = build_filter(values["filter"], parameters)
+    if not isinstance(filter_, IteratedFilter):
+        raise ConfigurationError(
+            "filter: a recorded valve needs the iterated filter, whose result does not depend on "
+            "the start by construction"
+        )
+    starts = [np.array(start, dtype=float) for start in donor.starts]
+    if not starts or any(start.shape != prior.mean.shape for start in starts):
+        raise ConfigurationError(
+            f"donor.starts = {list(donor.starts)}, expected lists of {len(parameters)} moduli each"
+        )
+    valve = recorded_valve(values, donor)
+    seen = Observation(("closed",), valve.seen[None], np.asarray(values["filter"]["R"]))
+    how = {"continuation": values["continuation"], "largest_change": donor.largest_change}
+    steps, records, rows, shapes = len(valve.settings.protocol.steps()), [], [], {}
+    with SolveBar("donor", steps, TYPICAL_SOLVES * len(starts), parameters) as bar:
+        first = valve.model(parameters, repeat=False, **how)
+        first.on_step = bar.step
+        # A start is met again by rounding of its logarithm.
+        known = Remembered(first, rtol=1e-12)
+        generic: Prediction = known(prior.mean)
+        row = {"closure": "generic", "ended": generic.reason, "predictions": 1, "equilibria": 1}
+        if generic.converged:
+            shapes["generic"] = generic.y.reshape(2, -1, 3)[1]
+            row |= valve.distances(shapes["generic"])
+        rows.append(row)
+        for k, start in enumerate(starts):
+            # Each goes on from the generic closed valve.
+            model = copy(first)
+            model.closures = 0
+            model_ = Remembered(model, known.runs, known.rtol)
+            own = replace(filter_, start=tuple(map(float, start)))
+            tissue = valve.settings.tissue
+            problem = Problem(parameters, model_, prior, own, transform, tissue)
+            found = estimate(problem, seen, on_iterate=bar.iterate)
+            record = record_of(found, case=f"fitted, start {k + 1}", simulated=True)
+            row = {"closure": record.case, "ended": record.reason, "equilibria": model.closures}
+            row |= {"iterations": record.iterations, "predictions": record.forward_solves}
+            if found.fitted is not None:
+                shapes.setdefault("fitted", found.fitted[-1])
+                row |= valve.distances(found.fitted[-1])
+            rows.append(row)
+            records.append(record)
+    rest = valve.coarse.surface.vertices
+    tips = valve.recording.papillary_tips
+    failed = [one for one in records if not one.converged]
+    ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
+    return Result(
+        tables={"": table(rows, **DISTANCES), "moduli": moduli_table(records)},
+        estimates=tuple(records),
+        numbers={
+            "data": DONOR_CITATION,
+            "pressure_mmHg": valve.settings.protocol.pressure_mmHg,
+            "recorded_motion_mm": float(np.linalg.norm(valve.seen - rest, axis=1).mean()),
+            "tip_motion_mm": float(np.linalg.norm(tips[-1] - tips[0], axis=1).max()),
+        },
+        arrays=_arrays(valve, shapes) if len(shapes) == 2 else {},
+        status="failed" if failed or not generic.converged else "converged",
+        reason=ended if not failed or not generic.converged else failed[0].reason,
+        detail=records[0].detail,
+        mesh=Mesh.of(valve.mesh),
+        forward_solves=1 + sum(one.forward_solves or 0 for one in records),
+    )
+
+
+DISTANCES: dict[str, Column | str] = {
+    "closure": "",
+    "ended": Column(hidden=True),
+    **dict.fromkeys(("mean", "median", "rms", "max", "surface"), "mm:.2f"),
+}
+
+
+def moduli_table(records: list[EstimateRecord]) -> Table:
+    """A row for each modulus of each estimate."""
+    keys = ("parameter", "truth", "prior_mean", "estimate", "std", "bound", "relative_error")
+    rows = [
+        {"estimation": one.case} | {key: row.get(key) for key in (*keys, "distance_mean", "reason")}
+        for one in records
+        for row in one.rows()
+        if row.get("kind", "modulus") == "modulus"
+    ]
+    columns: dict[str, Column | str] = {
+        "truth": Column("MPa"),
+        "prior_mean": Column("MPa", hidden=True),
+        "estimate": Column("MPa", std="std"),
+        "bound": Column("MPa", ".2g", label="data alone leave"),
+        "relative_error": Column(digits="+.2%", label="error"),
+        "distance_mean": "mm",
+        "reason": Column(hidden=True),
+    }
+    return table(rows, estimation="", parameter="", **columns)
+
+
+def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """As those of a case (`mvest.reporting.case.fields`)."""
+    surface, tips = valve.coarse.surface, valve.recording.papillary_tips
+    away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
+    return {
+        "triangles": surface.triangles,
+        "region": surface.region,
+        "annulus": valve.coarse.annulus,
+        "free_edge": valve.coarse.free_edge,
+        "rest": surface.vertices,
+        "frames": np.array(["closed"]),
+        "seen": np.array([True]),
+        "tips": tips[[0, -1]],
+        "observed": valve.seen[None],
+        **{name: points[None] for name, points in shapes.items()},
+        **{f"distance_{name}": distance for name, distance in away.items()},
+    }
+
+
+def _heart(job: Job[Settings]) -> Result:
+    heart, values = job.settings.heart, job.values
+    asked = gate_cases(heart.gate)
+    source = None if heart.source is None else Path(heart.source)
+    case = import_reference_heart(source, heart.options)
+    own = _on_case(values, case, job.folder / "case")
+    usual = {
+        "annulus_contraction": own["valve"]["annulus_contraction"],
+        "closed_depth": heart.options.closed_depth,
+    }
+    closing = close_valve(own)
+    ends = closing.ends()
+    rows = _closure_rows("as in gate and twins", usual, ends.steps())
+    for number, (name, changes) in enumerate(heart.closures.items()):
+        assumed = usual | changes
+        options = replace(heart.options, closed_depth=assumed["closed_depth"])
+        place = job.folder / f"case_{number}"
+        there = _on_case(values, import_reference_heart(source, options), place)
+        there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
+        rows += _closure_rows(name, assumed, close_valve(there, name).ends().steps())
+    truth = np.array(own["truth"]["values"], dtype=float)
+    gate = run_gate(
+        lambda each: closure_model(own, each),
+        truth,
+        asked,
+        on_case=lambda row: _say(f"gate, {row.case}: max {row.max_mm:.2g} mm, {row.reason}"),
+        on_path=lambda path: _say(f"gate, along {path.name}: {path.reason or 'no jump'}"),
+    )
+    records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
+    tissue = heart_parts(source)[0]
+    volume = abs(enclosed_volume(tissue.vertices, tissue.triangles))
+    shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
+    failed = [one.reason for one in records if not one.converged]
+    steps = closing.result.simulation
+    failed += [] if steps.converged else [steps.reason.value]
+    left = len(GATE_CASES) - len(asked)
+    return Result(
+        tables={
+            "": table(rows, closure=""),
+            "shape": table([dict(zip(("name", "value", "unit"), r, strict=True)) for r in shape]),
+            "meshes": table(_meshes(own), volume="mm³:.0f"),
+            "gate": gate_rows(gate),
+            "moduli": moduli_table(records),
+            "derived": table([{"what follows from the source": text} for text in case.derived]),
+        },
+        estimates=tuple(records),
+        numbers={"anatomy": anatomy_digest(own), "passed": gate.passed, "data": CITATION},
+        arrays=ends.arrays(),
+        status="failed" if failed else "converged",
+        reason=failed[0] if failed else "completed",
+        mesh=Mesh.of(closing.model.mesh),
+        forward_solves=1
+        + len(heart.closures)
+        + len(gate.rows)
+        + sum(path.closures for path in gate.paths),
+        gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
+        f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
+    )
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
+    """The configuration on the anatomy of a case, which is written to a folder of its own."""
+    if place.exists():
+        shutil.rmtree(place)
+    write_case(place, case)
+    own = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
+    return {**values, "valve": {**values["valve"], **own}}
+
+
+def _closure_rows(name: str, assumed: Values, steps: Table) -> list[dict[str, Any]]:
+    """The open and the last state of a closure."""
+    states = zip(("open", "closed"), steps.rows, strict=True)
+    return [{"closure": name, **assumed, "state": state, **row} for state, row in states]
+
+
+def _sizes(case: ValveCase) -> list[tuple[str, float | None, str]]:
+    """Sizes of the open valve: name, value, unit."""
+    valve, surface, frame = case.valve, case.surface, case.frame(Role.REFERENCE)
+    plane = plane_of(valve, frame.annulus)
+    ring = measure_annulus(frame.annulus, plane)
+    tips, chordae = frame.papillary_tips, case.chordae
+    span = np.linalg.norm(chordae.insertion - tips[chordae.tip], axis=1)
+    found: list[tuple[str, float | None, str]] = [
+        ("annulus, anteroposterior diameter", ring.anteroposterior_diameter, "mm"),
+        ("annulus, commissural diameter", ring.commissural_diameter, "mm"),
+        ("annulus, height of the saddle", ring.height, "mm"),
+        ("annulus, circumference", ring.circumference, "mm"),
+        ("annulus, projected area", ring.projected_area, "mm²"),
+    ]
+    for k, name in enumerate(surface.region_names):
+        own = surface.triangles[surface.region == k]
+        thickness = float(np.median(surface.thickness[np.unique(own)]))
+        found += [
+            (f"{name} leaflet, length", leaflet_length(surface.vertices, own, plane), "mm"),
+            (f"{name} leaflet, area", float(areas(surface.vertices, own).sum()), "mm²"),
+            (f"{name} leaflet, median thickness", thickness, "mm"),
+        ]
+    edge = float(np.median(plane.coordinates(frame.free_edge)[:, 2]))
+    depth = plane.coordinates(tips)[:, 2]
+    return [
+        *found,
+        ("open orifice", free_orifice(case, frame), "mm²"),
+        ("free edge below the annulus, median", edge, "mm"),
+        ("distance of the papillary tips", float(np.linalg.norm(tips[1] - tips[0])), "mm"),
+        ("anterolateral tip below the annulus", float(depth[0]), "mm"),
+        ("posteromedial tip below the annulus", float(depth[1]), "mm"),
+        ("chordae (laid out)", float(len(chordae)), ""),
+        ("chordae, shortest distance tip to insertion", float(span.min()), "mm"),
+        ("chordae, median distance tip to insertion", float(np.median(span)), "mm"),
+    ]
+
+
+def _meshes(values: Values) -> list[dict[str, Any]]:
+    """The mesh in layers and that of tetrahedra, with the volume of their elements."""
+    anatomy, store = anatomy_of(values), Path(values["paths"]["outputs"]) / "meshes"
+    unstructured = {**values["mesh"], "source": "tetwild"}
+    element = values["mechanics"]["element"]
+    rows = []
+    for name, how, kind in (
+        ("layers", values["mesh"], element),
+        ("pytetwild", unstructured, "tet10"),
+    ):
+        mesh = build_mesh(anatomy, how, kind, store)
+        points, weights = mesh.reference.points, mesh.reference.weights
+        size = jacobian_determinants(mesh.nodes, mesh.elements, mesh.reference, points) @ weights
+        count = {"nodes": len(mesh.nodes), "elements": len(mesh.elements)}
+        rows.append({"mesh": name, "element": kind, **count, "volume": float(size.sum())})
+    return rows
+
+
+def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
+    """Moduli from one simulated observation."""
+    twin = build_twin({**values, "truth": {**values["truth"], **changes}})
+    true, steps = twin.truth_values, len(twin.model.settings.protocol.steps())
+    with SolveBar(f"observation, {name}", steps, 1) as bar:
+        twin.truth_model.on_step = bar.step
+        seen = twin.source(true)
+    data = twin.observe(lambda m: seen, true, np.random.default_rng(values["seed"]))
+    if data.observation is None:
+        return EstimateRecord(case=name, status="failed", reason=data.reason)
+    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
+    with SolveBar(f"estimation, {name}", steps, TYPICAL_SOLVES, problem.parameters) as bar:
+        twin.model.on_step = bar.step
+        found = estimate(problem, data.observation, on_iterate=bar.iterate).against(data.truth)
+    return record_of(found, seed=values["seed"], case=name, simulated=True)
+
+
+def figure(results: Results) -> Figure | None:
+    """The closed donor valve with generic and fitted moduli, or the heart's open and closed."""
+    from matplotlib.figure import Figure
+
+    from mvest.reporting.case.figures import case_figure
+
+    name, record = next(iter(results.records.items()))
+    if name not in results.arrays:
+        return None
+    if "gate" not in record.tables:
+        return case_figure(results.arrays[name])
+    drawn = Figure(figsize=(8.0, 7.4), layout="constrained")
+    titles = {0: "open, as modelled", 1: "closed (simulated)"}
+    draw_closing(drawn, results.arrays[name], titles, ("anterior", "posterior"))
+    drawn.suptitle(
+        "Mitral valve of the HRA reference heart (male, v1.2): only its shape is real\n"
+        "Browne et al. 2022, doi 10.48539/HBM373.VSTV.568, CC BY 4.0; adapted",
+        fontsize=10,
+    )
+    return drawn
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run,
+    figure=figure,
+    captions={"": "A valve from outside and closures of its model."},
+    keeps_failures=True,
+)

@@ -1,0 +1,192 @@
+"""Valves from outside, on a small made-up recording and a made-up heart, and without any."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.common.records.record import read_record
+from experiments.common.schema import build
+from experiments.run import main
+from experiments.studies.imported import DATA_VARIABLE, DonorSettings, recorded_valve
+from mvest.cases.importing import reference_heart
+from mvest.closure.robustness import GateReport, GateRow
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.valve.mesh.solid_mesh import embed
+from tests.cases.importing.made_up_heart import heart
+from tests.experiments.configured import composed, plain
+from tests.valve.io.recorded import CASE, NAMES, skirt, write
+
+TRUTH = np.array([2.0, 1.0, 3.0])
+SMALL = [
+    "experiment=donor",
+    f"donor.case={CASE}",
+    f"donor.annulus={NAMES.annulus}",
+    f"donor.free_edge={NAMES.free_edge}",
+    *(f"donor.leaflets.{region}={name}" for region, name in NAMES.leaflets.items()),
+    "donor.vertices=70",
+    "donor.contact_vertices=336",
+    "donor.starts=[[1.5,1.5,1.5],[3,1,2]]",
+    "filter.initial=[1.5,1.5,1.5]",
+    "filter.P0=2.25",
+    "filter.R=1e-8",
+    "filter.method.tolerance=1e-3",
+    "mechanics.protocol.dt=0.5",
+    "mechanics.protocol.end=1.0",
+    "mechanics.newton.tolerance=1e-8",
+]
+"""Sucked outwards, so that nothing touches or buckles; the annulus narrows by a tenth."""
+
+SMALL_HEART = [
+    "experiment=reference_heart",
+    "mesh.edge_length=4.0",
+    "mechanics.contact_points.columns=72",
+    "mechanics.contact_points.rows=16",
+    "heart.options.closed_depth=0.75",  # the template's
+    "heart.options.smoothing_mm=1.0",
+    "mesh=coarse",
+    "observation.columns=40",
+    "observation.rows=10",
+    "heart.gate=[perturbed start]",
+    "tracking.enabled=false",
+]
+
+
+def made_up_recording(folder: Path) -> str:
+    """A skirt whose last frame is our own closure with the moduli ``TRUTH``."""
+    data = skirt()
+    write(folder, data)
+    place = f"donor.recording={folder}"
+    config = plain(composed(*SMALL, place))
+    valve = recorded_valve(config, build(DonorSettings, config["donor"]))
+    model = valve.model(tuple(config["parameters"]))
+    closed = model.close(TRUTH, sensitivities=False).simulation
+    assert closed.converged
+    fine = valve.recording.surface.vertices
+    free = np.setdiff1d(np.arange(len(fine)), valve.recording.annulus)
+    positions = embed(valve.mesh, fine)(closed.frames[-1])
+    data["frames"][-1, free] = positions[free]
+    write(folder, data)
+    return place
+
+
+def test_a_recorded_valve_end_to_end(run, tmp_path: Path) -> None:
+    place = made_up_recording(tmp_path)
+    status, _, err = run(*SMALL, place, "hydra.run.dir=here", "paths.results=published")
+    assert status == 0, err
+    assert "tricuspid" in (tmp_path / "here" / "donor.md").read_text()
+    record = read_record(tmp_path / "here" / "result.json")
+    assert record.status == "converged"
+    rows = record.table_of().rows
+    assert [row["closure"] for row in rows] == ["generic", "fitted, start 1", "fitted, start 2"]
+    # The recording is ours, but interpolated on other triangles than the mesh is made of.
+    for row, found in zip(rows[1:], record.estimates, strict=True):
+        estimate = [one.estimate for one in found.moduli]
+        # Nothing is known of the tissue but what is estimated.
+        assert all(one.truth is None for one in found.unknowns)
+        assert estimate == pytest.approx(TRUTH, rel=0.1)
+        assert row["mean"] < 0.5 * rows[0]["mean"]
+    one, other = ([u.estimate for u in found.moduli] for found in record.estimates)
+    assert one == pytest.approx(other, rel=5e-3)
+    names = {path.name for path in (tmp_path / "here").iterdir()}
+    assert {"donor.csv", "donor.md", "donor.png", "result.json", "fields.npz"} <= names
+    # Overrides keep a run out of the results.
+    assert not (tmp_path / "published").exists()
+
+
+def test_an_absent_recording_is_one_clear_line(run, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path / "nowhere"))
+    status, out, err = run("experiment=donor")
+    assert (status, out) == (2, "")
+    assert len(err.strip().splitlines()) == 1
+    assert err.startswith("error: donor valve: there is no folder")
+    assert DATA_VARIABLE in err
+    assert "Texas TriValve" in err
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("filter=paper", "needs the iterated filter"),
+        ("donor.starts=[[1,2]]", "expected lists of 3 moduli"),
+        ("donor.starts=[]", "expected lists of 3 moduli"),
+        ("donor.vertices=10", "remesh to 10 vertices"),
+        ("donor.vertexes=10", "did you mean vertices?"),
+        ("mechanics.element=hex18", "cannot thicken into 'hex18'"),
+        ("mechanics.protocol.pressure_mmHg=5", "the recording says how large the pressure is"),
+        ("donor.annulus=Rand", "no node sets 'Rand'; there are VALVE.ALL"),
+        ("donor.case=Other", "there is no folder"),
+    ],
+)
+def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
+    write(tmp_path, skirt())
+    settings = [word for word in SMALL if "tolerance" not in word or "newton" in word]
+    status, _, err = run(*settings, f"donor.recording={tmp_path}", override)
+    assert status == 2
+    assert words in err
+
+
+def gate_of_made_up(build, m, cases, on_case, on_path):
+    """What the gate would say; asking it is `tests.closure.test_robustness`'s."""
+    rows = [GateRow("reference", 0.0, 0.0, True, 1.0, "converged")]
+    rows += [GateRow(case.name, 0.1, 0.7, False, 1.0, "converged") for case in cases]
+    return GateReport(tuple(rows), (), None, False)
+
+
+def twin_of_made_up(values, name, changes):
+    """What a twin would give; estimating is the twin study's."""
+    assert values["valve"]["folder"]
+    unknown = Unknown(name="E_f.anterior", unit="MPa", estimate=6.3, std=0.1, truth=6.0)
+    return EstimateRecord(case=name, status="converged", reason="converged", unknowns=(unknown,))
+
+
+def run_heart(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
+    return main()
+
+
+@pytest.mark.slow
+def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.studies.imported.run_gate", gate_of_made_up)
+    monkeypatch.setattr("experiments.studies.imported._twin", twin_of_made_up)
+    source = heart(tmp_path / "heart")
+    monkeypatch.chdir(tmp_path)
+    assert run_heart(monkeypatch, *SMALL_HEART, f"heart.source={source}") == 0
+    (file,) = tmp_path.glob("outputs/reference_heart/*/result.json")
+    record = read_record(file)
+    sizes = {row["name"]: row["value"] for row in record.table_of("shape").rows}
+    # The template's, 26.9 mm by 36 mm.
+    assert sizes["annulus, anteroposterior diameter"] == pytest.approx(26.9, rel=0.05)
+    assert sizes["annulus, commissural diameter"] == pytest.approx(36.0, rel=0.05)
+    # Meshes of the midsurface with its thickness hold the tissue of the source.
+    tissue = sizes["tissue enclosed by the surface of the source"]
+    for row in record.table_of("meshes").rows:
+        assert row["volume"] == pytest.approx(tissue, rel=0.1)
+    opened, closed, still, *_ = record.table_of().rows
+    assert (opened["annulus_contraction"], still["annulus_contraction"]) == (0.08, 0.0)
+    assert closed["orifice"] < 0.2 * opened["orifice"]
+    gate = record.table_of("gate").rows
+    assert [row["variation"] for row in gate] == ["reference", "perturbed start"]
+    assert record.numbers["passed"] is False
+    assert record.gate.startswith("NOT passed")
+    assert record.gate.endswith("11 variations left out")
+    assert record.table_of("moduli").rows[0]["relative_error"] == pytest.approx(0.05)
+    assert list(file.parent.glob("*.png"))
+
+
+def test_without_the_heart_it_says_where_to_get_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(reference_heart.DATA_VARIABLE, str(tmp_path / "nowhere"))
+    monkeypatch.chdir(tmp_path)
+    assert run_heart(monkeypatch, "experiment=reference_heart", "tracking.enabled=false") == 2
+    said = capsys.readouterr().err
+    assert "The reference heart is not part of this package" in said
+    assert "Traceback" not in said
+
+
+def test_an_unknown_variation_of_the_gate_is_refused(tmp_path, monkeypatch, capsys):
+    source = heart(tmp_path / "heart")
+    monkeypatch.chdir(tmp_path)
+    arguments = [*SMALL_HEART, f"heart.source={source}", "heart.gate=[nothing]"]
+    assert run_heart(monkeypatch, *arguments) == 2
+    assert "'nothing', expected some of" in capsys.readouterr().err
