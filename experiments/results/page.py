@@ -1,13 +1,14 @@
 """``report.html``: all results on one page that needs nothing beside it.
 
-Each ``NAME.md`` of the results is a section, with the pictures ``NAME.png`` and ``NAME_PART.png``.
-Pictures are embedded and there is no script. Text is escaped by the template, and Markdown is
-rendered with raw HTML switched off.
+Each ``NAME.md`` of the results is a section, with the pictures ``NAME.png`` and ``NAME_PART.png``
+and their captions in it. Pictures are embedded and there is no script. Text is escaped by the
+template, and Markdown is rendered without raw HTML and pictures from elsewhere.
 """
 
 from __future__ import annotations
 
 import re
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ from mvest.reporting.pictures import embedded
 __all__ = ["REPORT", "write_report"]
 
 REPORT = "report.html"
+
+PICTURE = re.compile(r"^!\[(.*)\]\(([\w-]+)\.png\)$", re.MULTILINE)
+"""How a page of the results shows a picture."""
 
 
 def write_report(results: Path) -> Path:
@@ -53,16 +57,23 @@ def _section(path: Path, pictures: list[Path]) -> dict[str, Any]:
     heading, _, rest = body.partition("\n")
     if heading.startswith("# "):
         title, body = heading.removeprefix("# "), rest
+    captions = {name: _plain(caption) for caption, name in PICTURE.findall(body)}
     # The one tag that these files use; any other is shown as text.
-    body = re.sub(r"</?sub>", "", body)
+    body = re.sub(r"</?sub>", "", PICTURE.sub("", body))
     # Below the section's own heading.
     body = re.sub(r"^(#+ )", r"#\1", body, flags=re.MULTILINE)
-    html = MarkdownIt("commonmark", {"html": False}).enable("table").render(shown_text(body))
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
+    html = markdown.render(shown_text(body))
     html = html.replace("<table>", '<div class="scroll tall"><table>')
     html = html.replace("</table>", "</table></div>")
     return {
         "anchor": path.stem,
         "title": title,
         "body": Markup(html),
-        "pictures": [embedded(picture, f"{title}: {picture.stem}") for picture in pictures],
+        "pictures": [embedded(one, captions.get(one.stem, one.stem)) for one in pictures],
     }
+
+
+def _plain(markdown: str) -> str:
+    """Text that was escaped for Markdown."""
+    return unescape(re.sub(r"\\(\W)", r"\1", markdown))

@@ -145,7 +145,7 @@ def _places(values: Sequence[Any]) -> FloatArray:
         return numbers
     logarithms = np.log10(np.where(numbers > 0, numbers, 0.1 * some.min()))
     even, uneven = np.diff(logarithms), np.diff(numbers)
-    return logarithms if even.min() / even.max() > uneven.min() / uneven.max() else numbers
+    return logarithms if even.min() / even.max() >= uneven.min() / uneven.max() else numbers
 
 
 def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
@@ -224,9 +224,10 @@ def _paths(sweep: Sweep, values: Values) -> Figure | None:
 
 
 def _parted(values: Values, but: Sequence[str]) -> tuple[str, list[Any]]:
-    """The factor that parts panels, and its values; no name and one None where none does."""
+    """The factor that parts panels, rather names than numbers, and its values; or "" and None."""
     few = [name for name in values if name not in but and len(values[name]) <= MOST_PANELS]
-    return (few[0], values[few[0]]) if few else ("", [None])
+    chosen = min(few, key=lambda name: is_number(values[name]), default="")
+    return chosen, values.get(chosen, [None])
 
 
 def _heading(sweep: Sweep, column: str) -> str:

@@ -16,6 +16,13 @@ from mvest.errors import InputError
 
 __all__ = ["write_sweep"]
 
+CAPTIONS = {
+    "": "Errors and intervals along each factor.",
+    "matrix": "Errors over two factors.",
+    "paths": "Estimates after each iteration, from every start.",
+}
+"""End of the file name of a figure -> its caption."""
+
 
 def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
     """Write the tables and figures of one sweep; returns their paths.
@@ -37,21 +44,22 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
     from experiments.sweeps.figures import figures_of
     from mvest.reporting.figures import save_figure_with
 
-    base = results / f"sweep_{sweep.name}"
-    written = write_tables(
+    base, line = results / f"sweep_{sweep.name}", provenance_of(sweep.records)
+    drawn, written = figures_of(sweep), []
+    for part in CAPTIONS:
+        target = base.with_name(f"{base.name}_{part}" if part else base.name)
+        if part in drawn:
+            written += save_figure_with(target, drawn[part], line)
+        else:
+            # A picture of an older sweep would contradict the tables.
+            target.with_name(f"{target.name}.png").unlink(missing_ok=True)
+    tables = write_tables(
         base,
         sweep.title,
         {"": shortened(runs_of(sweep))},
         {"table": shortened(by_setting(sweep))},
         sweep.records,
+        captions=CAPTIONS,
         latex=True,
     )
-    drawn = figures_of(sweep)
-    for part in ("", "matrix", "paths"):
-        target = base.with_name(f"{base.name}_{part}" if part else base.name)
-        if part in drawn:
-            written += save_figure_with(target, drawn[part], provenance_of(sweep.records))
-        else:
-            # A picture of an older sweep would contradict the tables beside it.
-            target.with_name(f"{target.name}.png").unlink(missing_ok=True)
-    return written
+    return [*tables, *written]

@@ -181,7 +181,7 @@ def _swept(job: PlannedJob, end: End, overhead: float | None) -> SweptJob:
         start=settings["initial"],
         truth=truth,
         P0=settings["P0"],
-        Q=settings["Q"],
+        Q=settings["method"].get("Q", 0.0),
         R=settings["R"],
         overhead=overhead,
         record=end.record,
