@@ -50,9 +50,9 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
         target = base.with_name(f"{base.name}_{part}" if part else base.name)
         if part in drawn:
             written += save_figure_with(target, drawn[part], line)
-        else:
-            # A picture of an older sweep would contradict the tables.
-            target.with_name(f"{target.name}.png").unlink(missing_ok=True)
+        elif (older := target.with_name(f"{target.name}.png")).is_file():
+            # It would contradict the tables.
+            older.unlink()
     tables = write_tables(
         base,
         sweep.title,

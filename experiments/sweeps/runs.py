@@ -6,7 +6,7 @@ Nothing here depends on when or where a run was made, so that equal results give
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -39,13 +39,14 @@ ENDINGS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
 COVARIANCE = "filter coordinates²"
 """Filter coordinates are MPa, or logarithms where the filter works in them."""
 
-UNIT = "unit of the parameter"
+UNIT, BOUND, ERROR = "unit of the parameter", "Cramér–Rao bound", "signed error"
+"""A unit that differs from row to row where parameters do, and two columns."""
 
 COLUMNS = {
     **dict.fromkeys(("job", "seed", "status", "filter", "element"), ""),
     "noise": "mm", "parameter": "", "true value": UNIT, "start": UNIT,
     "P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²", "estimate": UNIT, "std": UNIT,
-    "low": UNIT, "high": UNIT, "Cramér–Rao bound": UNIT, "signed error": "%",
+    "low": UNIT, "high": UNIT, BOUND: UNIT, ERROR: "%",
     "distance mean": "mm", "distance SD": "mm", "distance max": "mm", "iterations": "",
     "forward solves": "", "reason": "",
 }  # fmt: skip
@@ -54,28 +55,35 @@ COLUMNS = {
 SAME = ("filter", "element", "noise_mm", "P0", "Q", "R", SEED)
 """Factors whose column says what the column of that name says anyway."""
 
-STATISTICS = {
-    "runs": Column(),
-    "failed": Column(),
-    "estimate": Column(UNIT, std="SD over runs", label="mean estimate ± SD over runs"),
-    "SD over runs": Column(UNIT),
-    "std": Column(UNIT, label="SD stated by the filter"),
-    "error": Column("%", label="mean error", hidden=True),
-    "median error": Column("%"),
-    "RMSE": Column("%"),
-    "largest error": Column("%"),
-    "RMSE / bound": Column(),
-    "coverage": Column("%", ".0f", low="coverage, low", high="coverage, high",
-                       label="95 % intervals that hold"),
-    "coverage, low": Column("%"),
-    "coverage, high": Column("%"),
-    "distance mean": Column("mm", hidden=True),
-    "distance SD": Column("mm", hidden=True),
-    "forward solves": Column(),
-    "forward solves, median": Column(hidden=True),
-    "forward solves, max": Column(hidden=True),
+STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
+    "estimate": (
+        Column(UNIT, std="SD over runs", label="mean estimate ± SD over runs"),
+        lambda good: good["estimate"].mean(),
+    ),
+    "SD over runs": (Column(UNIT), lambda good: good["estimate"].std()),
+    "std": (Column(UNIT, label="SD stated by the filter"), lambda good: good["std"].mean()),
+    "error": (Column("%", label="mean error", hidden=True), lambda good: good[ERROR].mean()),
+    "median error": (Column("%"), lambda good: good[ERROR].median()),
+    "RMSE": (Column("%"), lambda good: _rms(good[ERROR])),
+    "largest error": (Column("%"), lambda good: good[ERROR].abs().max()),
+    "RMSE / bound": (
+        Column(),
+        lambda good: _rms(good["estimate"] - good["true value"]) / (good[BOUND].mean() or np.nan),
+    ),
+    "coverage": (
+        Column("%", ".0f", low="coverage, low", high="coverage, high",
+               label="95 % intervals that hold"),
+        lambda good: _coverage(good)[0],
+    ),
+    "coverage, low": (Column("%"), lambda good: _coverage(good)[1]),
+    "coverage, high": (Column("%"), lambda good: _coverage(good)[2]),
+    "distance mean": (Column("mm", hidden=True), lambda good: good["distance mean"].mean()),
+    "distance SD": (Column("mm", hidden=True), lambda good: good["distance SD"].mean()),
+    "forward solves": (Column(), lambda good: good["forward solves"].mean()),
+    "forward solves, median": (Column(hidden=True), lambda good: good["forward solves"].median()),
+    "forward solves, max": (Column(hidden=True), lambda good: good["forward solves"].max()),
 }  # fmt: skip
-"""Columns of the table by setting after the factors."""
+"""Column -> what it is and how it follows from the runs of a setting that did not fail."""
 
 
 def factors_of(sweep: Sweep) -> dict[str, tuple[str, str]]:
@@ -143,8 +151,8 @@ def _cells(job: SweptJob, row: Mapping[str, Any], k: int) -> dict[str, Any]:
         "Q": _diagonal(job.Q, k),
         "low": low,
         "high": high,
-        "Cramér–Rao bound": row.get("bound"),
-        "signed error": None if error is None else 100.0 * error,
+        BOUND: row.get("bound"),
+        ERROR: None if error is None else 100.0 * error,
         "distance mean": row.get("distance_mean"),
         "distance SD": row.get("distance_std"),
         "distance max": row.get("distance_max"),
@@ -226,7 +234,9 @@ def by_setting(sweep: Sweep) -> Table:
         "setting": Column(),
         "parameter": Column(),
         **{name: Column(units.get(name, ""), hidden=True) for name in names},
-        **STATISTICS,
+        "runs": Column(),
+        "failed": Column(),
+        **{name: column for name, (column, _) in STATISTICS.items()},
         "failures": Column(hidden=not any(row.get("failures") for row in rows)),
     }
     return _table(sweep, rows, about)
@@ -250,33 +260,17 @@ def _statistics(runs: DataFrame) -> dict[str, Any]:
     good = good_of(runs)
     lost = runs.drop(good.index)["reason"]
     # Without the numbers of the filter's check.
-    parts = [reason.partition(NOT_THE_POSTERIOR)[:2] for reason in lost]
-    reasons = Counter("".join(part) for part in parts)
-    estimate, error, solves = good["estimate"], good["signed error"], good["forward solves"]
-    bound = good["Cramér–Rao bound"].mean()
-    rmse = np.sqrt(((estimate - good["true value"]) ** 2).mean())
-    share, low, high = _coverage(good)
+    reasons = Counter("".join(reason.partition(NOT_THE_POSTERIOR)[:2]) for reason in lost)
     return {
         "runs": len(good),
         "failed": len(lost),
-        "estimate": estimate.mean(),
-        "SD over runs": estimate.std(),
-        "std": good["std"].mean(),
-        "error": error.mean(),
-        "median error": error.median(),
-        "RMSE": np.sqrt((error**2).mean()),
-        "largest error": error.abs().max(),
-        "RMSE / bound": rmse / bound if bound > 0 else None,
-        "coverage": share,
-        "coverage, low": low,
-        "coverage, high": high,
-        "distance mean": good["distance mean"].mean(),
-        "distance SD": good["distance SD"].mean(),
-        "forward solves": solves.mean(),
-        "forward solves, median": solves.median(),
-        "forward solves, max": solves.max(),
+        **{name: number(good) for name, (_, number) in STATISTICS.items()},
         "failures": "; ".join(f"{n} x {text}" if n > 1 else text for text, n in reasons.items()),
     }
+
+
+def _rms(values: Series[Any]) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None]:
