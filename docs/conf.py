@@ -49,7 +49,6 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"mvest {release}"
 html_static_path = ["_static"]
 html_css_files = ["mvest.css"]
-html_extra_path = ["../results/report.html"]
 html_show_sourcelink = False
 html_sidebars = {"index": [], "start": []}
 html_copy_source = False

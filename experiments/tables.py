@@ -9,7 +9,8 @@ from pathlib import Path
 from experiments.results.keep import RECORDS, regenerate
 from experiments.results.page import write_report
 from experiments.runner.jobs.interruption import interruptible
-from experiments.sweeps.report import read_sweeps, write_sweep
+from experiments.sweeps.collected import read_sweeps
+from experiments.sweeps.report import write_sweep
 from mvest.errors import MvestError
 
 __all__ = ["main"]

@@ -215,7 +215,7 @@ class Config:
     isolate: Switch = True  # in a sweep, each job runs in a process of its own
     # What is varied in this job, by name.
     factors: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
-    # A sweep's name, size, kind, and under the name of each size its grid, or a list of grids of
+    # A sweep's name, size, and under the name of each size its grid, or a list of grids of
     # which it is the union; empty for a run by itself.
     sweep: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
     paths: Annotated[Paths, NOT_HASHED] = field(default_factory=Paths)

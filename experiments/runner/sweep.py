@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -13,25 +13,24 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
+from experiments.common.records.record import Record
 from experiments.common.schema import require_admissible_values
 from experiments.common.study import load_study
-from experiments.results.page import write_report
+from experiments.results.keep import publish, records_of
 from experiments.runner.collecting.collect import NOT_RUN, collect, read_ends
-from experiments.runner.collecting.restore import restore
 from experiments.runner.execution import slurm
 from experiments.runner.execution.check import require_admissible
 from experiments.runner.execution.drain import drain_here, drain_inline
-from experiments.runner.jobs.folder import nothing_empty, require_writable
+from experiments.runner.jobs.folder import last_record, nothing_empty, require_writable
 from experiments.runner.planning.compose import make_plan
 from experiments.runner.planning.plan import Plan
 from experiments.runner.planning.progress import SweepBar
 from experiments.runner.tracking.store import Store
 from experiments.runner.tracking.summary import SWEEP
 from experiments.runner.tracking.sync import log_sweep, open_early
-from experiments.sweeps.collected import Sweep
+from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
-from mvest.provenance import sealed, write_json
 from mvest.quantities import Gigabytes, Processes, within
 
 __all__ = ["collect_sweep", "run_sweep"]
@@ -183,19 +182,51 @@ def _collect(plan: Plan, to_come: int, store: Store | None = None) -> int:
     found = _write(plan)
     if plan.common["tracking"]["enabled"]:
         log_sweep(plan.common, plan, store)
-    restored = restore(plan)
+    restored = _restore(plan)
     if restored:
         print(f"{plan.name}: results take over {restored} runs of earlier attempts")
-    missing = any(job.reason == NOT_RUN for job in found.jobs)
+    missing = any(record.reason == NOT_RUN for record in found.records)
     if not missing and not to_come:
         _publish(plan, found)
-    return 0 if all(job.converged for job in found.jobs) else 1
+    return 0 if all(record.converged for record in found.records) else 1
+
+
+def _restore(plan: Plan) -> int:
+    """Let the results take over what jobs ended with where they have other records, or none.
+
+    A job publishes its own record as it ends. What was done before is not run again, and the
+    results may have been put back to another state since. Returns how many were taken over.
+    """
+    groups: dict[tuple[Path, str, str], dict[str, tuple[Record, Path]]] = {}
+    for job in plan.jobs:
+        record = last_record(job.folder, job.config_hash) if job.publish_as else None
+        if record is None or not (record.converged or load_study(record.study).keeps_failures):
+            continue
+        results = Path(job.values["paths"]["results"])
+        runs = groups.setdefault((results, record.study, record.table), {})
+        runs[str(job.publish_as)] = record, job.folder
+    count = 0
+    for (results, study, table), runs in groups.items():
+        kept = records_of(results, table)
+        hashes = {
+            name: record.provenance.config_hash
+            for name, record in (kept.records.items() if kept is not None else ())
+        }
+        new = {
+            name: run
+            for name, run in runs.items()
+            if hashes.get(name) != run[0].provenance.config_hash
+        }
+        if new:
+            publish(load_study(study), results, new)
+        count += len(new)
+    return count
 
 
 def _write(plan: Plan) -> Sweep:
     path = plan.folder / SWEEP
     found = collect(plan, read_ends(plan.folder))
-    write_json(path, sealed(asdict(found)))
+    write_sweep_file(path, found)
     print(_outcome(plan, found))
     print(f"Written to {path}")
     return found
@@ -204,15 +235,16 @@ def _write(plan: Plan) -> Sweep:
 def _outcome(plan: Plan, found: Sweep) -> str:
     """How a sweep ended, in one line."""
     total, ran = len(plan.jobs), len(plan.to_run)
-    failed = [job for job in found.jobs if not job.converged]
-    missing = sum(job.reason == NOT_RUN for job in failed)
+    failed = [record for record in found.records if not record.converged]
+    missing = sum(record.reason == NOT_RUN for record in failed)
+    stored = [record.numbers.get("truth_store") for record in found.records]
     text = f"{plan.name}: {total - len(failed)} of {total} jobs done"
     text += f" ({total - ran} before), " if total > ran else ", "
     text += f"{len(failed) - missing} without an estimate"
     if missing:
         text += f", {missing} not finished"
-    text += f"; stored truths used {found.truth_hits} times, {found.truth_misses} simulated"
-    overheads = [cost.overhead for cost in found.cost if cost.overhead is not None]
+    text += f"; stored truths used {stored.count('hit')} times, {stored.count('miss')} simulated"
+    overheads = [job.overhead for job in found.jobs if job.overhead is not None]
     if overheads:
         text += f"; overhead {median(overheads):.2f} s per job"
     return text
@@ -226,11 +258,10 @@ def _publish(plan: Plan, found: Sweep) -> None:
     if not plan.publish:
         print(f"{results} left as it is: this sweep has overrides")
         return
-    folder = results / "sweeps"
+    folder = results / SWEEPS
     require_writable(folder)
-    write_json(folder / f"{found.name}.json", sealed(asdict(found)))
+    write_sweep_file(folder / f"{found.name}.json", found)
     write_sweep(results, found)
-    write_report(results)
     print(f"Results in {results}")
 
 

@@ -1,138 +1,239 @@
-"""A collected sweep: the content of ``sweep.json``, which the runner writes and results keep."""
+"""A collected sweep: ``sweep.json`` of the runner, ``results/sweeps/NAME.json`` when published.
+
+A job is its record, without tables, and what the runner knows of it besides. In the file, what all
+jobs have alike stands once (``common``), and each job adds what is its own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, ValidationError
 
-from experiments.common.records.estimates import Paper, SeedRun
-from experiments.common.records.findings import Vector
-from experiments.common.records.record import Model, Provenance, Status
+from experiments.common.records.record import Frozen, Provenance, Record
 from mvest.errors import InputError
+from mvest.files import write_atomically
+from mvest.problem.record import EstimateRecord
+from mvest.provenance import require_sealed, sealed
+from mvest.reading.json_file import read_mapping
 
-__all__ = ["SCHEMA", "Cost", "Sweep", "SweepJob", "check_sweep"]
+__all__ = [
+    "SWEEPS",
+    "Sweep",
+    "SweptJob",
+    "head_of",
+    "read_sweep",
+    "read_sweeps",
+    "write_sweep_file",
+]
 
-SCHEMA = 2
-"""Version of the layout."""
+SWEEPS = "sweeps"
+"""Folder of the published sweeps within the results."""
 
+PATHS = {"iterates", "iterate_std"}
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SweepJob:
-    """One job with one run per seed, without any where it died; vectors are ``(p,)``.
-
-    ``seed`` is the first of so many ``repeats``, None where it is not known which seeds the job
-    had; ``P0``, ``Q`` and ``R`` are a variance, variances or a matrix.
-    """
-
-    hash: str
-    row: str
-    factors: Mapping[str, Any]
-    seed: int | None = None
-    repeats: int = 1
-    status: Status
-    reason: str
-    model: Model | None = None
-    initial: Vector | None = None
-    truth: Vector | None = None
-    P0: Any = None
-    Q: Any = None
-    R: Any = None
-    filter: str | None = None
-    runs: tuple[SeedRun, ...]
-
-    @property
-    def converged(self) -> bool:
-        """Whether the job ended as it should."""
-        return self.status == "converged"
+NOT_KEPT: dict[str, Any] = {
+    "detail": "", "correlation": (), "frames": (), "condition_number": None, "flat": (),
+    "confounded": (), "objective": (), "details": {}, "distance_to_truth_mm": None,
+}  # fmt: skip
+"""Parts of an estimate that no table or figure of a sweep shows; the job's own record has them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Seconds of a job: of estimating, of all of it, and of neither simulating nor estimating."""
-
-    hash: str
-    seconds: float | None
-    seconds_total: float | None
-    overhead: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sweep:
-    """Jobs that differ in their factors, with p parameters.
+class SweptJob(Frozen):
+    """One job of a sweep.
 
     Attributes
     ----------
-    schema : int
-    sweep : mapping
-        Its name, kind and size, and the grids of its sizes.
-    title : str
-    parameters : tuple of str
-    paper : Paper or None
-    truth_hits, truth_misses : int
-        Simulated truths that were in the store, and that were not.
-    provenance, commits : Provenance and tuple of str
-        Of the file, and of the jobs.
-    settings : mapping
-        Those of the first job, in what a sweep has in common.
-    jobs, cost : tuple of SweepJob, and of Cost
+    hash : str
+        First digits of the hash of its configuration.
+    seed, repeats : int
+        It runs with the seeds ``seed``, ``seed + 1``, ..., so many in all.
+    start, truth : (p,) or None
+        Initial guess and true values of the sweep's parameters, as configured.
+    P0, Q, R : number, (p,) or (p, p)
+        Covariances of the filter, as configured.
+    overhead : float or None
+        Seconds between the end of the job before and the end of this one that were spent neither
+        simulating nor estimating; None where that was not measured.
+    record : Record
+        Its head, see `head_of`.
     """
 
-    schema: int
-    sweep: Mapping[str, Any]
+    hash: str
+    seed: int
+    repeats: int = 1
+    start: tuple[float | None, ...] | None = None
+    truth: tuple[float | None, ...] | None = None
+    P0: Any = None
+    Q: Any = None
+    R: Any = None
+    overhead: float | None = None
+    record: Record
+
+    @property
+    def runs(self) -> tuple[EstimateRecord, ...]:
+        """A run for each planned seed; one that left no estimate failed for the job's reason."""
+        known = {one.seed for one in self.record.estimates}
+        lost = [
+            EstimateRecord(seed=seed, status="failed", reason=self.record.reason)
+            for seed in range(self.seed, self.seed + self.repeats)
+            if seed not in known
+        ]
+        return (*self.record.estimates, *lost)
+
+
+class Sweep(Frozen):
+    """Jobs that differ in their factors.
+
+    Attributes
+    ----------
+    version : int
+        Of this layout.
+    name, size, title : str
+    parameters : tuple of str, (p,)
+    paper : mapping or None
+        What the paper reports of the same experiment: ``table``, ``estimate``, ``error_percent``.
+    provenance : Provenance
+        Of the process that collected the jobs; its configuration hash is that of all jobs.
+    commits : tuple of str
+        Those that computed the jobs.
+    settings : mapping
+        The configuration of the first job, without factors and what belongs to a machine.
+    jobs : tuple of SweptJob
+        At least one.
+    """
+
+    version: Literal[3] = 3
+    name: str
+    size: str | None = None
     title: str
     parameters: tuple[str, ...]
-    paper: Paper | None = None
-    truth_hits: int = 0
-    truth_misses: int = 0
+    paper: Mapping[str, Any] | None = None
     provenance: Provenance
     commits: tuple[str, ...] = ()
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    jobs: tuple[SweepJob, ...]
-    cost: tuple[Cost, ...]
+    settings: Mapping[str, Any] = {}
+    jobs: tuple[SweptJob, ...] = Field(min_length=1)
 
     @property
-    def name(self) -> str:
-        """What files call it."""
-        return str(self.sweep["name"])
+    def factors(self) -> list[str]:
+        """Names of everything varied, in the order in which the jobs bring them up."""
+        return list(dict.fromkeys(name for job in self.jobs for name in job.record.factors))
 
     @property
-    def kind(self) -> str:
-        """What decides on tables and figures."""
-        return str(self.sweep["kind"])
+    def records(self) -> list[Record]:
+        """Those of all jobs."""
+        return [job.record for job in self.jobs]
+
+    def plain(self) -> dict[str, Any]:
+        """Plain data for JSON, sealed; `Sweep.of_plain` reads them."""
+        # Of the ways from several starts, one a job.
+        first = 1 if len({job.start for job in self.jobs}) > 1 else 0
+        jobs = []
+        for job in self.jobs:
+            unshown = dict.fromkeys(range(first, len(job.record.estimates)), PATHS)
+            left_out: Any = {"record": {"estimates": unshown}}
+            jobs.append(job.model_dump(mode="json", exclude_defaults=True, exclude=left_out))
+        common = _common(jobs)
+        header = self.model_dump(mode="json", exclude={"jobs"})
+        return sealed({**header, "common": common, "jobs": [_beyond(job, common) for job in jobs]})
+
+    @classmethod
+    def of_plain(cls, data: Any, where: str) -> Sweep:
+        """A sweep from plain data; ``where`` names them in an error.
+
+        Raises
+        ------
+        InputError
+            If the data are no collected sweep of this version, or not as they were written.
+        """
+        if not isinstance(data, Mapping):
+            raise InputError(f"{where} is no collected sweep but a {type(data).__name__}")
+        try:
+            common = data["common"]
+            jobs = [_joined(common, job) for job in data["jobs"]]
+            rest = {k: v for k, v in data.items() if k not in ("sha256", "common")}
+            sweep = cls.model_validate({**rest, "jobs": jobs})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"{where} is no collected sweep: {error}") from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise InputError(f"{where} is no collected sweep: {place}: {first['msg']}") from error
+        require_sealed(data, where)
+        return sweep
 
 
-def check_sweep(data: Any, where: str) -> Sweep:
-    """A collected sweep from plain data.
+def head_of(record: Record) -> Record:
+    """What a sweep keeps of a job's record: no tables, and of estimates what sweeps show."""
+    estimates = tuple(
+        one.model_copy(
+            update={**NOT_KEPT, "unknowns": tuple(u for u in one.unknowns if u.kind != "derived")}
+        )
+        for one in record.estimates
+    )
+    return record.model_copy(update={"tables": {}, "estimates": estimates})
+
+
+def write_sweep_file(path: Path, sweep: Sweep) -> None:
+    """Write a collected sweep, whole or not at all.
 
     Raises
     ------
     InputError
-        Naming ``where`` it comes from and what it lacks.
+        If it cannot be written.
     """
-    if not isinstance(data, Mapping):
-        raise InputError(f"{where} is no collected sweep but a {type(data).__name__}")
-    if data.get("schema", SCHEMA) != SCHEMA:
-        raise InputError(f"{where} has schema {data['schema']}; this version reads {SCHEMA}")
-    try:
-        sweep = TypeAdapter(Sweep).validate_python(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        *place, name = map(str, first["loc"])
-        what = " ".join(part.removesuffix("s") for part in place) or "it"
-        wrong = f"lacks {name}" if first["type"] == "missing" else f"{name}: {first['msg']}"
-        raise InputError(f"{where} is no collected sweep: {what} {wrong}") from error
-    if not {"name", "kind"} <= set(sweep.sweep):
-        raise InputError(f"{where}: `sweep` must say its name and its kind")
-    p = len(sweep.parameters)
-    for job in sweep.jobs:
-        for run in job.runs:
-            for key, values in (("estimate", run.estimate), ("std", run.std), ("bound", run.bound)):
-                if values is not None and len(values) != p:
-                    raise InputError(
-                        f"{where}: job {job.hash}, seed {run.seed}: {key} has {len(values)} "
-                        f"values for {p} parameters"
-                    )
-    return sweep
+    text = json.dumps(sweep.plain(), ensure_ascii=False, separators=(",", ":"))
+    write_atomically(path, text + "\n", sync=True)
+
+
+def read_sweep(path: Path) -> Sweep:
+    """The collected sweep in a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is no collected sweep, or is not as it was written.
+    """
+    return Sweep.of_plain(read_mapping(path), str(path))
+
+
+def read_sweeps(results: Path) -> list[Sweep]:
+    """Every published sweep in the order of file names."""
+    return [read_sweep(path) for path in sorted((results / SWEEPS).glob("*.json"))]
+
+
+def _common(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Entries that all of several nested mappings have alike."""
+    found: dict[str, Any] = {}
+    for key, value in parts[0].items():
+        others = [part[key] for part in parts if key in part]
+        if len(others) < len(parts):
+            continue
+        if all(isinstance(other, dict) for other in others):
+            found[key] = _common(others)
+        elif all(other == value and type(other) is type(value) for other in others):
+            found[key] = value
+    return found
+
+
+def _beyond(part: Mapping[str, Any], common: Mapping[str, Any]) -> dict[str, Any]:
+    """What a mapping says beyond the common entries."""
+    found = {}
+    for key, value in part.items():
+        if key not in common:
+            found[key] = value
+        elif isinstance(value, dict) and (own := _beyond(value, common[key])):
+            found[key] = own
+    return found
+
+
+def _joined(common: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
+    """The mapping of which `_beyond` gave a part."""
+    own = {
+        key: _joined(common[key], value) if isinstance(common.get(key), dict) else value
+        for key, value in part.items()
+    }
+    return {**common, **own}

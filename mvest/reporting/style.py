@@ -1,4 +1,4 @@
-"""One look for all figures of sweeps: colours, sizes, labels at the data.
+"""One look for all figures: colours, sizes, axes.
 
 Sizes are meant for a page about 800 pixels wide, where a figure of 8.3 inches shows 9-point text at
 about 12 pixels. Colours are Okabe and Ito's, colour maps run evenly in lightness.
@@ -6,16 +6,12 @@ about 12 pixels. Colours are Okabe and Ito's, colour maps run evenly in lightnes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from mvest.reporting.figures import COLOURS, MARKERS
-from mvest.typing import FloatArray
 
 __all__ = [
     "BAD",
@@ -28,8 +24,6 @@ __all__ = [
     "TEXT",
     "WIDTH",
     "headline",
-    "label_ends",
-    "levels",
     "log_axis",
     "panels",
     "plain_axes",
@@ -90,55 +84,3 @@ def log_axis(axis: Any) -> None:
     """Label a logarithmic axis with 0.01, 0.1, 1 instead of powers of ten."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
     axis.set_minor_formatter(NullFormatter())
-
-
-def levels(n: int) -> list[Any]:
-    """N colours in order from dark to light, light enough to part and dark enough to see."""
-    return [colormaps["viridis"](value) for value in np.linspace(0.0, 0.85, max(n, 1))]
-
-
-def label_ends(
-    axes: Any, x: float, ends: Sequence[tuple[float, str, Any]], *, gap: float = 0.055
-) -> None:
-    """Names beside the right ends of curves, pushed apart where they would overlap.
-
-    Parameters
-    ----------
-    axes : Axes
-        Its limits and scales are what they will be.
-    x : float
-        Where the curves end, in data coordinates.
-    ends : sequence of (y, text, colour)
-        y in data coordinates.
-    gap : float
-        Least distance between two labels, as part of the height of the axes.
-    """
-    if not ends:
-        return
-    # Asking for the limits makes matplotlib settle them; the transformation alone does not.
-    axes.get_xlim(), axes.get_ylim()
-    to_axes = axes.transData + axes.transAxes.inverted()
-    places = np.array([to_axes.transform((x, y))[1] for y, _, _ in ends])
-    left = float(to_axes.transform((x, ends[0][0]))[0]) + 0.02
-    spread = _apart(np.clip(places, 0.0, 1.0), gap)
-    for (_, text, colour), place in zip(ends, spread, strict=True):
-        axes.annotate(
-            text, (left, place), xycoords="axes fraction", color=colour, fontsize=SMALL,
-            va="center", ha="left", annotation_clip=False,
-        )  # fmt: skip
-
-
-def _apart(places: FloatArray, gap: float) -> FloatArray:
-    """Positions in the same order, at least ``gap`` apart and below 1."""
-    order = np.argsort(places, kind="stable")
-    moved = places[order].copy()
-    for k in range(1, len(moved)):
-        moved[k] = max(moved[k], moved[k - 1] + gap)
-    # What was pushed beyond the top comes back down together.
-    over = max(float(moved[-1]) - 1.0, 0.0)
-    for k in range(len(moved) - 1, -1, -1):
-        limit = moved[k + 1] - gap if k + 1 < len(moved) else 1.0
-        moved[k] = min(moved[k], limit) if over else moved[k]
-    result = np.empty_like(moved)
-    result[order] = moved
-    return result

@@ -13,8 +13,8 @@ from PIL import Image
 from experiments.results.page import write_report
 from experiments.runner.tracking.screenshot import look_at
 from mvest.reporting.case.report import report
-from tests.experiments.results.test_report import publish
-from tests.experiments.sweeps.synthetic_sweeps import TRUTH, job, run, sweep
+from tests.experiments.results.test_report import publish_sweep
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep
 from tests.reporting.case.made_up_case import (
     LINE,
     PROVENANCE,
@@ -122,10 +122,11 @@ def results_page(tmp_path_factory) -> Path:
         for k in range(2)
     ]
     lost = job({"filter": LONG, LONG: 2}, [], LONG, row=LONG)
-    publish(folder, sweep("filter", [*jobs, lost], title=LONG, settings={LONG: LONG}))
+    publish_sweep(folder, sweep("filter", [*jobs, lost], title=LONG, settings={LONG: LONG}))
     (folder / "gate.md").write_text(
         f"# {LONG}\n\n{LONG}\n\n| {HOSTILE} |\n|---|\n| b |\n", encoding="utf-8"
     )
+    (folder / "long.md").write_text(f"# {'W' * 10_000}\n", encoding="utf-8")
     return write_report(folder)
 
 

@@ -1,101 +1,94 @@
 """One file of a whole sweep: ``sweep.json``, from what its jobs ended with.
 
-That is appended to a file of the process that ran a job, so that ten thousand records need not be
-opened. The records stay the truth: a line that is torn, missing or of an older one is left aside.
+Each process that runs jobs appends their ends to a file of its own, so that ten thousand records
+need not be opened. The records stay the truth: a line that is torn, missing or older than its
+record is ignored.
 """
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
-from experiments.common.records.estimates import Paper, SeedRun
-from experiments.common.records.record import Record, Status, here_and_now, model_of_values
-from experiments.runner.jobs.compared import Compared, last_compared
-from experiments.runner.jobs.folder import is_done, result_time
+from experiments.common.records.record import Frozen, Record, here_and_now, stamp
+from experiments.common.study import Result
+from experiments.runner.jobs.folder import is_done, last_record, result_time
 from experiments.runner.planning.plan import Plan, PlannedJob
-from experiments.sweeps.collected import SCHEMA, Cost, Sweep, SweepJob
+from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import InputError
-from mvest.provenance import config_hash, require_sealed
+from mvest.provenance import config_hash, require_sealed, sealed
 from mvest.reading.json_file import parse_json
 
 __all__ = ["ENDS", "NOT_RUN", "End", "collect", "overheads", "read_ends"]
 
-UNSAID = ("factors", "paths", "tracking")
-"""Settings that are no part of what a sweep has in common, or belong to a machine."""
+NOT_COMMON = ("factors", "paths", "tracking", "sweep")
+"""Settings that jobs do not have in common, or that belong to a machine or the runner."""
 
 NOT_RUN = "not run"
 """Reason of a job that never began or was interrupted."""
 
+ENDS = "ends"
+"""Folder within a sweep's of the files to which processes append the ends of their jobs."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class End:
-    """What a sweep keeps of a job, from its record and from who ran it.
+
+class End(Frozen):
+    """How a job ended.
 
     Attributes
     ----------
     hash : str
         The job's short one.
-    status : {"converged", "failed"}
-    reason : str
-    runs : tuple of SeedRun
-        None where the job as a whole was lost.
-    truth_store : str or None
-    mesh_hash, commit : str
-    seconds_total, seconds_computing : float or None
-        All of the job, and of that simulating and estimating; None where it left no record.
-    written_ns : int or None
-        When the record was written.
-    finished : float
-        Seconds since the epoch, as the process that ran it says.
+    record : Record
+        Its head; one that says why where the job left none.
     process : str
         Which one ran it; empty where that is not known.
+    finished : float
+        Seconds since the epoch, as that process says.
+    written_ns : int or None
+        When the record was written; None where it could not be.
     """
 
     hash: str
-    status: Status
-    reason: str
-    runs: tuple[SeedRun, ...] = ()
-    truth_store: str | None = None
-    mesh_hash: str = "none"
-    commit: str = "None"
-    seconds_total: float | None = None
-    seconds_computing: float | None = None
-    written_ns: int | None = None
-    finished: float = 0.0
+    record: Record
     process: str = ""
+    finished: float = 0.0
+    written_ns: int | None = None
 
     @classmethod
-    def of(cls, job: PlannedJob, record: Record[Compared], process: str = "") -> End:
-        """What is kept of a record that a process has just written, or somebody before."""
-        found = record.findings
+    def of(cls, job: PlannedJob, record: Record, process: str = "") -> End:
+        """The end of a job whose record was just written, or found."""
         return cls(
             hash=job.short_hash,
-            status=record.status,
-            reason=record.reason,
-            runs=() if found.died else found.repeats,
-            truth_store=found.truth_store,
-            mesh_hash=record.provenance.mesh_hash,
-            commit=str(record.provenance.git.sha),
-            seconds_total=record.seconds_total,
-            seconds_computing=(
-                found.seconds_computing or found.repeats[0].seconds or record.seconds_total
-            ),
-            written_ns=result_time(job.folder),
-            finished=time.time(),
+            record=head_of(record),
             process=process,
+            finished=time.time(),
+            written_ns=result_time(job.folder),
         )
 
+    @classmethod
+    def lost(cls, job: PlannedJob, reason: str) -> End:
+        """The end of a job without a record."""
+        result = Result(status="failed", reason=reason)
+        record = stamp(job.values, job.config_hash, result, time.time())
+        return cls(hash=job.short_hash, record=record)
 
-ENDS = "ends"
-"""Folder within a sweep's of the files to which processes append the ends of their jobs."""
+    def line(self) -> str:
+        """A line of the log of ends."""
+        return json.dumps(sealed(self.model_dump(mode="json", exclude_defaults=True)))
 
-_END = TypeAdapter(End)
+    @property
+    def seconds_computing(self) -> float:
+        """Seconds of simulating and estimating."""
+        computing = self.record.numbers.get("seconds_computing")
+        spent = [one.seconds for one in self.record.estimates[:1]]
+        found = [one for one in (computing, *spent) if isinstance(one, int | float) and one]
+        return float(found[0]) if found else self.record.seconds_total
 
 
 def read_ends(folder: Path) -> dict[str, End]:
@@ -105,9 +98,9 @@ def read_ends(folder: Path) -> dict[str, End]:
         for line in path.read_bytes().splitlines():
             try:
                 data = parse_json(line, str(path))
-                end = _END.validate_python(data)
                 require_sealed(data, str(path))
-            except (ValidationError, InputError):
+                end = End.model_validate({k: v for k, v in data.items() if k != "sha256"})
+            except (ValidationError, InputError, AttributeError):
                 # Between two lines, cut off with the process that wrote it, of another version, or
                 # not as it was written.
                 continue
@@ -126,34 +119,24 @@ def collect(plan: Plan, appended: Mapping[str, End]) -> Sweep:
         From `read_ends`; jobs that are not there are read from their folders.
     """
     ends = [_end(job, appended.get(job.short_hash)) for job in plan.jobs]
-    recorded = [end for end in ends if end.seconds_total is not None]
-    stored = [end.truth_store for end in recorded]
+    sources = [end.record.provenance for end in ends if end.record.reason != NOT_RUN]
     first = plan.jobs[0].values
     spent = overheads(ends)
     return Sweep(
-        schema=SCHEMA,
-        sweep=plan.sweep or {"name": plan.name, "size": None, "kind": None},
+        name=str(plan.sweep.get("name", plan.name)),
+        size=plan.sweep.get("size"),
         title=first["title"],
         parameters=tuple(first["parameters"]),
-        paper=first["paper"] and Paper(**first["paper"]),
-        truth_hits=stored.count("hit"),
-        truth_misses=stored.count("miss"),
+        paper=first["paper"],
         provenance=here_and_now(
             config_hash({"jobs": [job.config_hash for job in plan.jobs]}),
-            next((end.mesh_hash for end in recorded), "none"),
+            next((one.mesh_hash for one in sources if one.mesh_hash != "none"), "none"),
             first["seed"],
         ),
-        commits=tuple(sorted({end.commit for end in recorded})),
-        settings={key: value for key, value in first.items() if key not in UNSAID},
-        jobs=tuple(map(_collected, plan.jobs, ends)),
-        cost=tuple(
-            Cost(
-                end.hash,
-                sum(run.seconds or 0.0 for run in end.runs),
-                end.seconds_total,
-                spent.get(end.hash),
-            )
-            for end in ends
+        commits=tuple(sorted({str(one.git.sha) for one in sources})),
+        settings={key: value for key, value in first.items() if key not in NOT_COMMON},
+        jobs=tuple(
+            _swept(job, end, spent.get(end.hash)) for job, end in zip(plan.jobs, ends, strict=True)
         ),
     )
 
@@ -172,7 +155,7 @@ def overheads(ends: Iterable[End]) -> dict[str, float]:
     spent = {}
     for by_one in processes.values():
         for before, end in pairwise(sorted(by_one, key=lambda end: end.finished)):
-            if end.status == "converged" and end.seconds_computing is not None:
+            if end.record.converged:
                 spent[end.hash] = end.finished - before.finished - end.seconds_computing
     return spent
 
@@ -181,32 +164,25 @@ def _end(job: PlannedJob, end: End | None) -> End:
     """A job's end as it was appended, where that is of the record which is there now."""
     written = result_time(job.folder)
     if end is not None and end.written_ns == written:
-        whole = is_done(job.folder) == (end.status == "converged")
+        whole = is_done(job.folder) == end.record.converged
         if written is None or whole:
             return end
-    record = last_compared(job.folder, job.config_hash)
-    if record is None:
-        return End(hash=job.short_hash, status="failed", reason=NOT_RUN)
-    return End.of(job, record)
+    record = last_record(job.folder, job.config_hash)
+    return End.lost(job, NOT_RUN) if record is None else End.of(job, record)
 
 
-def _collected(job: PlannedJob, end: End) -> SweepJob:
-    """A job with what each seed gave."""
-    values, settings = job.values, job.values["filter"]
-    return SweepJob(
-        hash=job.short_hash,
-        row=values["row"],
-        factors=values["factors"],
+def _swept(job: PlannedJob, end: End, overhead: float | None) -> SweptJob:
+    values: dict[str, Any] = job.values
+    settings, truth = values["filter"], values["truth"]["values"]
+    return SweptJob(
+        hash=end.hash,
         seed=values["seed"],
         repeats=values["repeats"],
-        status=end.status,
-        reason=end.reason,
-        model=model_of_values(values),
-        initial=settings["initial"],
-        truth=values["truth"]["values"],
+        start=settings["initial"],
+        truth=truth,
         P0=settings["P0"],
-        Q=settings["Q"],
+        Q=settings["method"].get("Q", 0.0),
         R=settings["R"],
-        filter=settings["mode"],
-        runs=end.runs,
+        overhead=overhead,
+        record=end.record,
     )

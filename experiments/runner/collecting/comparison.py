@@ -27,7 +27,7 @@ SHORT = {"observation.noise_mm": "noise", "filter.mode": "filter"}
 """Names of single settings."""
 
 BY_PARAMETER = {
-    "filter.initial": "initial", "filter.P0": "P0", "filter.Q": "Q", "filter.R": "R",
+    "filter.initial": "initial", "filter.P0": "P0", "filter.method.Q": "Q", "filter.R": "R",
     "truth.values": "truth",
 }  # fmt: skip
 """Names of settings that hold one value for each estimated parameter, or one for all."""
@@ -117,7 +117,7 @@ def metrics(record: Record) -> list[tuple[str, float, int]]:
         found.append((f"{key}.max", _mean([distance.max for distance in known]), 0))
     if runs:
         found += [
-            ("nis", _mean([run.innovation and run.innovation.nis for run in done]), 0),
+            ("nis", _mean([run.innovation.nis if run.innovation else None for run in done]), 0),
             ("failed", len(runs) - len(done), 0),
             ("iterations", _mean([run.iterations or 0 for run in runs]), 0),
             ("seconds", math.fsum(run.seconds or 0.0 for run in runs), 0),

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import queue
 import re
 import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from experiments.runner.collecting.collect import ENDS, End
 from experiments.runner.execution.guard import StoppedError, WorkerProcess, new_worker, run_apart
-from experiments.runner.jobs.compared import compared
 from experiments.runner.jobs.folder import FailedRunError, result_time
 from experiments.runner.planning.plan import Plan, PlannedJob
 from mvest.errors import ConfigurationError, MvestError
-from mvest.provenance import sealed
 
 __all__ = ["Shard", "drain_here", "drain_inline", "drain_shard"]
 
@@ -135,16 +132,16 @@ def _drain(plan: Plan, jobs: Iterable[PlannedJob], worker: WorkerProcess, name: 
             before = result_time(job.folder)
             try:
                 record = run_apart(job.request, worker, plan.written_ns, plan.workers)
-                end = End.of(job, compared(record, str(job.folder)), process)
+                end = End.of(job, record, process)
             except StoppedError:
                 break
             except (MvestError, OSError) as error:
-                end = End(hash=job.short_hash, status="failed", reason=str(error))
+                end = End.lost(job, str(error))
             if before is not None and end.written_ns == before:
                 # It was done already.
                 continue
-            failed += end.status != "converged"
+            failed += not end.record.converged
             # In a line of its own, also after one that was cut off.
-            ends.write(f"\n{json.dumps(sealed(asdict(end)))}\n")
+            ends.write(f"\n{end.line()}\n")
             ends.flush()
     return failed

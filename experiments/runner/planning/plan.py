@@ -11,7 +11,7 @@ import os
 import time
 import uuid
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -255,7 +255,7 @@ class Plan:
         times = [
             fmean(spent[kind]) * job.values.get("repeats", 1)
             for job in left
-            if (kind := json.dumps(asdict(model_of_values(job.values)))) in spent
+            if (kind := json.dumps(model_of_values(job.values).model_dump())) in spent
         ]
         if not times:
             return "time unknown: no job of this kind has finished yet"

@@ -8,10 +8,8 @@ from statistics import fmean, median
 
 from experiments.runner.collecting.estimate_table import sweep_table
 from experiments.runner.tracking.store import Store, telling
-from experiments.sweeps.collected import Sweep, check_sweep
+from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import write_atomically
-from mvest.provenance import require_sealed
-from mvest.reading.json_file import read_mapping
 
 __all__ = ["IS_SWEEP", "SWEEP", "TABLE", "log_summary"]
 
@@ -34,9 +32,7 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
     """
     from mlflow.entities import Metric
 
-    data = read_mapping(folder / SWEEP)
-    sweep = check_sweep(data, str(folder / SWEEP))
-    require_sealed(data, str(folder / SWEEP))
+    sweep = read_sweep(folder / SWEEP)
     result_hash = hashlib.sha256((folder / SWEEP).read_bytes()).hexdigest()
     with telling(store.place):
         chosen = f"tags.kind = '{IS_SWEEP}' and tags.sweep_id = '{sweep_id}'"
@@ -69,13 +65,19 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
 
 
 def _totals(sweep: Sweep) -> dict[str, float]:
-    runs = [run for job in sweep.jobs for run in job.runs if run.converged]
-    errors = [abs(error) for run in runs for error in run.relative_error or ()]
-    overheads = [cost.overhead for cost in sweep.cost if cost.overhead is not None]
+    unknowns = [
+        unknown
+        for record in sweep.records
+        for run in record.estimates
+        for unknown in run.unknowns
+        if run.converged
+    ]
+    errors = [abs(one.relative_error) for one in unknowns if one.relative_error is not None]
+    overheads = [job.overhead for job in sweep.jobs if job.overhead is not None]
     totals: dict[str, float] = {
         "jobs": len(sweep.jobs),
-        "failed": sum(not job.converged for job in sweep.jobs),
-        "seconds": sum(cost.seconds_total or 0.0 for cost in sweep.cost),
+        "failed": sum(not record.converged for record in sweep.records),
+        "seconds": sum(record.seconds_total for record in sweep.records),
     }
     if errors:
         totals["error.mean"] = 100.0 * fmean(errors)

@@ -11,7 +11,7 @@ import pytest
 
 from experiments import tables
 from experiments.common.records.record import read_record
-from experiments.studies.twin.findings import Findings
+from experiments.results.keep import records_of
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation import Prediction
@@ -33,28 +33,29 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert "E_f.anterior [MPa]" in finished.stdout
     (folder,) = (tmp_path / "outputs" / "debug").iterdir()
     # Read with its types, every field there.
-    record = read_record(folder / "result.json", Findings)
-    found, provenance = record.findings, record.provenance
-    (first,) = found.repeats
+    record = read_record(folder / "result.json")
+    provenance = record.provenance
+    (first,) = record.estimates
     assert record.converged
     assert record.parameters == ("E_f.anterior", "E_f.posterior")
     assert record.reason
     assert record.forward_solves > first.iterations > 0
     assert first.seconds > 0
-    assert len(found.truth) == len(first.std) == 2
+    # Two estimated moduli, and the four that follow from them.
+    assert [unknown.kind for unknown in first.unknowns] == ["modulus"] * 2 + ["derived"] * 4
+    assert all(unknown.std > 0 for unknown in first.moduli)
     assert first.distance_mm.max >= first.distance_mm.mean
-    assert max(abs(error) for error in first.relative_error) < 1e-4
-    assert len(found.moduli) == 6
-    assert found.closure["open"].orifice_area > found.closure["closed"].orifice_area > 0
+    assert max(abs(unknown.relative_error) for unknown in first.unknowns) < 1e-4
+    (row,) = record.table_of().rows
+    assert row["orifice, closed"] > 0
     assert provenance.config_hash.startswith(folder.name)
     assert set(provenance.threads.values()) == {"1"}
     names = {path.name for path in folder.iterdir()}
     assert {
         "debug.csv",
         "debug.md",
-        "debug.tex",
-        "iterates.png",
-        "valve.pdf",
+        "debug.png",
+        "debug_valve.png",
         "config.json",
     } <= names
     assert not [name for name in names if name.startswith(PREFIX)]
@@ -68,7 +69,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert tags["config_hash"] == provenance.config_hash
     assert tags["status"] == "converged"
     assert {"sweep_id", "git_sha", "mesh_hash"} <= set(tags)
-    assert metrics["estimate.anterior"] == pytest.approx(first.estimate[0])
+    assert metrics["estimate.anterior"] == pytest.approx(first.moduli[0].estimate)
     assert settings["initial.anterior"] == "5.0"
     assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
 
@@ -96,13 +97,12 @@ ERRORS = [
     ("filter.P0=[[1,2],[3,4]]", "must be symmetric"),
     ("filter.P0=[[1,2],[2,1]]", "positive semi-definite"),
     ("filter.P0=much", "filter.P0 = 'much', expected a number"),
-    ("filter.Q=-1", "filter.Q = -1"),
     ("filter.R=0", "filter.R = 0: R must be positive"),
     ("filter.R=[1,2,3]", "R has shape (3,)"),
-    ("filter.mode=magic", "filter.mode = 'magic', expected one of paper, extended, iterated"),
+    ("filter=magic", "Could not find 'filter/magic'; known: "),
     ("filter.transform=exp", "filter.transform = 'exp'"),
-    ("filter.tolerance=0", "filter.tolerance = 0, expected 1e-15 to 1"),
-    ("filter.max_iterations=0", "at least one iteration"),
+    ("filter.method.tolerance=0", "tolerance must be positive"),
+    ("filter.method.max_iterations=0", "at least one iteration"),
     ("observation.noise_mm=-1", "observation.noise_mm = -1, expected 0 to 1000 mm"),
     ("observation.frames=[shut]", "observed frames ['shut']"),
     ("observation.columns=7", "template of 7 x 7 vertices"),
@@ -178,10 +178,11 @@ def test_a_failing_forward_run_is_recorded(run, tmp_path, instead_of_closing) ->
     assert status == 1
     assert err.startswith("no estimate: no synthetic observation: Newton's method")
     assert "result.json" in err
-    record = read_record(tmp_path / "here" / "result.json", Findings)
+    record = read_record(tmp_path / "here" / "result.json")
     assert record.status == "failed"
-    assert record.findings.first.estimate is None
-    assert record.findings.first.distance_mm is None
+    (first,) = record.estimates
+    assert first.unknowns[0].estimate is None
+    assert first.distance_mm is None
     assert "Newton" in record.reason
     assert "no synthetic observation" in out
     assert not (tmp_path / "published").exists()
@@ -198,10 +199,11 @@ def test_a_model_that_fails_on_the_way_is_recorded(run, tmp_path, instead_of_clo
     status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.enabled=false")
     assert status == 1
     assert "it buckled" in err
-    record = read_record(tmp_path / "here" / "result.json", Findings)
+    record = read_record(tmp_path / "here" / "result.json")
     assert record.forward_solves == 1
-    assert record.findings.first.estimate is None
-    (start,) = record.findings.first.iterates
+    (first,) = record.estimates
+    assert first.unknowns[0].estimate is None
+    (start,) = first.iterates
     assert start == pytest.approx((5.0, 3.0), rel=1e-12)
 
 
@@ -251,8 +253,8 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     assert {"table1.csv", "table1.md", "table1.tex", "table1.png", "table1_valve.png"} <= set(kept)
     assert b"paper, Table 1" in kept["table1.md"]
     # The run's own figures, drawn once.
-    assert kept["table1_valve.png"] == (tmp_path / "here" / "valve.png").read_bytes()
-    assert kept["table1.pdf"] == (tmp_path / "here" / "iterates.pdf").read_bytes()
+    assert kept["table1_valve.png"] == (tmp_path / "here" / "table1_valve.png").read_bytes()
+    assert kept["table1.pdf"] == (tmp_path / "here" / "table1.pdf").read_bytes()
     # The tables follow from the record alone.
     for name in kept:
         if "valve" not in name:
@@ -288,8 +290,8 @@ def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of
 FAILURES = {
     "figure": ("matplotlib.figure.Figure.savefig", ValueError("no glyph for U+D800")),
     "table": ("pandas.DataFrame.to_csv", RuntimeError("quotes\nare open")),
-    "page": ("experiments.studies.twin.report.markdown_rows", KeyError("name")),
-    "words": ("experiments.studies.twin.study.text_table", "a\ud800".encode),
+    "page": ("mvest.reporting.tables.markdown_rows", KeyError("name")),
+    "words": ("mvest.reporting.tables.Table.text", "a\ud800".encode),
     "results": ("experiments.runner.execution.job._publish", InputError("records are damaged")),
     "marker": (
         "experiments.runner.execution.job.mark_done",
@@ -321,7 +323,7 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
     assert "the same command writes what is missing" in err.splitlines()[-1]
     assert "Traceback" not in err
     computed, count = (tmp_path / "here" / "result.json").read_bytes(), len(calls)
-    assert read_record(tmp_path / "here" / "result.json", Findings).findings.first.estimate
+    assert read_record(tmp_path / "here" / "result.json").estimates[0].moduli[0].estimate
     assert not (tmp_path / "here" / "done").exists()
 
     status, out, err = run(*usual)
@@ -329,9 +331,7 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
     assert "Written to " in out
     assert (tmp_path / "here" / "result.json").read_bytes() == computed
     assert (tmp_path / "here" / "done").exists()
-    assert {"debug.csv", "debug.md", "iterates.png"} <= {
-        p.name for p in (tmp_path / "here").iterdir()
-    }
+    assert {"debug.csv", "debug.md", "debug.png"} <= {p.name for p in (tmp_path / "here").iterdir()}
 
 
 def test_an_estimate_outlives_the_process_that_logs_it(
@@ -379,14 +379,14 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(
         "paths.results=published",
     )
     assert status == 0, err
-    place = tmp_path / "published" / "records" / "mesh_independence"
-    kept = sorted(path.name for path in place.iterdir())
-    assert kept == [
-        "mesh-independence-hex18-structured-36-x-4.json",
-        "mesh-independence-hex18-structured-36-x-8.json",
-        "mesh-independence-hex18-structured-40-x-5.json",
-        "mesh-independence-hex18-structured-54-x-6.json",
-        "mesh-independence-hex18-structured-72-x-8.json",
+    kept = records_of(tmp_path / "published", "mesh_independence")
+    assert kept is not None
+    assert list(kept.records) == [
+        "mesh-independence-hex18-structured-36-x-4",
+        "mesh-independence-hex18-structured-36-x-8",
+        "mesh-independence-hex18-structured-40-x-5",
+        "mesh-independence-hex18-structured-54-x-6",
+        "mesh-independence-hex18-structured-72-x-8",
     ]
     table = (tmp_path / "published" / "mesh_independence.md").read_text(encoding="utf-8")
     assert table.count("hex18 structured") == 5

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from experiments.runner.tracking.store import open_store
+from experiments.sweeps.collected import read_sweep
 from tests.places import ROOT
 from tests.processes import alive, gone, linux, until
 
@@ -64,14 +65,16 @@ def finished(folder: Path, *more: str) -> str:
 
 def answer(folder: Path) -> dict[str, object]:
     """What a sweep found, without times and commits."""
-    found = json.loads((folder / "outputs" / "sweep_debug" / "sweep.json").read_text())
-    runs = [(job["hash"], job["status"], job["runs"][0]["estimate"]) for job in found["jobs"]]
-    tables = {}
-    for path in folder.glob("results/*.csv"):
-        # Above the rows stands the commit, with a word if the checkout has been changed since.
-        rows = [line for line in path.read_text().splitlines() if not line.startswith("#")]
-        # What was spent is never the same.
-        tables[path.name] = len(rows) if "cost" in path.name else rows
+    found = read_sweep(folder / "outputs" / "sweep_debug" / "sweep.json")
+    runs = [
+        (job.hash, job.record.status, [u.estimate for u in job.record.estimates[0].unknowns])
+        for job in found.jobs
+    ]
+    # Above the rows stands the commit, with a word if the checkout has been changed since.
+    tables = {
+        path.name: [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        for path in folder.glob("outputs/results/*.csv")
+    }
     return {"runs": runs, "tables": tables}
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.common.records.record import write_record
 from experiments.runner import sweep
 from experiments.runner.execution import guard
 from experiments.runner.jobs import limits
@@ -22,8 +23,8 @@ from experiments.runner.jobs.request import Request
 from experiments.runner.planning import progress
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.planning.progress import SweepBar
-from experiments.studies.twin import study
-from mvest.provenance import sealed, write_json
+from experiments.studies import twin
+from experiments.sweeps.collected import Sweep, read_sweep
 from tests.places import ROOT
 
 QUICK = ("hydra/launcher=basic", "tracking.enabled=false")
@@ -46,8 +47,8 @@ def run(run, monkeypatch):
 DEBUG = Path("outputs/sweep_debug")
 
 
-def collected() -> dict:
-    return json.loads((DEBUG / "sweep.json").read_text())
+def collected() -> Sweep:
+    return read_sweep(DEBUG / "sweep.json")
 
 
 def runs() -> list[str]:
@@ -70,17 +71,16 @@ def test_a_sweep_is_planned_run_and_collected(run):
         assert f"seed {job['factors']['seed']}" in (folder / "log.txt").read_text()
 
     found = collected()
-    assert [job["hash"] for job in found["jobs"]] == [job["hash"] for job in plan["jobs"]]
-    assert [job["status"] for job in found["jobs"]] == ["converged"] * 4
-    assert [job["runs"][0]["seed"] for job in found["jobs"]] == [1, 2, 1, 2]
-    assert found["jobs"][1]["runs"][0]["estimate"] == [6.2, 2.0]
-    assert found["jobs"][2]["initial"] == [4.0, 2.0]
-    assert (found["truth_hits"], found["truth_misses"]) == (4, 0)
-    assert found["sweep"]["kind"] == "initial_guess"
-    assert "factors" not in found["settings"]
-    assert json.loads(Path("results/sweeps/debug.json").read_text()) == found
-    lines = Path("results/sweep_debug.csv").read_text().splitlines()
-    assert len([line for line in lines if not line.startswith("#")]) == 1 + 4
+    assert [job.hash for job in found.jobs] == [job["hash"] for job in plan["jobs"]]
+    assert [record.status for record in found.records] == ["converged"] * 4
+    assert [record.estimates[0].seed for record in found.records] == [1, 2, 1, 2]
+    assert found.records[1].estimates[0].unknown("E_f.anterior").estimate == 6.2
+    assert found.jobs[2].start == (4.0, 2.0)
+    assert "stored truths used 4 times, 0 simulated" in out
+    assert "factors" not in found.settings
+    assert read_sweep(Path("outputs/results/sweeps/debug.json")) == found
+    lines = Path("outputs/results/sweep_debug.csv").read_text().splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == 1 + 2 * 4
     assert "4 jobs, 0 done" in out
 
 
@@ -92,14 +92,14 @@ def test_only_what_is_missing_or_failed_is_run_again(run):
     assert status == 1
     assert "2 of 4 jobs done" in out
     assert "2 without an estimate" in out
-    reasons = [job["reason"] for job in collected()["jobs"]]
+    reasons = [record.reason for record in collected().records]
     assert reasons[0] == "RuntimeError: it broke"
     assert reasons[1].startswith("killed by signal 9")
     assert "seed=1: RuntimeError: it broke" in err
     assert "seed=2: killed by signal 9" in err
-    assert "Traceback" in (DEBUG / collected()["jobs"][0]["hash"] / "log.txt").read_text()
-    with_failures = Path("results/sweep_debug.csv").read_text()
-    assert with_failures.count("failed") == 2
+    assert "Traceback" in (DEBUG / collected().jobs[0].hash / "log.txt").read_text()
+    with_failures = Path("outputs/results/sweep_debug.csv").read_text()
+    assert with_failures.count(",failed,") == 2 * 2
 
     status, out, err = run(*usual)
     assert status == 0
@@ -108,18 +108,18 @@ def test_only_what_is_missing_or_failed_is_run_again(run):
     assert "0 failed" in err or not err
     assert "2 done, 2 failed before, 2 to run" in out
     assert runs() == ["1", "2", "1", "2", "1", "2"]
-    resumed = Path("results/sweep_debug.csv").read_bytes()
+    resumed = Path("outputs/results/sweep_debug.csv").read_bytes()
 
     status, out, _ = run(*usual)
     assert "nothing left" in out
     assert len(runs()) == 6
-    assert Path("results/sweep_debug.csv").read_bytes() == resumed
+    assert Path("outputs/results/sweep_debug.csv").read_bytes() == resumed
 
     status, out, _ = run(*usual, "force=true")
     assert status == 0
     assert len(runs()) == 10
     # Undisturbed, the table is the same one, byte for byte.
-    assert Path("results/sweep_debug.csv").read_bytes() == resumed
+    assert Path("outputs/results/sweep_debug.csv").read_bytes() == resumed
 
 
 def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
@@ -173,20 +173,20 @@ def test_a_sweep_may_be_the_union_of_grids(run):
 def test_a_sweep_from_the_command_line_is_planned_as_well(run):
     status, out, _ = run("-m", "experiment=debug", "seed=1,2,3")
     assert status == 0
-    found = json.loads(Path("outputs/debug/sweep.json").read_text())
-    assert found["sweep"] == {"name": "debug", "size": None, "kind": None}
-    assert [job["runs"][0]["seed"] for job in found["jobs"]] == [1, 2, 3]
+    found = read_sweep(Path("outputs/debug/sweep.json"))
+    assert (found.name, found.size) == ("debug", None)
+    assert [record.estimates[0].seed for record in found.records] == [1, 2, 3]
     _, out, _ = run("-m", "experiment=debug", "seed=1,2,3,4")
     assert "3 done, 0 failed before, 1 to run" in out
 
 
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
-    _, out, _ = run("sweep=debug", "publish=true", "filter.tolerance=1e-3")
+    _, out, _ = run("sweep=debug", "publish=true", "filter.method.tolerance=1e-3")
     assert "left as it is" in out
     run("sweep=debug", "publish=true", "sweep.small.seed='1'")
-    assert not Path("results").exists()
+    assert not Path("outputs/results").exists()
     run("sweep=debug", "publish=true", "sweep.size=full")
-    assert json.loads(Path("results/sweeps/debug.json").read_text())["sweep"]["size"] == "full"
+    assert read_sweep(Path("outputs/results/sweeps/debug.json")).size == "full"
 
 
 WRONG = [
@@ -199,9 +199,9 @@ WRONG = [
     (("sweep=debug", "filter.P0=0.01,-1"), "filter.P0 = -1: the variance has a negative variance"),
     (("sweep=debug", "filter.P0=1,[[1,2],[3,4]]"), "must be symmetric"),
     (("sweep=debug", "filter.P0=1,[[1,2],[2,1]]"), "positive semi-definite"),
-    (("sweep=debug", "filter.Q=-1"), "filter.Q = -1"),
+    (("sweep=debug", "filter.method.tolerance=0"), "tolerance must be positive"),
     (("sweep=debug", "filter.R=1,0"), "filter.R = 0: R must be positive"),
-    (("sweep=debug", "filter.mode=paper,magic"), "filter.mode = 'magic'"),
+    (("sweep=debug", "filter=paper,magic"), "Could not find 'filter/magic'; known: "),
     (("sweep=debug", "filter.initial=[5,3],[1,2,3]"), "filter.initial has 3 values"),
     (("sweep=debug", "observation.noise_mm=0,-1"), "observation.noise_mm = -1, expected 0"),
     (("sweep=debug", "time_limit_s=0"), "time_limit_s = 0, expected 0.01 to"),
@@ -254,7 +254,7 @@ def test_a_disk_that_fills_up_within_a_job_costs_its_row(run):
     status, _, err = run("sweep=debug")
     assert status == 1
     assert err.count("No space left on device") == 1
-    assert "result.json: No space left on device" in collected()["jobs"][1]["reason"]
+    assert "result.json: No space left on device" in collected().records[1].reason
 
 
 def test_a_sweep_that_cannot_go_on_says_so_in_a_line_and_can_be_resumed(run, monkeypatch):
@@ -267,8 +267,8 @@ def test_a_sweep_that_cannot_go_on_says_so_in_a_line_and_can_be_resumed(run, mon
     assert status == 1
     assert err.startswith("error: the sweep cannot go on ([Errno 28] No space left on device: 'en")
     assert len(err.splitlines()) == 1
-    assert [job["reason"] for job in collected()["jobs"]] == ["not run"] * 4
-    assert not Path("results").exists()
+    assert [record.reason for record in collected().records] == ["not run"] * 4
+    assert not Path("outputs/results").exists()
     assert run("sweep=debug")[0] == 0
 
 
@@ -283,7 +283,7 @@ def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
     assert err.startswith("interrupted")
     assert "the same command goes on from there" in err
     assert "2 of 4 jobs done (2 before), 0 without an estimate, 2 not finished" in out
-    states = [job["status"] for job in collected()["jobs"]]
+    states = [record.status for record in collected().records]
     assert states == ["converged", "converged", "failed", "failed"]
 
 
@@ -292,10 +292,10 @@ def test_a_job_beyond_its_memory_costs_its_own_row(run):
     status, _, err = run("sweep=debug", "memory_limit_gb=0.5")
     assert status == 1
     assert "seed=1: memory limit of 0.5 GB (used: up to " in err
-    jobs = collected()["jobs"]
+    records = collected().records
     # Its neighbours in the same process go on.
-    assert sum(job["status"] == "converged" for job in jobs) == 3
-    (reason,) = [job["reason"] for job in jobs if job["status"] == "failed"]
+    assert sum(record.converged for record in records) == 3
+    (reason,) = [record.reason for record in records if not record.converged]
     found = re.fullmatch(r"memory limit of 0.5 GB \(used: up to (0\.\d+) GB\)", reason)
     assert 0.4 < float(found[1]) <= 0.5
     status, _, _ = run("sweep=debug", "memory_limit_gb=0.5")
@@ -308,7 +308,7 @@ def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
         while True:
             kept.append(b"x" * 2**24)
 
-    monkeypatch.setattr(study, "STUDY", replace(study.STUDY, run=hog))
+    monkeypatch.setattr(twin, "STUDY", replace(twin.STUDY, run=hog))
     limit = round(limits._resident_and_reserved()[0] / limits.GB + 0.2, 2)
     before = resource.getrlimit(resource.RLIMIT_DATA)
     status, _, err = run("experiment=debug", f"memory_limit_gb={limit}")
@@ -330,9 +330,8 @@ def test_jobs_of_a_sweep_have_a_time_limit_unless_it_is_taken_away(run, given, l
 
 
 def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
-    # What the worker's study finds is plain.
-    said = replace(study.STUDY, findings=dict, words=lambda record: f"said: {record.status}")
-    monkeypatch.setattr(study, "STUDY", said)
+    said = replace(twin.STUDY, words=lambda record: f"said: {record.status}")
+    monkeypatch.setattr(twin, "STUDY", said)
     alone = ("experiment=debug", "time_limit_s=600", "seed=2")
     Path("raise-2").touch()
     status, _, err = run(*alone)
@@ -358,8 +357,8 @@ def planned(folder: Path, seed: int) -> PlannedJob:
 
 def end(job: PlannedJob, status: str, reason: str) -> None:
     asked = Request(job.values, job.config_hash, job.folder)
-    record = write_failure(asked, reason, time.time()) | {"status": status}
-    write_json(job.folder / "result.json", sealed(record))
+    record = write_failure(asked, reason, time.time())
+    write_record(job.folder / "result.json", record.model_copy(update={"status": status}))
 
 
 def test_the_bar_counts_and_names_failures(tmp_path, monkeypatch, capsys):
@@ -456,7 +455,7 @@ def undisturbed(tmp_path_factory) -> bytes:
     finished = sweep_process(folder)
     _, err = finished.communicate(timeout=600)
     assert finished.returncode == 0, err
-    return (folder / "results" / "sweep_debug.csv").read_bytes()
+    return (folder / "outputs" / "results" / "sweep_debug.csv").read_bytes()
 
 
 @pytest.mark.slow
@@ -474,8 +473,8 @@ def test_a_sweep_whose_worker_was_killed_ends_as_an_undisturbed_one(tmp_path, un
     out, err = running.communicate(timeout=600)
     place = tmp_path / "outputs" / "sweep_debug"
     if victim == "job":
-        found = json.loads((place / "sweep.json").read_text())
-        lost = [job["reason"] for job in found["jobs"] if job["status"] == "failed"]
+        found = read_sweep(place / "sweep.json").records
+        lost = [record.reason for record in found if not record.converged]
         assert running.returncode == 1, out + err
         assert len(lost) == 1
         assert lost[0].startswith("killed by signal 9")
@@ -488,4 +487,4 @@ def test_a_sweep_whose_worker_was_killed_ends_as_an_undisturbed_one(tmp_path, un
     out, err = again.communicate(timeout=600)
     assert again.returncode == 0, out + err
     assert {path: path.stat().st_mtime_ns for path in done} == done, "a job was done twice"
-    assert (tmp_path / "results" / "sweep_debug.csv").read_bytes() == undisturbed
+    assert (tmp_path / "outputs" / "results" / "sweep_debug.csv").read_bytes() == undisturbed

@@ -10,33 +10,43 @@ from pandas import read_csv, read_parquet
 
 from experiments.cli import main
 from experiments.common.records.record import write_record
+from experiments.results.keep import write_records
 from experiments.runner.collecting.estimate_table import COLUMNS, estimate_table, write_estimates
+from experiments.sweeps.collected import write_sweep_file
 from mvest.errors import InputError
-from mvest.provenance import sealed, write_json
-from tests.experiments.runner.tracking.test_tracking import swept
-from tests.experiments.studies.made_up import made_up
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.verdict import Verdict
+from tests.experiments.studies.made_up import made_up, made_up_estimate
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, failed_run, job, run, sweep
 
-UNKNOWN = {
-    "name": "E_f.anterior", "label": "E_f anterior", "unit": "MPa", "kind": "modulus",
-    "treatment": "estimated", "prior_mean": 6.0, "prior_std": 3.0, "estimate": 5.0, "std": 0.5,
-    "low": 4.1, "high": 6.2, "truth": 4.0,
-}  # fmt: skip
-NUISANCE = UNKNOWN | {"name": "pressure_scale", "unit": "", "kind": "nuisance", "truth": None}
+MODULUS = Unknown(
+    name="E_f.anterior", unit="MPa", prior_mean=6.0, prior_std=3.0, estimate=5.0, std=0.5, low=4.1,
+    high=6.2, truth=4.0,
+)  # fmt: skip
+PRESSURE = Unknown(name="pressure_scale", kind="nuisance", estimate=1.0, std=0.1)
 
 
-def record(folder: Path, findings: dict | None, **changes) -> Path:
+def record(folder: Path, **header) -> Path:
     folder.mkdir(parents=True)
-    write_record(folder / "result.json", made_up(findings, **changes))
-    return folder
+    write_record(folder / "result.json", made_up(**header))
+    return folder / "result.json"
+
+
+def swept():
+    """Two jobs, the first with a failed seed, the second lost."""
+    good = [run(1, TRUTH, [0.1, 0.1]), failed_run(2, "it buckled")]
+    return sweep("x", [job({"noise": 0.0, "R": [0.1, 0.2]}, good), job({"noise": 0.5}, [])])
 
 
 def test_a_row_for_each_unknown_of_a_case(tmp_path: Path) -> None:
-    case = {"about": {"simulated": True}, "unknowns": [UNKNOWN, NUISANCE],
-            "verdict": {"trust": "limited"}}  # fmt: skip
-    record(tmp_path / "a", {"estimate": [5.0], "std": [0.5], "case": case},
-           parameters=("E_f.anterior",))  # fmt: skip
+    verdict = Verdict(trust="doubtful")
+    estimate = EstimateRecord(
+        status="converged", reason="", simulated=True, verdict=verdict,
+        unknowns=(MODULUS, PRESSURE),
+    )  # fmt: skip
+    record(tmp_path / "a", estimates=(estimate,))
     table = estimate_table(tmp_path)
-    assert list(table.columns) == [column.name for column in COLUMNS]
+    assert list(table.columns) == list(COLUMNS)
     assert list(table["parameter"]) == ["E_f.anterior", "pressure_scale"]
     first = table.iloc[0]
     assert (first["unit"], first["kind"], first["low"], first["high"]) == (
@@ -45,14 +55,14 @@ def test_a_row_for_each_unknown_of_a_case(tmp_path: Path) -> None:
     # 5 instead of 4.
     assert first["relative_error"] == pytest.approx(0.25)
     assert bool(first["simulated"])
-    assert first["verdict"] == "limited"
+    assert first["verdict"] == "doubtful"
     assert first["record"] == "a/result.json"
     assert np.isnan(table["relative_error"][1])
 
 
 def test_failures_are_rows_and_other_records_are_none(tmp_path: Path) -> None:
-    record(tmp_path / "died", None, status="failed", reason="it\nbuckled")
-    record(tmp_path / "other", {"gap_mm": 1.0})
+    record(tmp_path / "died", status="failed", reason="it\nbuckled")
+    record(tmp_path / "other", numbers={"gap_mm": 1.0})
     table = estimate_table(tmp_path)
     assert set(table["record"]) == {"died/result.json"}
     assert set(table["status"]) == {"failed"}
@@ -61,17 +71,27 @@ def test_failures_are_rows_and_other_records_are_none(tmp_path: Path) -> None:
 
 
 def test_a_sweep_stands_for_its_jobs(tmp_path: Path) -> None:
-    record(tmp_path / "sweep" / "jobs" / "a", {"estimate": [1.0, 2.0], "std": [0.1, 0.1]})
-    write_json(tmp_path / "sweep" / "sweep.json", sealed(swept("ab")))
+    record(tmp_path / "sweep" / "jobs" / "a", estimates=(made_up_estimate(),))
+    write_sweep_file(tmp_path / "sweep" / "sweep.json", swept())
     table = estimate_table(tmp_path)
     assert set(table["record"]) == {"sweep/sweep.json"}
-    # Two parameters of two seeds of the first job, and of the lost second one.
-    assert len(table) == 6
-    assert list(table["seed"]) == [1, 1, 2, 2, 1, 1]
+    # Two parameters of two seeds of the first job, and the lost second one.
+    assert list(table["seed"]) == [1, 1, 2, 2, 1]
+    assert list(table["parameter"].isna()) == [False] * 4 + [True]
+
+
+def test_published_records_and_sweeps_are_read_together(tmp_path: Path) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "sweeps").mkdir()
+    kept = {name: made_up(estimates=(made_up_estimate(),)) for name in ("a", "b")}
+    write_records(tmp_path, "t", kept)
+    write_sweep_file(tmp_path / "sweeps" / "x.json", swept())
+    places = list(dict.fromkeys(estimate_table(tmp_path)["record"]))
+    assert places == ["records/t.jsonl#a", "records/t.jsonl#b", "sweeps/x.json"]
 
 
 def test_both_forms_hold_the_same_and_the_dictionary_all_columns(tmp_path: Path, capsys) -> None:
-    write_json(tmp_path / "sweep.json", sealed(swept("ab")))
+    write_sweep_file(tmp_path / "sweep.json", swept())
     for name in ("t.csv", "t.parquet"):
         assert main(["table", str(tmp_path), str(tmp_path / name)]) == 0
     assert str(tmp_path / "t.columns.csv") in capsys.readouterr().out
@@ -94,7 +114,7 @@ def test_what_is_refused(tmp_path: Path, capsys) -> None:
         estimate_table(tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"ends with .csv or .parquet"):
         write_estimates(tmp_path, tmp_path / "t.xlsx")
-    place = record(tmp_path / "a", {"estimate": [1.0, 2.0], "std": [0.1, 0.1]}) / "result.json"
+    place = record(tmp_path / "a", estimates=(made_up_estimate((1.0, 2.0)),))
     place.write_text(place.read_text().replace("1.0", "1.5", 1))
     assert main(["table", str(tmp_path), str(tmp_path / "t.csv")]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -6,14 +6,14 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import experiments.runner.execution.worker as worker_module
-from experiments.common.records.record import SCHEMA, Outcome, stamp, write_record
+from experiments.common.records.record import VERSION, Record, stamp, write_record
+from experiments.common.study import Result
 from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.execution.job import FailedRunError
 from experiments.runner.jobs.folder import finished_record, is_done, last_record, lock, mark_done
@@ -67,9 +67,15 @@ def request(folder: Path, **order) -> Request:
     return Request(values, "0" * 64, folder)
 
 
-def converged(asked: Request, config_hash: str = "0" * 64) -> dict:
-    record = stamp(asked.values, config_hash, Outcome(findings={"estimate": [1.0]}), 0.0)
-    return sealed(asdict(record))
+def converged(asked: Request, config_hash: str = "0" * 64) -> Record:
+    """A record of success in the job's folder."""
+    record = stamp(asked.values, config_hash, Result(numbers={"a_mm": 1.0}), 0.0)
+    write_record(asked.folder / "result.json", record)
+    return record
+
+
+def changed(folder: Path, **entries) -> dict:
+    return json.loads((folder / "result.json").read_text()) | entries
 
 
 def said(folder: Path) -> dict:
@@ -92,10 +98,10 @@ def said(folder: Path) -> dict:
 def test_whatever_ends_a_job_costs_its_own_row(worker, tmp_path, order, reason):
     asked = request(tmp_path / "job", **order)
     record = run_apart(asked, worker)
-    assert record["status"] == "failed"
-    assert reason in record["reason"]
-    assert record["factors"] == {"k": 1}
-    assert record["findings"] is None
+    assert record.status == "failed"
+    assert reason in record.reason
+    assert record.factors == {"k": 1}
+    assert record.estimates == ()
     assert last_record(asked.folder, asked.config_hash) == record
     assert not is_done(asked.folder)
     # The next job finds a process at its service.
@@ -141,25 +147,24 @@ def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypa
 def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
     asked = request(tmp_path, signal=9)
     done = converged(asked)
-    write_json(tmp_path / "result.json", done)
     mark_done(tmp_path)
     assert run_apart(asked, worker) == done
     asked.values["force"] = True
-    assert run_apart(asked, worker)["status"] == "failed"
+    assert run_apart(asked, worker).status == "failed"
     assert not is_done(tmp_path)
 
 
 def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
-    write_json(tmp_path / "result.json", converged(request(tmp_path), "1" * 64))
+    converged(request(tmp_path), "1" * 64)
     mark_done(tmp_path)
-    assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
+    assert run_apart(request(tmp_path, exit=3), worker).status == "failed"
 
 
 def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_path, capsys):
     asked = request(tmp_path)
-    done = converged(asked)
+    converged(asked)
     mark_done(tmp_path)
-    write_json(tmp_path / "result.json", done | {"findings": {"estimate": [6.0, 2.0]}})
+    write_json(tmp_path / "result.json", changed(tmp_path, numbers={"a_mm": 2.0}))
     assert last_record(tmp_path, "0" * 64) is None
     run_apart(asked, worker)
     assert said(tmp_path), "the worker was asked"
@@ -172,8 +177,7 @@ def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_pat
 def test_other_arrays_beside_a_result_are_not_its_own(tmp_path):
     np.savez(tmp_path / "fields.npz", x=np.ones(3))
     asked = request(tmp_path)
-    outcome = Outcome(findings=None)
-    write_record(tmp_path / "result.json", stamp(asked.values, asked.config_hash, outcome, 0.0))
+    converged(asked)
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) is not None
     np.savez(tmp_path / "fields.npz", x=np.zeros(3))
@@ -182,11 +186,11 @@ def test_other_arrays_beside_a_result_are_not_its_own(tmp_path):
 
 def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
     record = converged(request(tmp_path))
-    write_json(tmp_path / "result.json", record)
     assert last_record(tmp_path, "0" * 64) is None
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) == record
-    write_json(tmp_path / "result.json", sealed(record | {"schema": SCHEMA - 1}))
+    older = sealed(changed(tmp_path, version=VERSION - 1))
+    write_json(tmp_path / "result.json", older)
     assert last_record(tmp_path, "0" * 64) is None, "a layout that nothing here reads"
 
 
@@ -194,20 +198,19 @@ def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
 def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_path, order, capsys):
     asked = request(tmp_path, **order)
     record = converged(asked)
-    write_json(tmp_path / "result.json", record)
     assert run_apart(asked, worker) == record
     assert "the same command writes what is missing" in capsys.readouterr().err
     assert last_record(tmp_path, "0" * 64) is None, "of which not everything is written"
     asked.values["force"] = True
-    assert run_apart(asked, worker)["status"] == "failed"
+    assert run_apart(asked, worker).status == "failed"
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        *("{}", "[]", "", "null", "NaN", "[" * 9999, '"\\ud800"', '{"schema": 2}'),
-        *('{"schema": 2, "status": "converged"}', '{"schema": 2, "provenance": 3}'),
-        '{"schema": ' + "9" * 5000 + "}",
+        *("{}", "[]", "", "null", "NaN", "[" * 9999, '"\\ud800"', '{"version": 3}'),
+        *('{"version": 3, "status": "converged"}', '{"version": 3, "provenance": 3}'),
+        '{"version": ' + "9" * 5000 + "}",
     ],
 )
 def test_a_damaged_result_is_none(worker, tmp_path, content):
@@ -215,7 +218,7 @@ def test_a_damaged_result_is_none(worker, tmp_path, content):
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) is None
     assert finished_record(tmp_path, "0" * 64) is None
-    assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
+    assert run_apart(request(tmp_path, exit=3), worker).status == "failed"
 
 
 def test_a_second_process_waits_for_the_folder(tmp_path):
@@ -249,11 +252,11 @@ import os, sys
 from pathlib import Path
 from dataclasses import replace
 from experiments.runner.execution import worker
-from experiments.studies.twin import study
+from experiments.studies import twin
 def run(job):
     Path("pid").write_text(str(os.getpid()))
     while True: sum(range(1000))
-study.STUDY = replace(study.STUDY, run=run)
+twin.STUDY = replace(twin.STUDY, run=run)
 worker.main()
 """
 """The real worker, in the middle of a computation that never ends."""

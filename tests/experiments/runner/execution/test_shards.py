@@ -1,25 +1,23 @@
 """Shards: other schedulers work on a planned sweep, are killed, and nothing is done twice."""
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from experiments import cli
-from experiments.common.records.estimates import SeedRun
 from experiments.run import main
 from experiments.runner.collecting import collect
 from experiments.runner.execution import guard
 from experiments.runner.execution.drain import Shard
 from experiments.runner.planning.plan import Plan
+from experiments.sweeps.collected import read_sweep
 from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import sealed
+from tests.experiments.studies.made_up import made_up, made_up_estimate
 from tests.places import ROOT
 
 FAKE = str(Path(__file__).parents[1] / "fake_worker.py")
@@ -151,9 +149,9 @@ def test_two_shards_at_once_do_every_job_once(planned, capsys):
     assert runs() == list(range(12))
     assert cli.main(["collect", str(FOLDER)]) == 0
     assert "12 of 12 jobs done" in capsys.readouterr().out
-    found = json.loads((FOLDER / "sweep.json").read_text())
-    assert [job["runs"][0]["seed"] for job in found["jobs"]] == list(range(12))
-    assert found["jobs"][7]["runs"][0]["estimate"] == [6.7, 2.0]
+    found = read_sweep(FOLDER / "sweep.json")
+    assert [job.record.estimates[0].seed for job in found.jobs] == list(range(12))
+    assert [one.estimate for one in found.jobs[7].record.estimates[0].unknowns] == [6.7, 2.0]
     # Nothing is left for anyone, and what was appended agrees with the records.
     again = mvest("worker", str(FOLDER), "--shard", "1/1")
     again.communicate(timeout=120)
@@ -161,8 +159,8 @@ def test_two_shards_at_once_do_every_job_once(planned, capsys):
     for path in (FOLDER / collect.ENDS).iterdir():
         path.unlink()
     assert cli.main(["collect", str(FOLDER)]) == 0
-    from_records = json.loads((FOLDER / "sweep.json").read_text())
-    assert from_records["jobs"] == found["jobs"]
+    from_records = read_sweep(FOLDER / "sweep.json")
+    assert from_records.records == found.records
 
 
 def test_the_same_shard_started_twice_does_no_job_twice(planned):
@@ -203,9 +201,9 @@ def test_a_job_that_dies_costs_its_shard_nothing_else(planned, capsys):
     assert cli.main(["worker", str(FOLDER)]) == 0
     assert "12 jobs, 1 without an estimate" in capsys.readouterr().out
     assert cli.main(["collect", str(FOLDER)]) == 1
-    found = json.loads((FOLDER / "sweep.json").read_text())
-    assert found["jobs"][4]["reason"].startswith("killed by signal 9")
-    assert sum(job["status"] == "converged" for job in found["jobs"]) == 11
+    found = read_sweep(FOLDER / "sweep.json").records
+    assert found[4].reason.startswith("killed by signal 9")
+    assert sum(record.converged for record in found) == 11
     # The same command runs what failed, and nothing else.
     assert cli.main(["worker", str(FOLDER)]) == 0
     assert runs() == sorted([*range(12), 4])
@@ -238,12 +236,10 @@ def test_a_wrong_share_is_one_clear_line(planned, capsys, arguments, words):
 
 
 def test_an_end_that_was_changed_is_left_aside(tmp_path):
-    run = SeedRun(seed=1, status="converged", reason="", estimate=(6.0,))
-    end = collect.End(hash="abc", status="converged", reason="", runs=(run,))
+    end = collect.End(hash="abc", record=made_up(estimates=(made_up_estimate((6.0, 2.0)),)))
     place = tmp_path / collect.ENDS / "one.jsonl"
     place.parent.mkdir()
-    line = json.dumps(sealed(asdict(end)))
-    place.write_text(f"\n{line}\n")
+    place.write_text(f"\n{end.line()}\n")
     assert collect.read_ends(tmp_path) == {"abc": end}
-    place.write_text(f"\n{line.replace('6.0', '5.9')}\n")
+    place.write_text(f"\n{end.line().replace('6.0', '5.9')}\n")
     assert collect.read_ends(tmp_path) == {}

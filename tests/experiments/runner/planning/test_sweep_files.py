@@ -1,7 +1,6 @@
 """The sweeps' configurations: every job of every size composes, and says what sets it apart."""
 
 import json
-from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +13,15 @@ from experiments.common.building.filters import build_filter
 from experiments.common.building.twin import build_twin
 from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import SECRET
-from experiments.common.config import hash_of, register
-from experiments.common.ranges import require_in_range
-from experiments.common.records.estimates import SeedRun
-from experiments.common.records.record import Outcome
+from experiments.common.config import hash_of, register, require_in_range
 from experiments.common.schema import build
-from experiments.common.study import Job
+from experiments.common.study import Job, Result
 from experiments.runner.jobs.limits import TIME_LIMIT_S
 from experiments.runner.planning.compose import expand, grids, make_plan
 from experiments.runner.plugins import register_plugins
-from experiments.studies.twin.findings import Findings
-from experiments.studies.twin.settings import Settings
-from experiments.studies.twin.study import run_twin
+from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
+from mvest.problem.record import EstimateRecord
 from tests.places import CONF
 
 SWEEPS = ("initial_guess", "covariance", "noise", "discrepancy", "filter")
@@ -42,7 +37,7 @@ DEBUG = (
     "mechanics.protocol.dt=0.05",
     "mechanics.protocol.end=0.1",
     "mechanics.protocol.equilibrium=false",
-    "filter.max_iterations=3",
+    "filter.method.max_iterations=3",
 )
 """Any job in seconds: the settings of the quick check."""
 
@@ -78,7 +73,7 @@ def test_every_job_composes_and_is_told_apart(configuration, name: str, size: st
         config_hash, config = composed(f"sweep={name}", f"sweep.size={size}", *overrides)
         hashes.add(config_hash)
         assert config["name"] == config["table"] == f"sweep_{name}"
-        assert config["sweep"]["name"] == config["sweep"]["kind"] == name
+        assert config["sweep"]["name"] == name
         assert config["title"]
         assert config["publish"]
         assert config["factors"]
@@ -155,7 +150,7 @@ def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration
     assert len(keys) == len(set(keys.values())) == 12
 
 
-def ran(overrides: tuple[str, ...], folder: Path) -> Outcome[Findings]:
+def ran(overrides: tuple[str, ...], folder: Path) -> Result:
     config_hash, config = composed(*overrides)
     return run_twin(Job(config, Settings(), folder, config_hash))
 
@@ -165,29 +160,28 @@ def test_a_job_of_each_sweep_runs(configuration, tmp_path, name: str) -> None:
     overrides = jobs(name, "small")[-1]
     settings = (*DEBUG, "repeats=2", f"paths.outputs={tmp_path}", "filter.R=1e-4")
     job = (f"sweep={name}", *overrides, *settings)
-    outcome = ran(job, tmp_path / "job")
+    result = ran(job, tmp_path / "job")
     assert not (tmp_path / "job").exists(), "nothing is drawn, so nothing is kept to draw"
-    found = outcome.findings
-    json.dumps(asdict(found), allow_nan=False)
     seed = composed(*job)[1]["seed"]
-    assert [entry.seed for entry in found.repeats] == [seed, seed + 1]
-    for entry in found.repeats:
-        assert np.shape(entry.estimate) == np.shape(entry.bound) == (2,)
+    assert [entry.seed for entry in result.estimates] == [seed, seed + 1]
+    for entry in result.estimates:
+        json.dumps(entry.model_dump(mode="json"), allow_nan=False)
+        assert all(None not in (own.estimate, own.bound) for own in entry.moduli)
         assert len(entry.iterates) == len(entry.iterate_std) == entry.iterations + 1
-    assert found.first.reason == outcome.reason
+    assert result.estimates[0].reason == result.reason
 
 
 def test_seeds_give_the_same_alone_and_in_a_batch(configuration, tmp_path) -> None:
     settings = ("sweep=noise", "observation.noise_mm=0.01", *DEBUG, f"paths.outputs={tmp_path}")
 
-    def run(seed: int, repeats: int) -> list[SeedRun]:
-        outcome = ran((*settings, f"seed={seed}", f"repeats={repeats}"), tmp_path)
-        return [replace(entry, seconds=None) for entry in outcome.findings.repeats]
+    def run(seed: int, repeats: int) -> list[EstimateRecord]:
+        result = ran((*settings, f"seed={seed}", f"repeats={repeats}"), tmp_path)
+        return [entry.model_copy(update={"seconds": None}) for entry in result.estimates]
 
     together = run(3, 3)
     assert run(4, 1) == together[1:2]
     assert run(4, 2) == together[1:]
-    assert len(set(together)) == 3
+    assert len({one.moduli for one in together}) == 3
 
 
 @pytest.mark.parametrize(

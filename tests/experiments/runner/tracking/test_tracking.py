@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -17,9 +17,8 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from pandas import read_parquet
 
-from experiments.common.records.record import SCHEMA, Record, here_and_now
+from experiments.common.records.record import Record, write_record
 from experiments.runner.collecting import comparison
-from experiments.runner.jobs.compared import Compared, compared
 from experiments.runner.planning.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import store as stores
 from experiments.runner.tracking import summary, sync
@@ -27,8 +26,10 @@ from experiments.runner.tracking import upload as uploading
 from experiments.runner.tracking.dashboard import last_comparison
 from experiments.runner.tracking.store import TrackingError, open_store
 from experiments.runner.tracking.upload import RECEIPT, upload
+from experiments.sweeps.collected import Sweep, SweptJob, write_sweep_file
 from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import sealed, write_json
+from mvest.problem.record import EstimateRecord, Spread, Unknown
+from tests.experiments.studies.made_up import SOURCE, made_up
 from tests.places import ROOT
 
 NAMES = ["E_f.anterior", "E_f.posterior"]
@@ -59,7 +60,10 @@ def make_config(outputs: Path, **changes) -> dict:
         "valve": {"leaflets": {"edge_thinning": 0.75}},
         "mesh": {"source": "structured", "columns": 24, "rows": 3, "layers": 1},
         "mechanics": {"element": "hex18"},
-        "filter": {"mode": "paper", "initial": [5.0, 3.0], "P0": 0.01, "Q": 0.01, "R": 1e-4},
+        "filter": {
+            **{"mode": "paper", "initial": [5.0, 3.0], "P0": 0.01, "R": 1e-4},
+            "method": {"Q": 0.01},
+        },
         "observation": {"frames": ["open", "closed"], "noise_mm": 0.5},
         "truth": {"values": [6.23, 2.09], "source": None},
         "donor": {"vertices": 430},
@@ -69,54 +73,46 @@ def make_config(outputs: Path, **changes) -> dict:
     return config | changes
 
 
-def make_record(config_hash: str = "c" * 64, **changes) -> dict:
-    record = {
+def estimate(
+    values: tuple[float, float] | None = (6.0, 2.0), seed: int = 1, **changes
+) -> EstimateRecord:
+    """An estimate with SDs of 0.1 and 0.05 MPa, or a failed one."""
+    done = values is not None
+    columns = zip(NAMES, values or (None, None), (0.1, 0.05), (6.25, 1.96), strict=True)
+    unknowns = tuple(
+        Unknown(name=name, unit="MPa", estimate=value, std=std if done else None, truth=truth)
+        for name, value, std, truth in columns
+    )
+    whole = {
+        "seed": seed,
+        "status": "converged" if done else "failed",
+        "reason": "tolerance" if done else "it buckled",
+        "unknowns": unknowns,
+        "distance_mm": Spread(mean=0.1, std=0.05, max=0.4) if done else None,
+        "iterations": 2,
+        "forward_solves": 3,
+        "seconds": 2.0,
+        "iterates": ((5.0, 3.0), values) if done else (),
+    }
+    return EstimateRecord(**{**whole, **changes})
+
+
+def make_record(config_hash: str = "c" * 64, **changes) -> Record:
+    source = {"config_hash": config_hash, "mesh_hash": "m" * 64}
+    whole = {
         "study": "twin",
         "experiment": "debug",
         "title": "A quick check",
         "row": "white noise",
         "table": "debug",
-        "status": "converged",
         "reason": "tolerance",
-        "detail": "",
-        "factors": {},
         "parameters": NAMES,
-        "estimate": [6.0, 2.0],
-        "std": [0.1, 0.05],
-        "relative_error": [-0.04, 0.02],
-        "distance_mm": {"mean": 0.1, "std": 0.05, "max": 0.4},
-        "distance_to_truth_mm": None,
-        "iterations": 2,
         "forward_solves": 3,
-        "seconds": 4.0,
         "seconds_total": 5.0,
-        "iterates": [[5.0, 3.0], [6.0, 2.0]],
-        "mesh": {"sha256": "m" * 64, "nodes": 700, "truth_sha256": "t" * 64},
-        "model": {"element": "hex18", "cells": [24, 3, 1]},
-        "provenance": {
-            "config_hash": config_hash,
-            "mesh_hash": "m" * 64,
-            "seed": 1,
-            "git": {"sha": "a" * 40, "dirty": False},
-            **{"versions": {}, "threads": {}, "python": "3.12", "platform": "Linux"},
-            **{"machine": "x86_64", "cpu_count": 2, "finished": "2024-01-01T00:00:00Z"},
-        },
+        "provenance": SOURCE.model_copy(update=source),
+        "estimates": (estimate(),),
     }
-    return record | changes
-
-
-HEADER = {field.name for field in fields(Record)}
-
-
-def written(record: dict) -> str:
-    """A record as a job writes it: what the study found apart from what the runner stamps."""
-    header = {key: value for key, value in record.items() if key in HEADER}
-    findings = {key: value for key, value in record.items() if key not in HEADER}
-    return json.dumps(sealed({"schema": SCHEMA, **header, "findings": findings}))
-
-
-def comparable(**changes) -> Record[Compared]:
-    return compared(json.loads(written(make_record(**changes))), "made up")
+    return made_up(**{**whole, **changes})
 
 
 def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
@@ -124,9 +120,9 @@ def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
     folder.mkdir(parents=True)
     record = make_record((name * 64)[:64], **changes)
     (folder / "config.json").write_text(json.dumps(config or make_config(outputs)))
-    (folder / "result.json").write_text(written(record))
+    write_record(folder / "result.json", record)
     (folder / "iterates.png").write_bytes(b"picture")
-    if record["status"] == "converged":
+    if record.converged:
         (folder / "done").touch()
     return folder
 
@@ -140,7 +136,7 @@ def stored(outputs: Path) -> list:
 
 def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
     config = make_config(tmp_path)
-    config["filter"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
+    config["filter"]["method"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
     found = comparison.parameters(config, NAMES)
     assert found["P0"] == "0.01"
     assert (found["initial.anterior"], found["initial.posterior"]) == ("5.0", "3.0")
@@ -153,28 +149,25 @@ def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
 
 
 def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
-    runs = [
-        {"seed": 4, "status": "converged", "reason": "", "estimate": [6.0, 2.0], "std": [0.1, 0.1],
-         "relative_error": [-0.04, 0.02], "seconds": 1.0, "forward_solves": 3, "iterations": 2},
-        {"seed": 5, "status": "converged", "reason": "", "estimate": [6.4, 2.0], "std": [0.1, 0.1],
-         "relative_error": [0.02, 0.04], "seconds": 2.0, "forward_solves": 3, "iterations": 4},
-        {"seed": 6, "status": "failed", "reason": "", "estimate": None, "std": None,
-         "relative_error": None, "seconds": 3.0, "forward_solves": 1, "iterations": 0},
-    ]  # fmt: skip
-    found = comparison.metrics(comparable(repeats=runs))
+    # Of the truths 6.25 and 1.96 these are -4 and 2, 2 and 4 %.
+    runs = (
+        estimate((6.0, 1.9992), 4, seconds=1.0, iterations=2),
+        estimate((6.375, 2.0384), 5, seconds=2.0, iterations=4),
+        estimate(None, 6, seconds=3.0, iterations=0),
+    )
+    found = comparison.metrics(make_record(estimates=runs))
     single = {name: value for name, value, _ in found if not name.startswith(("repeat", "iterate"))}
     assert single["error.anterior"] == pytest.approx((4 + 2) / 2)
     assert single["error.mean"] == pytest.approx((4 + 2 + 2 + 4) / 4)
-    assert single["estimate.anterior"] == pytest.approx(6.2)
-    assert single["spread.anterior"] == pytest.approx(0.4 / 2**0.5)
+    assert single["estimate.anterior"] == pytest.approx(6.1875)
+    assert single["spread.anterior"] == pytest.approx(0.375 / 2**0.5)
     assert (single["failed"], single["seconds"], single["iterations"]) == (1, 6.0, 2)
     seeds = [(v, step) for name, v, step in found if name == "repeat.estimate.anterior"]
-    assert seeds == [(6.0, 4), (6.4, 5)]
+    assert seeds == [(6.0, 4), (6.375, 5)]
 
 
 def test_a_failed_run_has_no_errors() -> None:
-    nothing = dict.fromkeys(("estimate", "std", "relative_error", "distance_mm", "iterates"))
-    record = comparable(status="failed", mesh=None, repeats=[], **nothing)
+    record = make_record(status="failed", estimates=(estimate(None),))
     found = {name: value for name, value, _ in comparison.metrics(record)}
     assert found["failed"] == 1
     assert not [name for name in found if name.startswith(("error", "estimate", "distance"))]
@@ -196,9 +189,6 @@ def test_a_job_becomes_one_flat_run(tmp_path) -> None:
     assert "mlflow.parentRunId" not in tags
     assert float(run.data.params["P0"]) == 0.01
     assert run.data.metrics["error.anterior"] == pytest.approx(4.0)
-    inputs = {one.tags[0].value: one.dataset for one in run.inputs.dataset_inputs}
-    assert inputs["mesh"].digest == "m" * 36
-    assert json.loads(inputs["observation"].source)["noise_mm"] == 0.5
     kept = tmp_path / "mlartifacts" / run.info.run_id / "artifacts"
     assert {path.name for path in kept.iterdir()} == {"config.json", "result.json", "iterates.png"}
 
@@ -220,8 +210,8 @@ def test_a_new_result_takes_the_place_of_the_old_one(tmp_path) -> None:
     store = open_store(None, tmp_path, "debug")
     upload(store, job, "sweep-1")
     assert uploading.is_tracked(job)
-    changed = make_record(("job" * 64)[:64], estimate=[6.1, 2.1])
-    (job / "result.json").write_text(written(changed))
+    changed = make_record(("job" * 64)[:64], estimates=(estimate((6.1, 2.1)),))
+    write_record(job / "result.json", changed)
     assert not uploading.is_tracked(job)
     assert upload(store, job, None)
     (run,) = stored(tmp_path)
@@ -233,7 +223,7 @@ def test_a_run_that_was_cut_short_is_made_anew(tmp_path, monkeypatch) -> None:
     job = make_job(tmp_path)
     store = open_store(None, tmp_path, "debug")
     with monkeypatch.context() as patch:
-        patch.setattr(store.client, "log_inputs", lambda *_, **__: 1 / 0)
+        patch.setattr(store.client, "log_artifact", lambda *_, **__: 1 / 0)
         with pytest.raises(TrackingError):
             upload(store, job, "sweep-1")
     assert not (job / RECEIPT).exists()
@@ -243,9 +233,8 @@ def test_a_run_that_was_cut_short_is_made_anew(tmp_path, monkeypatch) -> None:
 
 
 def test_a_failed_run_is_told_with_its_reason(tmp_path) -> None:
-    nothing = dict.fromkeys(("estimate", "std", "relative_error", "distance_mm", "iterates"))
-    killed = {"status": "failed", "reason": "killed by signal 9", "mesh": None, "repeats": []}
-    upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, **killed, **nothing), "s")
+    killed = {"status": "failed", "reason": "killed by signal 9", "estimates": ()}
+    upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, **killed), "s")
     (run,) = stored(tmp_path)
     assert (run.info.status, run.data.tags["reason"]) == ("FAILED", "killed by signal 9")
 
@@ -400,12 +389,12 @@ def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read
     (make_job(tmp_path, "c") / "config.json").write_text("{")
     make_job(tmp_path, "d")
     # Of a version before this one.
-    (make_job(tmp_path, "e") / "result.json").write_text(json.dumps(make_record()))
+    (make_job(tmp_path, "e") / "result.json").write_text('{"version": 2}')
     assert sync.main([str(tmp_path)]) == 1
     captured = capsys.readouterr()
     assert [run.data.tags["folder"] for run in stored(tmp_path)] == ["d"]
     assert captured.err.count("left out") == 2
-    assert "another version" in captured.err
+    assert "of this version" in captured.err
     assert "config.json" in captured.err
     assert sync.main([str(tmp_path / "nowhere")]) == 2
 
@@ -472,43 +461,30 @@ def test_a_sweep_is_logged_at_its_end(tmp_path) -> None:
     assert many.endswith(f"/runs?searchFilter=tags.sweep_id%20%3D%20%22{sweep_id}%22")
 
 
-def swept(names: str, **changes) -> dict:
-    """What ``sweep.json`` says of jobs of these names, the last of which was lost."""
-    run = {"seed": 1, "status": "converged", "reason": "tolerance", "seconds": 2.0}
-    numbers = {"estimate": [6.0, 2.0], "std": [0.1, 0.05], "relative_error": [-0.04, 0.02]}
-    jobs = [
-        {
-            "hash": (name * 64)[:16],
-            "row": name,
-            "factors": {"noise": 0.5 * number, "R": 0.01 if number else [0.1, 0.2]},
-            "seed": 1,
-            "status": "converged",
-            "reason": "tolerance",
-            "runs": [run | numbers, run | {"seed": 2, "status": "failed", "reason": "it buckled"}],
-        }
-        for number, name in enumerate(names)
-    ]
-    jobs[-1] |= {"status": "failed", "reason": "killed by signal 9", "runs": []}
-    found = {
-        "schema": 2,
-        "sweep": {"name": "debug", "size": "small", "kind": "noise"},
-        "title": "A quick check",
-        "parameters": NAMES,
-        "provenance": asdict(here_and_now("c" * 64, "none", 1)),
-        "jobs": jobs,
-        "cost": [
-            {"hash": job["hash"], "seconds": 2.0, "seconds_total": 3.0, "overhead": 0.5}
-            for job in jobs
-        ],
-    }
-    return found | changes
+def write_swept(folder: Path, names: str, **changes) -> None:
+    """What is collected of jobs of these names, the last of which was lost."""
+    jobs = []
+    for number, name in enumerate(names):
+        lost = number == len(names) - 1
+        killed = {"status": "failed", "reason": "killed by signal 9", "estimates": ()}
+        record = make_record(
+            row=name,
+            factors={"noise": 0.5 * number, "R": 0.01 if number else [0.1, 0.2]},
+            seconds_total=3.0,
+            **(killed if lost else {"estimates": (estimate(), estimate(None, 2))}),
+        )
+        short = (name * 64)[:16]
+        jobs.append(SweptJob(hash=short, seed=1, repeats=2, overhead=0.5, record=record))
+    whole = {"name": "debug", "size": "small", "title": "A quick check", "parameters": NAMES}
+    given = {**whole, "provenance": SOURCE, "jobs": tuple(jobs), **changes}
+    write_sweep_file(folder / summary.SWEEP, Sweep(**given))
 
 
 def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> None:
     for name in "abc":
         make_job(tmp_path, name)
     plan = make_plan(tmp_path, a={}, b={}, c={})
-    write_json(plan.folder / summary.SWEEP, sealed(swept("abc")))
+    write_swept(plan.folder, "abc")
     sync.log_sweep(asked(tmp_path), plan, None)
 
     def kinds() -> list[str | None]:
@@ -519,29 +495,26 @@ def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> N
     (whole,) = [run for run in stored(tmp_path) if run.data.tags.get("kind") == "sweep"]
     assert whole.info.run_name == "all 3 jobs"
     assert whole.data.metrics == {
-        "jobs": 3.0, "failed": 1.0, "seconds": 9.0, "error.mean": pytest.approx(3.0),
-        "overhead": 0.5,
+        "jobs": 3.0, "failed": 1.0, "seconds": 9.0, "overhead": 0.5,
+        "error.mean": pytest.approx(50 * (0.04 + 0.04 / 1.96)),
     }  # fmt: skip
     kept = Path(unquote(urlsplit(whole.info.artifact_uri).path))
     table = read_parquet(kept / "jobs.parquet")
-    # Two moduli of each of the seeds 1 and 2 of two jobs, and of the lost one.
-    assert list(table["job"]) == ["a" * 16] * 4 + ["b" * 16] * 4 + ["c" * 16] * 2
-    assert list(table["status"]) == ["converged", "converged", "failed", "failed"] * 2 + [
-        "failed",
-        "failed",
-    ]
+    # Two moduli of each of the seeds 1 and 2 of two jobs, and the lost one.
+    assert list(table["job"]) == ["a" * 16] * 4 + ["b" * 16] * 4 + ["c" * 16]
+    assert list(table["status"]) == [*["converged", "converged", "failed", "failed"] * 2, "failed"]
     assert list(table["reason"][7:9]) == ["it buckled", "killed by signal 9"]
     assert list(table["parameter"][:2]) == NAMES
     assert list(table["estimate"].dropna()) == [6.0, 2.0] * 2
-    assert list(table["relative_error"].dropna()) == [-0.04, 0.02] * 2
-    assert set(table["unit"]) == {"MPa"}
+    assert list(table["relative_error"].dropna()) == pytest.approx([-0.04, 0.04 / 1.96] * 2)
+    assert set(table["unit"].dropna()) == {"MPa"}
     assert json.loads(table["factors"][4]) == {"noise": 0.5, "R": 0.01}
     assert (kept / "sweep.json").read_text() == (plan.folder / "sweep.json").read_text()
 
     # Once for each state of the sweep.
     sync.log_sweep(asked(tmp_path), plan, None)
     assert whole.info.run_id in {run.info.run_id for run in stored(tmp_path)}
-    write_json(plan.folder / summary.SWEEP, sealed(swept("abc", title="Anew")))
+    write_swept(plan.folder, "abc", title="Anew")
     sync.log_sweep(asked(tmp_path), plan, None)
     assert kinds() == ["None", "None", "None", "sweep"]
     assert whole.info.run_id not in {run.info.run_id for run in stored(tmp_path)}
@@ -552,7 +525,7 @@ def test_of_very_many_jobs_only_the_whole_is_a_run_unless_asked(tmp_path, monkey
     for name in "abc":
         make_job(tmp_path, name)
     plan = make_plan(tmp_path, a={}, b={}, c={})
-    write_json(plan.folder / summary.SWEEP, sealed(swept("abc")))
+    write_swept(plan.folder, "abc")
     config = asked(tmp_path)
     sync.log_sweep(config, plan, None)
     assert sync.main([str(tmp_path)]) == 0

@@ -1,0 +1,166 @@
+"""Collected sweeps: their file, what is published of them, and what is refused."""
+
+import json
+
+import pytest
+
+from experiments.sweeps.collected import Sweep, head_of, read_sweep, read_sweeps, write_sweep_file
+from experiments.sweeps.report import write_sweep
+from mvest.errors import InputError
+from tests.experiments.studies.made_up import SOURCE, made_up_twin
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, noise, run, starts, sweep
+
+HOSTILE = r"<b>x</b> | 5 % & $y$ \input{z}_1"
+
+
+def small() -> Sweep:
+    jobs = [
+        job({"filter": name}, [run(1, TRUTH * 1.01, [0.1, 0.1])] if name != "c" else [], "dead")
+        for name in "abc"
+    ]
+    return sweep("filter", jobs)
+
+
+def contents(folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("whole", [small(), noise(2), lost(noise(2)), sweep("x", [job({}, [])])])
+def test_a_sweep_comes_back_from_its_file(tmp_path, whole):
+    write_sweep_file(tmp_path / "a.json", whole)
+    back = read_sweep(tmp_path / "a.json")
+    assert [one.hash for one in back.jobs] == [one.hash for one in whole.jobs]
+    for ours, theirs in zip(back.records, whole.records, strict=True):
+        assert head_of(ours).model_dump(exclude={"estimates"}) == head_of(theirs).model_dump(
+            exclude={"estimates"}
+        )
+        assert [one.unknowns for one in ours.estimates] == [
+            one.unknowns for one in theirs.estimates
+        ]
+    assert back.plain() == whole.plain()
+
+
+def test_paths_are_kept_where_starts_differ_of_the_first_seed():
+    def kept(whole: Sweep) -> list[bool]:
+        back = Sweep.of_plain(whole.plain(), "there")
+        return [bool(one.iterates) for record in back.records for one in record.estimates]
+
+    assert kept(starts()) == [True] * 16
+    assert not any(kept(noise(2)))
+    two = [run(seed, TRUTH, [0.1, 0.1]) for seed in (1, 2)]
+    jobs = [job({"a": k}, two, start=(float(k), 1.0)) for k in (1, 2)]
+    assert kept(sweep("x", jobs)) == [True, False] * 2
+
+
+def test_what_jobs_have_alike_is_stored_once():
+    many = [job({"a": k, "b": 1}, [run(1, TRUTH, [0.1, 0.1])]) for k in range(50)]
+    data = sweep("x", many).plain()
+    assert data["common"]["record"]["factors"] == {"b": 1}
+    assert data["jobs"][3]["record"]["factors"] == {"a": 3}
+    assert data["common"]["record"]["provenance"]["versions"] == {"mvest": "0.1.0"}
+    assert len(json.dumps(data["jobs"][3])) < 1000
+
+
+def test_a_record_is_kept_without_what_no_table_shows():
+    whole = made_up_twin()
+    head = head_of(whole)
+    assert whole.tables
+    assert head.tables == {}
+    assert head.estimates[0].unknowns == whole.estimates[0].unknowns
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda s: s.pop("jobs"), "'jobs'"),
+        (lambda s: s.update(version=2), "version"),
+        (lambda s: s.update(jobs=[]), "jobs"),
+        (lambda s: s["common"]["record"].pop("title"), r"jobs\.0\.record\.title"),
+        (lambda s: s.update(jobs=[3]), "is no collected sweep"),
+        (lambda s: s.update(title="Better"), "content is not what was written"),
+    ],
+)
+def test_a_damaged_sweep_is_named(damage, words):
+    data = small().plain()
+    damage(data)
+    with pytest.raises(InputError, match=words):
+        Sweep.of_plain(data, "there.json")
+    with pytest.raises(InputError, match=r"there\.json is no collected sweep but a list"):
+        Sweep.of_plain([], "there.json")
+
+
+def test_published_sweeps_are_read_in_their_order(tmp_path):
+    assert read_sweeps(tmp_path) == []
+    (tmp_path / "sweeps").mkdir()
+    for whole in (noise(2), small()):
+        write_sweep_file(tmp_path / "sweeps" / f"{whole.name}.json", whole)
+    assert [whole.name for whole in read_sweeps(tmp_path)] == ["filter", "noise"]
+    (tmp_path / "sweeps" / "a.json").write_text("{", encoding="utf-8")
+    with pytest.raises(InputError, match=r"a\.json is not JSON"):
+        read_sweeps(tmp_path)
+
+
+def test_everything_of_a_sweep_stands_side_by_side(tmp_path):
+    written = write_sweep(tmp_path, small())
+    assert {path.name for path in written} == set(contents(tmp_path)) == {
+        "sweep_filter.csv", "sweep_filter_table.csv", "sweep_filter_table.tex", "sweep_filter.md",
+        "sweep_filter.png",
+    }  # fmt: skip
+    page = (tmp_path / "sweep_filter.md").read_text(encoding="utf-8")
+    assert "(sweep_filter.png)" in page
+    assert "nan" not in page
+
+
+def test_equal_sweeps_give_equal_files_whenever_they_ran(tmp_path):
+    first = small()
+    # What may differ between an undisturbed sweep and one that was killed and taken up again.
+    source = SOURCE.model_copy(update={"finished": "2031-01-01T00:00:00Z", "cpu_count": 99})
+
+    def later(one):
+        estimates = tuple(e.model_copy(update={"seconds": 1e3}) for e in one.record.estimates)
+        more = {"finished": source.finished, "config_hash": one.record.provenance.config_hash}
+        record = one.record.model_copy(
+            update={
+                "estimates": estimates,
+                "seconds_total": 1e3,
+                "provenance": source.model_copy(update=more),
+            }
+        )
+        return one.model_copy(update={"record": record, "overhead": 7.0})
+
+    second = first.model_copy(
+        update={"provenance": source, "jobs": tuple(later(one) for one in first.jobs)}
+    )
+    for name, whole in (("a", first), ("b", second)):
+        (tmp_path / name).mkdir()
+        write_sweep(tmp_path / name, whole)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_hostile_names_act_in_no_file(tmp_path):
+    whole = sweep("filter", [job({"filter": HOSTILE}, [], HOSTILE, row=HOSTILE)])
+    write_sweep(tmp_path, whole)
+    markdown = (tmp_path / "sweep_filter.md").read_text(encoding="utf-8")
+    assert "<b>" not in markdown
+    rows = [line for line in markdown.splitlines() if line.startswith("|")]
+    assert len({line.replace(r"\|", "").count("|") for line in rows}) == 1
+    tex = (tmp_path / "sweep_filter_table.tex").read_text(encoding="utf-8")
+    body = "\n".join(line for line in tex.splitlines() if not line.startswith("%"))
+    assert r"\input" not in body
+    assert r"\textbackslash{}input\{z\}\_1" in body
+
+
+def test_a_picture_that_no_longer_holds_is_taken_away(tmp_path):
+    write_sweep(tmp_path, small())
+    assert (tmp_path / "sweep_filter.png").exists()
+    write_sweep(tmp_path, lost(small()))
+    assert not list(tmp_path.glob("*.png"))
+    assert ".png" not in (tmp_path / "sweep_filter.md").read_text(encoding="utf-8")
+
+
+def test_a_sweep_cannot_write_elsewhere_and_says_where_it_cannot(tmp_path):
+    with pytest.raises(InputError, match="letters, digits"):
+        write_sweep(tmp_path, small().model_copy(update={"name": "../x"}))
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot write"):
+        write_sweep(tmp_path / "file", lost(small()))

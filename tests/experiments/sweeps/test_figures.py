@@ -1,0 +1,106 @@
+"""What the figures of a sweep show."""
+
+import pytest
+
+from experiments.sweeps.figures import figures_of
+from mvest.reporting.style import plain_number
+from tests.experiments.sweeps.made_up_sweeps import (
+    TRUTH,
+    failed_run,
+    job,
+    lost,
+    noise,
+    run,
+    starts,
+    sweep,
+)
+
+
+def axes_of(figure, label: str):
+    (found,) = [axes for axes in figure.axes if axes.get_xlabel() == label]
+    return found
+
+
+def dots(axes) -> list[tuple[float, float]]:
+    return [
+        (float(line.get_xdata()[0]), float(line.get_ydata()[0]))
+        for line in axes.lines
+        if line.get_marker() == "o" and line.get_linestyle() == "None"
+    ]
+
+
+def test_a_panel_for_each_factor_with_medians_intervals_and_failures():
+    def runs(errors):
+        return [run(k, TRUTH * (1 + e / 100), [0.1, 0.1]) for k, e in enumerate(errors)]
+
+    jobs = [
+        job({"kind": "a", "R": 0.01}, runs([1.0, 2.0, 6.0])),
+        job({"kind": "b", "R": 1.0}, [*runs([-1.0, -1.0, -1.0]), failed_run(3, "no")], seed=0),
+    ]
+    figure = figures_of(sweep("x", jobs))[""]
+    kind, r = axes_of(figure, "kind"), axes_of(figure, "R [mm²]")
+    assert [text.get_text() for text in kind.get_xticklabels()] == ["a", "b"]
+    # Both moduli at both values; the second one's run failed.
+    assert [y for _, y in dots(kind)] == pytest.approx([2.0, 2.0, -1.0, -1.0])
+    assert sum(line.get_marker() == "x" for line in kind.lines) == 1
+    # Half widths of 1.96 x 0.1 in percent of 6.23 and 2.09.
+    assert [bar.get_height() / 2 for bar in kind.patches[:2]] == pytest.approx(
+        [100 * 0.196 / 6.23, 100 * 0.196 / 2.09], rel=1e-3
+    )
+    # Two decades apart: the axis is logarithmic.
+    assert list(r.get_xticks()) == [-2.0, 0.0]
+    assert [text.get_text() for text in r.get_xticklabels()] == ["0.01", "1"]
+
+
+def test_numbers_stand_at_their_value_where_that_is_more_even_and_zero_has_a_place():
+    def places(values):
+        jobs = [job({"a": v}, [run(1, TRUTH, [0.1, 0.1])]) for v in values]
+        return list(figures_of(sweep("x", jobs))[""].axes[0].get_xticks())
+
+    assert places([float(k) for k in range(1, 7)]) == [1, 2, 3, 4, 5, 6]
+    assert places([0.0, 0.01, 0.1, 1.0]) == pytest.approx([-3, -2, -1, 0])
+
+
+def test_the_matrix_has_a_cell_for_each_pair_and_marks_failures():
+    figure = figures_of(starts())["matrix"]
+    iterated, paper = figure.axes[:2]
+    assert [axes.get_title() for axes in (iterated, paper)] == ["filter: iterated", "filter: paper"]
+    for axes in (iterated, paper):
+        texts = [text.get_text() for text in axes.texts]
+        assert len(texts) == 9
+        assert texts.count("×") == 1
+    # 1e-4 x 4 x 2 of the truth, in percent.
+    assert "0.08" in [text.get_text() for text in paper.texts]
+
+
+def test_the_matrix_shows_the_worst_parameters_root_mean_square():
+    runs = [run(k, TRUTH * [1 + e / 100, 1.0], [0.1, 0.1]) for k, e in enumerate((1.0, -7.0))]
+    jobs = [job({"a": a, "b": b}, runs) for a in (1, 2) for b in (1, 2)]
+    # Root of (1 + 49) / 2 = 5.
+    assert {t.get_text() for t in figures_of(sweep("x", jobs))["matrix"].axes[0].texts} == {"5"}
+
+
+def test_paths_are_drawn_where_starts_differ():
+    figure = figures_of(starts())["paths"]
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["filter: iterated", "filter: paper"]
+    for k, axes in enumerate(figure.axes):
+        paths = [line for line in axes.lines if len(line.get_xdata()) == 3]
+        assert len(paths) == 8, "one start of nine killed its job"
+        (truth,) = [line for line in axes.lines if line.get_linestyle() == "--"]
+        assert truth.get_ydata()[0] == TRUTH[k // 2]
+
+
+def test_nothing_to_draw_gives_no_figure():
+    assert set(figures_of(starts())) == {"", "matrix", "paths"}
+    assert set(figures_of(noise(3))) == {"", "matrix"}
+    one_factor = sweep("x", [job({"a": k}, [run(1, TRUTH, [0.1, 0.1])]) for k in (1, 2)])
+    assert set(figures_of(one_factor)) == {""}
+    assert figures_of(sweep("x", [job({"a": 1}, [run(1, TRUTH, [0.1, 0.1])])])) == {}
+    assert figures_of(lost(starts())) == {}
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0, "0"), (0.0004, "4e-4"), (0.012, "0.012"), (2.25, "2.2"), (73.4, "73")]
+)
+def test_numbers_on_axes_are_short(value: float, text: str):
+    assert plain_number(value) == text
