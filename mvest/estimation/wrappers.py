@@ -1,15 +1,15 @@
-"""Models made of models: of some of the parameters, of some of what is predicted, with a memory."""
+"""Models made of models: of some of the parameters, with a memory."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from mvest.estimation.prediction import ObservationModel, Predicted, Prediction, predict
-from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Remembered", "Restartable", "SharedStart", "of_some", "rows_of", "stacked"]
+__all__ = ["Remembered", "Restartable", "SharedStart", "of_some"]
 
 State = TypeVar("State")
 
@@ -41,33 +41,6 @@ def of_some(
         return replace(prediction, jacobian=prediction.jacobian[:, kept])
 
     return part
-
-
-def rows_of(model: ObservationModel, rows: BoolArray) -> Callable[[FloatArray], Prediction]:
-    """A model of which some of the predicted numbers are observed, those of ``rows (n,)``."""
-
-    def seen(m: FloatArray) -> Prediction:
-        prediction = predict(model, m, len(rows))
-        if not prediction.converged:
-            return prediction
-        return replace(prediction, y=prediction.y[rows], jacobian=prediction.jacobian[rows])
-
-    return seen
-
-
-def stacked(models: Sequence[ObservationModel]) -> Callable[[FloatArray], Prediction]:
-    """Several models of the same parameters as one, which fails where one of them does."""
-
-    def whole(m: FloatArray) -> Prediction:
-        parts = []
-        for model in models:
-            parts.append(predict(model, m))
-            if not parts[-1].converged:
-                return parts[-1]
-        y, jacobian = zip(*((part.y, part.jacobian) for part in parts), strict=True)
-        return Prediction(np.concatenate(y), np.concatenate(jacobian))
-
-    return whole
 
 
 class Remembered:

@@ -13,6 +13,10 @@ from mvest.estimation.prediction import ObservationModel, Prediction, predict, r
 from mvest.observation.errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray
 
+ALL_VERTICES = "all vertices"
+LANDMARKS = 10
+"""On the free edge, and as many halfway to it, evenly around the valve."""
+
 FRAMES = ("open", "closed")
 """Frames that a valve model predicts, in the order in which it stacks them."""
 
@@ -184,3 +188,24 @@ def select_frames(
     size = len(stacked) // len(predicted)
     starts = [size * predicted.index(frame) for frame in frames]
     return np.concatenate([stacked[start : start + size] for start in starts])
+
+
+def vertex_sets(columns: int, rows: int) -> dict[str, BoolArray]:
+    """Sets of vertices that might be seen, out of ``columns x rows``, annulus first; each ``(n,)``.
+
+    Parameters
+    ----------
+    columns, rows : int
+        Vertices around the valve, and from the annulus to the free edge.
+    """
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    way = row / (rows - 1)
+    around = np.isin(column, np.linspace(0, columns, LANDMARKS, endpoint=False).astype(int))
+    return {
+        ALL_VERTICES: way >= 0.0,
+        "belly (middle third)": (way >= 1 / 3) & (way <= 2 / 3),
+        "annulus and free edge": (way == 0.0) | (way == 1.0),
+        "free edge": way == 1.0,
+        f"{2 * LANDMARKS} landmarks": around
+        & ((way == 1.0) | (way == way[np.argmin(abs(way - 0.5))])),
+    }

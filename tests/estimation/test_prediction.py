@@ -17,7 +17,7 @@ from mvest.estimation import (
     UnscentedFilter,
 )
 from mvest.estimation.prediction import as_prediction, predict
-from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of, stacked
+from mvest.estimation.wrappers import Remembered, SharedStart, of_some
 from mvest.observation.vertices import Observation
 from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
@@ -62,7 +62,6 @@ USES = {
     **{named(f): run_filter(f) for f in FILTERS},
     "expectation": run_expectation,
     "some parameters": lambda model: of_some(model, np.ones(2), np.array([0]))(np.ones(1)),
-    "some rows": lambda model: rows_of(model, np.ones(6, dtype=bool))(np.ones(2)),
     "remembered": lambda model: Remembered(model)(np.ones(2)),
     "as_prediction": lambda model: as_prediction(model(np.ones(2)), 2),
 }
@@ -125,41 +124,13 @@ def test_what_a_model_without_derivatives_hands_on_arrives_too() -> None:
     np.testing.assert_allclose(found.prediction.aux, found.mean, rtol=1e-12)
 
 
-def test_wrappers_hand_on() -> None:
+def test_a_model_of_some_parameters_hands_on() -> None:
     model = lambda m: Prediction(H @ m, H, reason="closed", aux="state")  # noqa: E731
-    rows = np.array([True, False, True, False, False, True])
-    for wrapped, m in (
-        (of_some(model, np.ones(2), np.array([1])), np.array([3.0])),
-        (rows_of(model, rows), np.array([1.0, 3.0])),
-    ):
-        prediction = wrapped(m)
-        assert (prediction.reason, prediction.aux) == ("closed", "state")
-    whole = H @ np.array([1.0, 3.0])
-    np.testing.assert_array_equal(of_some(model, np.ones(2), np.array([1]))(m[1:]).y, whole)
-    np.testing.assert_array_equal(rows_of(model, rows)(m).y, whole[rows])
-    np.testing.assert_array_equal(rows_of(model, rows)(m).jacobian, H[rows])
+    prediction = of_some(model, np.ones(2), np.array([1]))(np.array([3.0]))
+    assert (prediction.reason, prediction.aux) == ("closed", "state")
+    np.testing.assert_array_equal(prediction.y, H @ np.array([1.0, 3.0]))
     failed = lambda m: Prediction.failed("does not close")  # noqa: E731
-    assert of_some(failed, np.ones(2), np.array([1]))(m[1:]).reason == "does not close"
-    assert rows_of(failed, rows)(m).reason == "does not close"
-
-
-def test_models_are_stacked_up_to_the_first_that_fails() -> None:
-    calls = []
-
-    def model(factor: float):
-        def predicted(m: np.ndarray) -> Prediction:
-            calls.append(factor)
-            return Prediction.failed("open") if m[0] < 0 else Prediction(factor * H @ m, factor * H)
-
-        return predicted
-
-    whole = stacked([model(1.0), model(2.0)])
-    m = np.array([1.0, 3.0])
-    np.testing.assert_array_equal(whole(m).y, np.concatenate([H @ m, 2.0 * H @ m]))
-    np.testing.assert_array_equal(whole(m).jacobian, np.concatenate([H, 2.0 * H]))
-    calls.clear()
-    assert whole(-m).reason == "open"
-    assert calls == [1.0]
+    assert of_some(failed, np.ones(2), np.array([1]))(np.ones(1)).reason == "does not close"
 
 
 def test_a_known_value_is_met_to_the_last_bit() -> None:

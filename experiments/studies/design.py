@@ -1,0 +1,501 @@
+"""Which observations would make the moduli known, found out before any are made.
+
+Two experiments compare designs from exact derivatives alone. `identifiability` asks for one
+configured valve which frames, vertices and errors it takes, and what must be known of chordae and
+pressure. `design` asks for virtual patients how many closed frames it takes under how well known
+pressures, and estimates some of them.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import closure_model, mechanics_of
+from experiments.common.building.filters import require_one_each
+from experiments.common.building.virtual_patients import PatientSettings, draw_patient_values
+from experiments.common.cases.own_case import settings_of
+from experiments.common.cases.settings import PersonalSettings
+from experiments.common.progress import SolveBar, say
+from experiments.common.records.record import NOT_GATED, Mesh
+from experiments.common.study import Job, Result, Results, Study
+from mvest.closure.cycle import CycleModel, CycleProtocol
+from mvest.closure.model import ClosureModel
+from mvest.errors import GeometryError
+from mvest.estimation.information.design import Design, together
+from mvest.observation.errors import SpatialCorrelation
+from mvest.observation.vertices import ALL_VERTICES, vertex_sets
+from mvest.personalisation.chain import personalise
+from mvest.personalisation.considered_geometry import ConsideredGeometry
+from mvest.personalisation.design import (
+    HALF,
+    KINDS,
+    FrameDesigns,
+    StatedErrors,
+    design_case,
+)
+from mvest.personalisation.model import build_coarse
+from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
+from mvest.problem.record import EstimateRecord, confounded, finite, record_of
+from mvest.quantities import (
+    BeatTime,
+    Count,
+    Factor,
+    Length,
+    Pressure,
+    PressureError,
+    Share,
+    TimeStep,
+)
+from mvest.reporting.tables import Column, Table, table
+from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.variation import vary
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+__all__ = ["STUDY", "run"]
+
+Values = Mapping[str, Any]
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DesignsSettings:
+    """Observations of the configured valve that are compared before any is made."""
+
+    pressures_mmHg: tuple[Pressure, ...] = (60.0,)  # of one closed frame more
+    cycle_times: tuple[BeatTime, ...] = ()  # s, observed in a whole cycle
+    cycle_dt: TimeStep = 0.003125  # s
+    noise_mm: tuple[Length, ...] = (0.1, 0.25, 0.5, 1.0)
+    typical_mm: Length = 0.5  # noise of what tables say at one noise
+    correlation_length_mm: Length = 5.0
+    target: Share = 0.05  # relative standard deviation that is wanted of a modulus
+    # Relative standard deviations of the nuisances, by what is assumed to be known of them: 0
+    # for what is known, and nothing is known of what is not named.
+    knowledge: dict[str, dict[str, Factor]] = field(default_factory=dict)
+    believed: str = ""  # which of these holds where it is asked how well pressure must be known
+    known: tuple[str, ...] = ()  # parameters taken as known where confounded ones are looked for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Corner:
+    """A design with which a patient is estimated: errors as stated, and as drawn."""
+
+    frames: Count = 1  # closed ones, the first under the closed frame's pressure
+    factor: Factor = 0.1  # relative, on all pressures
+    offset_mmHg: PressureError = 0.0
+    each_mmHg: PressureError = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FramesSettings:
+    """Frames of a virtual patient that are designed, and which designs are also tried."""
+
+    geometry: ConsideredGeometry | None = None  # how well it is known where it is not exactly
+    corners: dict[str, Corner] | None = None  # name -> design
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration: of the configured valve, or of a patient."""
+
+    designs: DesignsSettings = field(default_factory=DesignsSettings)
+    frames: FramesSettings | None = None
+    patient: PatientSettings | None = None
+    personal: PersonalSettings = field(default_factory=PersonalSettings)
+
+
+def run(job: Job[Settings]) -> Result:
+    """Compare designs of the configured valve, or those of a virtual patient's frames."""
+    if job.settings.frames is not None and job.settings.patient is not None:
+        return _patient_designs(job, job.settings.frames, job.settings.patient)
+    return _valve_designs(job.values, job.settings.designs)
+
+
+# -- one configured valve -------------------------------------------------------------------------
+def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
+    """Derivatives of one run for each set of frames, and all designs from them.
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close.
+    """
+    model = replace(closure_model(values), continuation=True)
+    truth = np.array(values["truth"]["values"], dtype=float)
+    require_one_each("truth.values", truth, model.names)
+    frames = _jacobians(settings, model, truth)
+    designs = list(_designs(values, settings, model, frames, truth))
+    whole = [(about, design) for about, design in designs if about["vertices"] == ALL_VERTICES]
+    rows = [{**about, **row} for about, design in designs for row in _expected(settings, design)]
+    needed = [row for about, design in whole for row in _pressures(settings, about, design)]
+    units = dict.fromkeys(next(iter(rows), ()), "")
+    units |= {name: "%" for name in units if name.startswith("std")}
+    units |= {name: "mm" for name in units if name.startswith("noise")}
+    return Result(
+        tables={
+            "": table(rows, **units),
+            "knowledge_of_pressure": table(
+                needed, frames="", errors="", parameter="", **{"known to": "%"}
+            ),
+            "confounded": table(_confounded(settings, whole)),
+        },
+        numbers={"typical_mm": settings.typical_mm, "target_percent": 100 * settings.target},
+        mesh=Mesh.of(model.mesh),
+        forward_solves=len(frames),
+    )
+
+
+def _jacobians(
+    settings: DesignsSettings, model: ClosureModel, truth: FloatArray
+) -> dict[str, list[FloatArray]]:
+    """Derivatives ``(3n, p)`` of each of some frames, by what they are called."""
+    protocol = model.settings.protocol
+    peak, closed = protocol.pressure_mmHg, dict[float, FloatArray]()
+    for pressure in (*settings.pressures_mmHg, peak):
+        at = replace(protocol, pressure_mmHg=pressure)
+        own = replace(model, settings=replace(model.settings, protocol=at))
+        with SolveBar(f"closed at {pressure:g} mmHg", len(at.steps()), 1) as bar:
+            own.on_step = bar.step
+            found = own(truth)
+        if not found.converged:
+            raise GeometryError(f"closed at {pressure:g} mmHg: {found.reason}")
+        closed[pressure] = found.jacobian[len(found.y) // 2 :]
+    # The open valve is the model's own shape at rest, which depends on no parameter.
+    open_ = np.zeros_like(closed[peak])
+    frames = {"closed": [closed[peak]], "open and closed": [open_, closed[peak]]}
+    for pressure in sorted(closed.keys() - {peak}):
+        frames[f"closed at {pressure:g} and {peak:g} mmHg"] = [closed[pressure], closed[peak]]
+    if times := settings.cycle_times:
+        found = CycleModel(model, CycleProtocol(peak, dt=settings.cycle_dt, times=times))(truth)
+        if not found.converged:
+            raise GeometryError(f"whole cycle: {found.reason}")
+        frames[f"whole cycle, {len(times)} frames"] = np.split(found.jacobian, len(times))
+    return frames
+
+
+def _designs(
+    values: Values,
+    settings: DesignsSettings,
+    model: ClosureModel,
+    frames: Mapping[str, Sequence[FloatArray]],
+    truth: FloatArray,
+) -> Iterator[tuple[Row, Design]]:
+    """What each observation says, and what it consists of."""
+    observed, length = values["observation"], settings.correlation_length_mm
+    correlation = SpatialCorrelation(model.valve.surface.vertices, length)
+    sets = vertex_sets(observed["columns"], observed["rows"])
+    for (name, members), correlated in product(sets.items(), (False, True)):
+        R = correlation.of(members).noise(1.0, 3) if correlated else 1.0
+        rows = np.repeat(members, 3)
+        for label, jacobians in frames.items():
+            parts = [Design.of(H[rows], R, truth, model.names) for H in jacobians]
+            about = {
+                "frames": label,
+                "number of frames": len(parts),
+                "vertices": name,
+                "number of vertices": int(members.sum()),
+                "errors": f"correlated over {length:g} mm" if correlated else "independent",
+            }
+            yield about, together(*parts)
+
+
+def _moduli(design: Design) -> list[str]:
+    return [name for name in design.names if name.startswith("E_f.")]
+
+
+def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
+    """Each modulus with each knowledge of the nuisances."""
+    target, typical = f"{100 * settings.target:g} %", f"{settings.typical_mm:g} mm"
+    for (knowledge, stds), name in product(settings.knowledge.items(), _moduli(design)):
+        yield {
+            "knowledge of the nuisances": knowledge,
+            "parameter": name,
+            **{
+                f"std at {noise:g} mm": finite(100 * design.std(name, noise, stds))
+                for noise in settings.noise_mm
+            },
+            f"noise for {target}": finite(design.needed_noise(name, settings.target, stds)),
+            f"observations of {typical} for {target}": finite(
+                design.needed_repeats(name, settings.target, settings.typical_mm, stds)
+            ),
+        }
+
+
+def _pressures(settings: DesignsSettings, about: Row, design: Design) -> Iterator[Row]:
+    """How well the pressure must be known for each modulus, the rest as it is believed.
+
+    Nothing: need not be known; 0: not even if it is known exactly.
+    """
+    if "pressure_scale" in design.names:
+        half = settings.knowledge.get(settings.believed, {})
+        asked = settings.target, settings.typical_mm, "pressure_scale", half
+        for name in _moduli(design):
+            needed = finite(100 * design.needed_knowledge(name, *asked))
+            frames, errors = about["frames"], about["errors"]
+            yield {"frames": frames, "errors": errors, "parameter": name, "known to": needed}
+
+
+def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) -> Iterator[Row]:
+    """Changes of parameters that hardly show together, where nothing is known of nuisances."""
+    for about, design in designs:
+        bound = design.at(settings.typical_mm, dict.fromkeys(settings.known, 0.0))
+        for group in confounded(bound):
+            moved = zip(group.parameters, group.relative, strict=True)
+            yield {
+                "frames": about["frames"],
+                "errors": about["errors"],
+                "changes that hardly show": ", ".join(f"{n} {100 * v:+.2g} %" for n, v in moved),
+                "correlation": group.correlation,
+            }
+
+
+# -- frames of a virtual patient ------------------------------------------------------------------
+VALUES, ANATOMY, ERRORS = range(3)
+"""Streams of random numbers, so that all designs are tried on the same valve."""
+
+
+def _patient_designs(job: Job[Settings], frames: FramesSettings, about: PatientSettings) -> Result:
+    """All designs of a patient's valve at the generic moduli, and estimations with some.
+
+    Raises
+    ------
+    GeometryError
+        If the patient's valve does not close.
+    """
+    patient = _patient(job.values, about, Corner(), ())
+    wanted = settings_of(job.values, job.settings.personal)
+    known = {"exact": None} | ({"considered": frames.geometry} if frames.geometry else {})
+    designs: dict[str, FrameDesigns] = {}
+    for name, geometry in known.items():
+        say(f"designs, geometry {name}")
+        found = design_case(patient.case, replace(wanted, considered_geometry=geometry))
+        if isinstance(found, str):
+            raise GeometryError(f"the generic valve does not close in every frame: {found}")
+        designs[name] = found
+    rows = [{"geometry": name, **row} for name, own in designs.items() for row in own.rows()]
+    tables = {"": table(rows, geometry="", errors="", error="mmHg", left="%")}
+    tried, estimates = list[Row](), list[EstimateRecord]()
+    for name, corner in (frames.corners or {}).items():
+        say(f"estimated: {name}")
+        record, predicted = _tried(job.values, about, wanted, designs["exact"], name, corner)
+        estimates.append(record)
+        tried += _compared(record, predicted, designs["exact"].knowledge)
+    if tried:
+        tables["tried"] = table(tried, **TRIED)
+    mesh = build_coarse(patient.case, wanted).mesh
+    return Result(tables=tables, estimates=tuple(estimates), mesh=Mesh.of(mesh), gate=NOT_GATED)
+
+
+def _patient(
+    values: Values, about: PatientSettings, corner: Corner, pressures: tuple[float, ...]
+) -> VirtualPatient:
+    """The patient as a design sees it: further frames under pressures, which are off as it says."""
+    simulation = replace(
+        about.simulation,
+        fitted_pressure_mmHg=pressures,
+        fitted_relaxation=(0.0,) * len(pressures),
+    )
+    deviations = replace(
+        about.deviations,
+        pressure=corner.factor,
+        pressure_offset_mmHg=corner.offset_mmHg,
+        pressure_each_mmHg=corner.each_mmHg,
+    )
+    drawn = replace(about, simulation=simulation, deviations=deviations)
+    streams = [np.random.default_rng([values["seed"], k]) for k in (VALUES, ANATOMY, ERRORS)]
+    template = vary(template_of(values).parameters, streams[ANATOMY], about.variation)
+    return simulate_patient(
+        about.name,
+        about.description,
+        Template(template),
+        draw_patient_values(drawn, streams[VALUES]),
+        simulation,
+        mechanics_of(values),
+        streams[ERRORS],
+    )
+
+
+def _tried(
+    values: Values,
+    about: PatientSettings,
+    wanted: PersonaliseSettings,
+    designs: FrameDesigns,
+    name: str,
+    corner: Corner,
+) -> tuple[EstimateRecord, dict[str, float]]:
+    """An estimate of the patient with a design, and what the design predicts of each modulus."""
+    further = tuple(designs.pressures_mmHg[k] for k in designs.chosen(corner.frames))[1:]
+    unknowns = tuple(
+        replace(u, std=corner.factor) if u.name == "pressure_scale" else u for u in wanted.unknowns
+    )
+    pressures = PressureErrors(corner.offset_mmHg, corner.each_mmHg)
+    patient = _patient(values, about, corner, further)
+    fit = personalise(patient.case, replace(wanted, unknowns=unknowns, pressures=pressures))
+    record = record_of(fit.result, seed=values["seed"], case=name, simulated=True)
+    stated = StatedErrors(corner.factor, corner.offset_mmHg, corner.each_mmHg)
+    kept = record.without_details().with_truth(patient.hidden.values)
+    return kept, designs.left(corner.frames, stated)
+
+
+TRIED: dict[str, Column | str] = {
+    "design": "",
+    "modulus": "",
+    "predicted": Column("%", ".0f"),
+    "reported": Column("%", ".0f"),
+    "error": Column("%", ".0f"),
+    "generic": Column("%", ".0f", label="error of the generic guess"),
+}
+"""Of the standard deviation of the prior's logarithm."""
+
+
+def _compared(
+    record: EstimateRecord, predicted: Mapping[str, float], knowledge: Mapping[str, float]
+) -> Iterator[Row]:
+    """What became of each modulus that was estimated with a design."""
+    for name, share in predicted.items():
+        own, scale = record.unknown(name), knowledge[name] / 100
+        estimate, truth, generic = own.estimate, own.truth or np.nan, own.prior_mean or np.nan
+        yield {
+            "design": record.case,
+            "modulus": name,
+            "predicted": 100 * share,
+            "reported": None if not estimate else (own.std or 0.0) / estimate / scale,
+            "error": None if not estimate else float(np.log(estimate / truth)) / scale,
+            "generic": float(np.log(generic / truth)) / scale,
+            "reason": record.reason,
+        }
+
+
+# -- tables and figures ---------------------------------------------------------------------------
+def summary(results: Results) -> dict[str, Table]:
+    """For readers: a row for each observation, or for each design the median over patients."""
+    rest = {name: results.table(name) for name in results.table_names if name}
+    if "left" not in results.table().values:
+        worse = _worse(results).reset_index()
+        known = worse.columns[len(OBSERVATION) :]
+        first = dict.fromkeys(OBSERVATION, "")
+        return {"worse_modulus": table(worse, **first, **dict.fromkeys(known, "%:.2g")), **rest}
+    medians = _medians(results).reset_index()
+    counts = {name: Column("%", ".0f") for name in medians.columns if name.endswith("closed")}
+    keys: dict[str, Column | str] = {"geometry": "", "errors": "", "error": "mmHg", "known": ""}
+    shown = {"median_left": table(medians, **keys, **counts), **rest}
+    if "tried" in rest:
+        values = list(TRIED)[2:]
+        squares = rest["tried"].frame.dropna().groupby("design", sort=False)[values].agg(_rms)
+        about = {name: TRIED[name] for name in values}
+        shown["root_mean_squares"] = table(squares.reset_index(), design="", **about)
+    return shown
+
+
+def _rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+OBSERVATION = ["vertices", "errors", "frames"]
+
+
+def _worse(results: Results) -> DataFrame:
+    """Deviation of the worse modulus at the typical noise, a column for each knowledge."""
+    frame, column = results.table().frame, f"std at {results.first.numbers['typical_mm']:g} mm"
+    known = "knowledge of the nuisances"
+    # Infinite where it is not determined.
+    worse = frame.fillna({column: np.inf}).groupby([*OBSERVATION, known], sort=False)[column].max()
+    return worse.unstack().loc[:, frame[known].unique()]
+
+
+def _medians(results: Results) -> DataFrame:
+    """What is left of the guess's error, median over patients and moduli, by number of frames."""
+    keys = ["geometry", "errors", "error", "known", "frames"]
+    frame = results.table().frame
+    medians = frame.groupby(keys, sort=False)["left"].median().unstack()
+    return medians.rename(columns=lambda n: f"{n} closed")
+
+
+def figure(results: Results) -> Figure:
+    """Deviations as tables in colours, or what is left against the number of frames."""
+    patients = "left" in results.table().values
+    return _left_figure(results) if patients else _deviations_figure(results)
+
+
+SHADES = ("#0072B2", "#9ECAE1", "#F6E3C5", "#E8A87C")
+"""From within the target to far from it; blue is what all figures show as good."""
+
+MULTIPLES = (1.0, 2.0, 6.0)
+"""Of the target: where a deviation's colour changes."""
+
+
+def _deviations_figure(results: Results) -> Figure:
+    """A panel for each knowledge of the nuisances: what is seen against frames."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    from mvest.reporting.style import SMALL, panels, plain_number
+
+    worse, target = _worse(results), float(results.first.numbers["target_percent"] or 0.0)
+    norm = BoundaryNorm([0.0, *(m * target for m in MULTIPLES), np.inf], len(SHADES))
+    drawn, (grid,) = panels(1, len(worse.columns), 5.6, sharey=True)
+    for axes, knowledge in zip(grid, worse, strict=True):
+        shown = worse[knowledge].unstack()[worse.index.unique("frames")]
+        axes.imshow(shown, cmap=ListedColormap(SHADES), norm=norm, aspect="auto")
+        for (row, column), value in np.ndenumerate(shown.to_numpy()):
+            text = plain_number(value) if np.isfinite(value) else "∞"
+            colour = "white" if value <= target else "black"
+            axes.text(
+                column, row, text, ha="center", va="center", fontsize=SMALL - 1.5, color=colour
+            )
+        axes.set_title(textwrap.fill(str(knowledge), 13), fontsize=SMALL)
+        axes.set_xticks(
+            range(shown.shape[1]), [textwrap.fill(str(f), 22) for f in shown], rotation=90
+        )
+        axes.grid(visible=False)
+    grid[0].set_yticks(range(len(shown)), [", ".join(seen) for seen in shown.index])
+    return drawn
+
+
+def _left_figure(results: Results) -> Figure:
+    """A panel for each kind of error of the pressures and each geometry."""
+    from mvest.reporting.style import SMALL, levels, panels
+
+    medians = _medians(results)
+    geometries = list(medians.index.unique("geometry"))
+    drawn, grid = panels(
+        len(geometries), len(KINDS), 2.5 * len(geometries), sharex=True, sharey=True
+    )
+    for (row, geometry), (column, kind) in product(enumerate(geometries), enumerate(KINDS)):
+        axes, own = grid[row, column], medians.loc[geometry, kind]
+        for (error, _), colour in zip(own.index, levels(len(own)), strict=True):
+            counts = range(1, own.shape[1] + 1)
+            axes.plot(
+                counts, own.loc[error].iloc[0], "o-", color=colour, ms=3, label=f"{error:g} mmHg"
+            )
+        axes.axhline(100 * HALF, color="0.5", lw=0.9, ls="--")
+        axes.set_ylim(0, None)
+        axes.set_title(f"{KINDS[kind]}, geometry {geometry}", fontsize=SMALL)
+    for axes in grid[-1]:
+        axes.set_xlabel("closed frames")
+    drawn.supylabel("left of the generic guess's error (%)", fontsize=SMALL)
+    grid[-1, -1].legend(fontsize=SMALL - 1.5, frameon=False, ncols=2)
+    return drawn
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run,
+    summary=summary,
+    figure=figure,
+    captions={
+        "": "What is expected of designs, before any data are taken: the standard deviation [%] of "
+        "the worse modulus with each observation, dark where the target is met; or what closed "
+        "frames leave of the generic guess's error, dashed: half. Simulated."
+    },
+)

@@ -1,1 +1,0 @@
-"""What data can tell, before any are taken."""
