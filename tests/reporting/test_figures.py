@@ -3,21 +3,18 @@ from matplotlib.figure import Figure
 
 from mvest.errors import InputError
 from mvest.reporting.figures import iterates_figure, save_figure_with
-from tests.reporting.records import failed_record, record
 
 LINE = "table1: mvest 0.1.0, commit 0123456789ab, configuration cdcdcdcdcdcd, seed 1"
 
 
-def drawn(of):
-    """The iterates of a record."""
-    return iterates_figure(
-        f"{of['title']}: {of['row']}", of["parameters"], of["iterates"], of["iterate_std"],
-        of["truth"],
-    )  # fmt: skip
+def drawn(iterates=((5.0, 3.0), (6.1, 2.3), (6.22, 2.1), (6.2296, 2.0901))):
+    """A figure of four iterates with standard deviations of 0.1."""
+    names, std = ("E_f.anterior", "E_f.posterior"), [(0.1, 0.1)] * len(iterates)
+    return iterates_figure("Moduli: same model", names, iterates, std, (6.23, 2.09))
 
 
 def test_iterates_band_and_truth_are_drawn() -> None:
-    axes = drawn(record()).axes[0]
+    axes = drawn().axes[0]
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
     assert list(lines["E_f.anterior"]) == [5.0, 6.1, 6.22, 6.2296]
     band = axes.collections[0].get_paths()[0].vertices
@@ -35,13 +32,13 @@ def test_iterates_band_and_truth_are_drawn() -> None:
 
 def test_a_run_without_iterates_is_refused() -> None:
     with pytest.raises(InputError, match="nothing to draw"):
-        drawn(failed_record())
+        drawn(())
 
 
 def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
     names = []
     for base in ("a", "b"):
-        names.append(save_figure_with(tmp_path / base, drawn(record()), LINE))
+        names.append(save_figure_with(tmp_path / base, drawn(), LINE, pdf=True))
     for first, second in zip(*names, strict=True):
         assert first.read_bytes() == second.read_bytes()
     assert [path.suffix for path in names[0]] == [".png", ".pdf"]
@@ -52,7 +49,7 @@ def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
 def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot write"):
-        save_figure_with(tmp_path / "file" / "a", drawn(record()), LINE)
+        save_figure_with(tmp_path / "file" / "a", drawn(), LINE)
 
 
 @pytest.mark.parametrize(
