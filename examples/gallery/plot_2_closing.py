@@ -12,7 +12,6 @@ from drawing import draw, same_scale
 
 import mvest
 from mvest.reporting.case.drawing import ATRIUM
-from mvest.scenarios.measures import contact_reach
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import orifice_area
 
@@ -39,7 +38,7 @@ figure = plt.figure(figsize=(9, 4.8), layout="constrained")
 grid = figure.add_gridspec(2, 4, height_ratios=[1, 1.1])
 panels = [figure.add_subplot(grid[0, k]) for k in range(4)]
 for axes, k in zip(panels, (0, 4, 5, -1), strict=True):
-    draw(axes, valve, shapes[k], reach=contact_reach(model) if k == -1 else None)
+    draw(axes, valve, shapes[k], reach=model.contact_reach_mm if k == -1 else None)
     title = "equilibrium" if k == -1 else f"{closing.times[k]:.2f} s"
     axes.set_title(f"{title}, {pressure[k]:.0f} mmHg", fontsize=10)
 same_scale(panels, shapes[:1], ATRIUM)

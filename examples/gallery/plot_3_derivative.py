@@ -14,7 +14,6 @@ from matplotlib.colors import Normalize
 
 import mvest
 from mvest.reporting.case.drawing import ATRIUM
-from mvest.scenarios.measures import contact_reach
 
 template = mvest.Template()
 tissue = {"anterior": mvest.TissueSettings(2.65), "posterior": mvest.TissueSettings(1.11)}
@@ -35,7 +34,7 @@ norm, cmap = Normalize(0, np.quantile(size, 0.99)), plt.get_cmap("viridis")
 figure, panels = plt.subplots(1, 2, figsize=(8.5, 3.6), layout="constrained")
 for k, axes in enumerate(panels):
     draw(axes, model.valve, closed, values=size[:, k], cmap=cmap, norm=norm,
-         reach=contact_reach(model))  # fmt: skip
+         reach=model.contact_reach_mm)  # fmt: skip
     axes.set_title(f"+10 % of {('E_f (anterior)', 'E_f (posterior)')[k]}", fontsize=10)
 same_scale(panels, [closed], ATRIUM)
 bar = figure.colorbar(ScalarMappable(norm, cmap), ax=panels, shrink=0.8, extend="max")

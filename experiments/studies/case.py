@@ -23,7 +23,6 @@ from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts, require_plausible
 from mvest.personalisation.gate import gate_case, gate_lines
 from mvest.personalisation.model import build_model
-from mvest.scenarios.measures import contact_reach
 
 __all__ = ["STUDY", "check_case"]
 
@@ -57,7 +56,7 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
     case = _read(values)
     settings = settings_of(values, build(PersonalSettings, values["personal"]))
     model = build_model(case, settings, mesh_store(values))
-    figure = frames_figure(case, contact_reach(model))
+    figure = frames_figure(case, model.contact_reach_mm)
     drawn = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")[0]
     surface, tips = case.surface, case.frame(Role.REFERENCE).papillary_tips
     lines = [

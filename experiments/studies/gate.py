@@ -22,7 +22,6 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GateReport, run_gate
 from mvest.reporting.tables import Column, Table, joined, table
-from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.valve.measure.coaptation import find_gap
@@ -101,7 +100,7 @@ def _open(model: ClosureModel, vertices: FloatArray) -> tuple[float, float]:
     surface = model.valve.surface
     annulus = vertices[model.valve.annulus]
     seen = vertices, surface.triangles, annulus, plane_of(model.valve, annulus)
-    gap = find_gap(*seen, contact_reach(model))
+    gap = find_gap(*seen, model.contact_reach_mm)
     return gap.area, largest_passing_ball(*seen, thickness=surface.thickness).diameter
 
 

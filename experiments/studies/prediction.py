@@ -30,7 +30,6 @@ from mvest.quantities import AxisCount, Count, Logarithm, within
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
-from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.posterior import posterior_samples
 from mvest.scenarios.predict import PredictedScenario, Sample, closed_valve, predict_scenario
 from mvest.scenarios.scenario import Scenario, model_under
@@ -160,7 +159,7 @@ def run_prediction(job: Job[Settings]) -> Result:
         numbers={
             "samples": attempted,
             "samples_not_closed": sum(len(one.failures) for one in every),
-            "contact_reach_mm": contact_reach(usual),
+            "contact_reach_mm": usual.contact_reach_mm,
         },
         estimates=records,
         arrays=_fields(valve, compared) if compared else {},

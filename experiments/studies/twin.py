@@ -29,7 +29,6 @@ from mvest.problem.record import EstimateRecord, Unknown, record_of
 from mvest.problem.registration import unit_of
 from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
-from mvest.scenarios.measures import contact_reach
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
 
@@ -189,7 +188,7 @@ def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
         "observed": result.observation.positions[-1:].astype(np.float32),
         "fitted": result.fitted[-1:].astype(np.float32),
         "distance_fitted": np.asarray(result.distance, dtype=np.float64)[None],
-        "reach_mm": np.array(contact_reach(twin.model)),
+        "reach_mm": np.array(twin.model.contact_reach_mm),
     }
 
 

@@ -174,6 +174,12 @@ class ClosureModel:
             return self._closed
         return replace(self._closed, guide=self.guide.closed)
 
+    @property
+    def contact_reach_mm(self) -> float:
+        """Distance of midsurfaces at the free edge within which contact acts."""
+        edge = float(self.valve.surface.thickness[self.valve.free_edge].mean())
+        return self.settings.contact.activation_distance * edge
+
     def restart(self, closed: ClosedState | None) -> None:
         """Go on from a closed state of this model, or from the open valve, as if it had just begun.
 

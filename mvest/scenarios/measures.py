@@ -54,13 +54,6 @@ def meaning_of(name: str) -> str:
     return MEASURES[f"stress_{which}_{{}}_mpa"].format(region)
 
 
-def contact_reach(model: ClosureModel) -> float:
-    """Distance (mm) of midsurfaces at the free edge within which contact acts."""
-    surface = model.valve.surface
-    edge = float(surface.thickness[model.valve.free_edge].mean())
-    return model.settings.contact.activation_distance * edge
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shape:
     vertices: FloatArray
@@ -94,7 +87,7 @@ def measure_closed(
     annulus = vertices[valve.annulus]
     pair = surface.triangles[surface.region == 0], surface.triangles[surface.region == 1]
     shape = _Shape(vertices, pair, annulus, plane_of(valve, annulus))
-    measures = _closure(shape, contact_reach(model))
+    measures = _closure(shape, model.contact_reach_mm)
     tenting = measure_tenting(vertices, surface.triangles, annulus, shape.plane)
     measures |= {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
     size = measure_annulus(annulus, shape.plane)

@@ -129,7 +129,8 @@ def test_an_estimate_loads_neither_tables_nor_figures_nor_cases(tmp_path):
         "import sys\nimport experiments.run\n"
         "from experiments.runner.execution import check, job\n"
         "from experiments.common.study import load_study\nload_study('twin')\n"
-        "heavy = {'matplotlib', 'pandas', 'mlflow', 'mvest.personalisation.chain'} & set(sys.modules)\n"
+        "heavy = {'matplotlib', 'pandas', 'mlflow', 'mvest.personalisation.chain'}\n"
+        "heavy &= set(sys.modules)\n"
         "assert not heavy, heavy"
     )
     subprocess.run(

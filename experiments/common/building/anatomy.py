@@ -6,26 +6,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
 
 from experiments.common.schema import NOT_HASHED, build, contents
-from mvest.cases.folder import read_case
-from mvest.cases.paths import files_of_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.provenance import config_hash
 from mvest.quantities import Share
-from mvest.scenarios.scenario import narrowed, plane_of
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Motion, Valve
-from mvest.valve.mesh.given import ENVELOPE_SHARE, GivenValve, tetrahedral_leaflets
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetwild import TetwildSettings
+
+if TYPE_CHECKING:
+    from mvest.valve.mesh.given import GivenValve
 
 __all__ = [
     "Anatomy",
@@ -39,7 +37,7 @@ __all__ = [
 ]
 
 Values = Mapping[str, Any]
-Anatomy = Template | GivenValve
+Anatomy: TypeAlias = "Template | GivenValve"
 
 COARSEST = (24, 3)
 """Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
@@ -61,7 +59,11 @@ class ValveFolder:
 
 def folder_hash(folder: str | None) -> str | None:
     """SHA-256 over the files of a case folder; None where there is none to read."""
-    files = contents(files_of_case(Path(folder))) if folder else None
+    if not folder:
+        return None
+    from mvest.cases.paths import files_of_case
+
+    files = contents(files_of_case(Path(folder)))
     return config_hash(files) if files else None
 
 
@@ -106,6 +108,11 @@ def template_of(config: Values) -> Template:
 @cache
 def _of_folder(folder: str, _sha256: str | None, contraction: float) -> GivenValve:
     """The anatomy of a case, read once as long as its files are the same."""
+    # What reads cases is as large as all that Table 1 needs of the valve.
+    from mvest.cases.folder import read_case
+    from mvest.scenarios.scenario import narrowed, plane_of
+    from mvest.valve.mesh.given import GivenValve
+
     case = read_case(folder)
     valve = case.valve
     if not 0 <= contraction < 0.5:
@@ -127,6 +134,8 @@ def upright(valve: Valve) -> Valve:
 
     Pictures and errors of an observation are in these axes.
     """
+    from mvest.scenarios.scenario import plane_of
+
     plane = plane_of(valve, valve.surface.vertices[valve.annulus])
     axes = np.stack([plane.lateral, plane.anterior, -plane.normal], axis=1)
 
@@ -179,6 +188,9 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
         )
     if not isinstance(anatomy, Template):
         return anatomy.tetrahedra(mesh["edge_length"], element, store)
+    from mvest.valve.mesh.given import ENVELOPE_SHARE, tetrahedral_leaflets
+    from mvest.valve.mesh.tetwild import TetwildSettings
+
     settings = TetwildSettings(mesh["edge_length"], ENVELOPE_SHARE * mesh["edge_length"])
     surface = anatomy.valve(*UNSTRUCTURED_SURFACE).surface
     normals = anatomy.normals(*UNSTRUCTURED_SURFACE)

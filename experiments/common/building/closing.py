@@ -20,7 +20,6 @@ from mvest.errors import InputError
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Table, table
-from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.stress import contact_pressure, nodal_stress
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
@@ -106,7 +105,7 @@ class Closing:
             "chord_tip": system.cables.tip,
             # Of faces, which are half a thickness nearer than midsurfaces on both sides.
             "reach_mm": np.array(
-                contact_reach(model) - valve.surface.thickness[valve.free_edge].mean()
+                model.contact_reach_mm - valve.surface.thickness[valve.free_edge].mean()
             ),
         }
 

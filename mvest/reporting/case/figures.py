@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -12,7 +12,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from mvest.cases.case import Role, ValveCase
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
@@ -30,6 +29,9 @@ from mvest.reporting.case.fields import CaseFields, read_case_fields, turn_of
 from mvest.reporting.figures import COLOURS, DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
+
+if TYPE_CHECKING:
+    from mvest.cases.case import ValveCase
 
 HIGH_QUANTILE = 0.99
 PRIOR, POSTERIOR, WITHOUT = "0.75", COLOURS[0], COLOURS[1]
@@ -84,6 +86,9 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
         Distance of midsurfaces within which leaflets touch: the gap of the closed frame is drawn.
     """
     surface, chordae = case.surface, case.chordae
+    # Imports what reads cases, which figures of a synthetic valve do not need.
+    from mvest.cases.case import Role
+
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
     shapes, none = [], np.zeros(0, dtype=np.int64)
