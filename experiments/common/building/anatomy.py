@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.common.schema import NOT_HASHED, build, contents
 from mvest.cases.folder import read_case
-from mvest.cases.paths import files_of_case
+from mvest.cases.schema import files_of_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.provenance import config_hash
