@@ -53,8 +53,7 @@ from scipy.sparse.linalg import splu
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.prediction import Prediction
 from mvest.external.contract import read_request, write_answer
-from mvest.mechanics.blocks import box, outer_faces
-from mvest.mechanics.body import simulate_body
+from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray

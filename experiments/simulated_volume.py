@@ -32,8 +32,8 @@ from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.slicer import checked_path, write_sequence_nrrd
-from mvest.simulation.motion.closing import MotionSettings, close_in_motion
+from mvest.imaging.writing import checked_path, write_sequence_nrrd
+from mvest.simulation.motion import MotionSettings, close_in_motion
 
 __all__ = ["SimulatedVolumeOptions", "simulate_command", "write_simulated_volume"]
 

@@ -4,8 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.dimensions import AnnulusDimensions, TemplateParameters
 from mvest.valve.anatomy.template import Template

@@ -7,7 +7,7 @@ import pytest
 
 from mvest.elements import ELEMENTS, FACES, element
 from mvest.errors import InputError
-from mvest.mechanics.blocks import box, outer_faces
+from mvest.mechanics.body import box, outer_faces
 
 NAMES = tuple(ELEMENTS)
 

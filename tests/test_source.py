@@ -12,7 +12,7 @@ from experiments.common.building.truth import MADE_BY
 from experiments.studies import imaged_patient
 from experiments.studies.imaging.detectors import SAMPLED_BY
 from mvest.errors import InputError
-from mvest.simulation.motion.population import draw_population
+from mvest.simulation.population import draw_population
 from mvest.simulation.trials import try_sequence
 from mvest.source import SOURCES, Sources, source_key
 
@@ -274,7 +274,7 @@ def test_volumes_and_what_writes_them_count_where_they_are_used():
         "mvest.imaging.simulator.beams",
     }
     assert imaged >= FORWARD | volumes | {
-        "mvest.imaging.writing.slicer", "mvest.cases.writer",
+        "mvest.imaging.writing", "mvest.cases.writer",
     }  # fmt: skip
     assert reached(*SAMPLED_BY) >= volumes
     tried = reached(try_sequence)

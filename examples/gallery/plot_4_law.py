@@ -12,7 +12,7 @@ import numpy as np
 
 import mvest
 from mvest.estimation.information.consistency import chi_square_band
-from mvest.mechanics.law.biaxial import biaxial_stress
+from mvest.mechanics.law.exponential import biaxial_stress
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import material_law
 

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mvest
-from mvest.mechanics.law.field import FieldBasis
+from mvest.mechanics.law.regional import FieldBasis
 from mvest.mechanics.settings import ModulusField, StiffPatch
 
 template = mvest.Template()

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mvest
-from mvest.mechanics.blocks import box, outer_faces
+from mvest.mechanics.body import box, outer_faces
 
 size = (20.0, 10.0, 1.3)
 tissue = mvest.TransverselyIsotropic.isotropic(E=2.0, nu=0.488)

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mvest
-from mvest.mechanics.blocks import box
+from mvest.mechanics.body import box
 
 unit, elements = box("hex18_thin", (12, 1, 1), (1.0, 1.0, 1.0))
 angle, radius = np.pi / 2 * unit[:, 0], 9.8 + 0.2 * unit[:, 2]

@@ -20,7 +20,7 @@ from experiments.common.records.writer import write_results
 from experiments.common.study import Results, Study, load_study
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
-from mvest.reading.json_file import parse_json
+from mvest.reading.documents import parse_json
 
 __all__ = ["RECORDS", "arrays_of", "publish", "records_of", "regenerate", "write_records"]
 

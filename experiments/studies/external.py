@@ -28,8 +28,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, predict
 from mvest.estimation.transform import Transform
 from mvest.external.contract import read_points, write_points
-from mvest.external.differences import Differences
-from mvest.external.model import ProcessModel
+from mvest.external.model import Differences, ProcessModel
 from mvest.external.process import Command, files_of_command
 from mvest.problem.estimate import StudyResult
 from mvest.problem.record import EstimateRecord, record_of, spread

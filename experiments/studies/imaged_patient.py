@@ -47,22 +47,22 @@ from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
-from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
+from mvest.imaging.simulator.acquisition import draw_acquisition
 from mvest.imaging.simulator.probe import Probe, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.slicer import write_sequence_nrrd
+from mvest.imaging.writing import write_sequence_nrrd
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation.error_budget import EVERYTHING
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.skill import generic_guess
 from mvest.provenance import write_json
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.motion.closing import MotionSettings
-from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient
-from mvest.simulation.motion.population import draw_tip_motion
+from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
+from mvest.simulation.motion import MotionSettings
+from mvest.simulation.population import draw_tip_motion
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 

@@ -56,7 +56,7 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.io.abaqus.leaflet_mesh import SetNames
+from mvest.valve.io.abaqus.mesh import SetNames
 from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
 from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.measurements import leaflet_length

@@ -30,8 +30,13 @@ from mvest.quantities import AxisCount, Count, Logarithm, within
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
-from mvest.scenarios.posterior import posterior_samples
-from mvest.scenarios.predict import PredictedScenario, Sample, closed_valve, predict_scenario
+from mvest.scenarios.predict import (
+    PredictedScenario,
+    Sample,
+    closed_valve,
+    posterior_samples,
+    predict_scenario,
+)
 from mvest.scenarios.scenario import Scenario, model_under
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve

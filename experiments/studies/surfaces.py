@@ -38,9 +38,9 @@ from experiments.common.skill import (
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
-from mvest.cases.importing.labels import LabelsOptions, import_labels
+from mvest.cases.importing.segmented import LabelsOptions, import_labels
 from mvest.cases.importing.slicerheart import SlicerheartOptions, import_slicerheart
-from mvest.cases.paths import CASE_FILE
+from mvest.cases.schema import CASE_FILE
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError
 from mvest.problem.record import EstimateRecord, Unknown

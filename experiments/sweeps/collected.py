@@ -18,7 +18,7 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.problem.record import EstimateRecord
 from mvest.provenance import require_sealed, sealed
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 
 __all__ = [
     "SWEEPS",

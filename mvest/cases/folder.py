@@ -2,20 +2,25 @@
 
 What a field means stands in ``README.md`` beside this module. Every error begins with the file and
 the field it comes from.
+
+Joint errors of all frames are one file of arrays by name, in NumPy's ``.npz``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.checks import at, check_closing_pressure, check_frames, check_regions
-from mvest.cases.error_file import read_error_samples
 from mvest.cases.frames import SECONDS_PER, SeenFrame, check_reference, place_frame, read_frame
-from mvest.cases.paths import CASE_FILE, CaseFolder
 from mvest.cases.pressure_curve import PressureCurve, generic_curve
 from mvest.cases.schema import (
+    CASE_FILE,
     CaseFile,
+    CaseFolder,
     ChordaeEntry,
     ObservationEntry,
     PointData,
@@ -23,8 +28,49 @@ from mvest.cases.schema import (
 )
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
-from mvest.reading.table import read_numbers
+from mvest.reading.npz import read_npz
+from mvest.reading.text import one_line, read_numbers
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
+
+ARRAYS = ("frames", "vertices", "tips")
+SOURCE = "source"
+
+
+def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
+    """Read the samples of a case whose frames have these names, in this order.
+
+    ``frames`` are names ``(f,)``, ``vertices (K, f, n, 3)`` and ``tips (K, f, t, 3)`` displacements
+    in mm from where a point was seen to where it may have been. ``source (K,)`` may be there:
+    integers, alike for samples that are not independent of each other.
+
+    Raises
+    ------
+    InputError
+        The file is no ``.npz``, holds other arrays, is of other frames, or a value is no
+        displacement.
+    """
+    if file.suffix.lower() != ".npz":
+        raise InputError(f"{file.name}: extension {file.suffix!r}, expected .npz")
+    stored = read_npz(file, ARRAYS, exact=True, optional=(SOURCE,), where=file.name)
+    names, vertices, tips = (stored[name] for name in ARRAYS)
+    if names.ndim != 1 or names.dtype.kind != "U" or names.tolist() != list(frames):
+        shown = (
+            one_line(names.tolist(), 80)
+            if names.dtype.kind == "U"
+            else f"an array of {names.dtype}"
+        )
+        raise InputError(f"{file.name}: frames {shown}, expected {one_line(list(frames), 120)}")
+    return ErrorSamples(vertices, tips, stored.get(SOURCE))
+
+
+def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]) -> None:
+    """Write samples so that they are read back unchanged."""
+    names, vertices, tips = np.array(list(frames)), samples.vertices, samples.tips
+    if samples.source is None:
+        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips)
+    else:
+        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips, source=samples.source)
+
 
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
 """Leaflets tracked in echocardiography are about 1 mm off, and smoothly so."""

@@ -19,13 +19,11 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
-from mvest.cases.ears import without_ears
-from mvest.cases.paths import CaseFolder
-from mvest.cases.rims import Rims, find_rims, match_annulus, two_loops
-from mvest.cases.schema import CaseFile, FrameEntry, wrong
+from mvest.cases.rims import Rims, find_rims, match_annulus, two_loops, without_ears
+from mvest.cases.schema import CaseFile, CaseFolder, FrameEntry, wrong
 from mvest.cases.surface_files import RegionSurface, read_regions
 from mvest.errors import InputError
-from mvest.reading.table import read_numbers, read_vertices
+from mvest.reading.text import read_numbers, read_vertices
 from mvest.typing import FloatArray, IntArray
 
 MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -38,7 +36,7 @@ class SeenFrame:
     """One entry of ``frames`` with its files read; lengths in mm, all else as in `Frame`.
 
     Loops are vertex numbers ``(k,)``, points ``(k, 3)`` mm, or None where they were not given.
-    ``ears`` are the triangles whose inner edge was turned (`mvest.cases.ears`).
+    ``ears`` are the triangles whose inner edge was turned (`mvest.cases.rims`).
     """
 
     entry: FrameEntry

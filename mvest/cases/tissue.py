@@ -17,11 +17,10 @@ from mvest.cases.chord_layout import (
     lay_out_chordae,
 )
 from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
-from mvest.cases.paths import CaseFolder
 from mvest.cases.rims import Rims
-from mvest.cases.schema import CaseFile, ChordaeEntry, PointData
+from mvest.cases.schema import CaseFile, CaseFolder, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
-from mvest.reading.table import indices, numbers, read_columns
+from mvest.reading.text import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface

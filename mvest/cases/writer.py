@@ -9,13 +9,12 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.error_file import write_error_samples
-from mvest.cases.paths import CASE_FILE
-from mvest.cases.schema import VERSION
+from mvest.cases.folder import write_error_samples
+from mvest.cases.schema import CASE_FILE, VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.reading.table import write_columns
+from mvest.reading.text import write_columns
 from mvest.valve.io.leaflet_surfaces import write_surface
 
 

@@ -13,11 +13,10 @@ from itertools import accumulate
 
 import numpy as np
 
-from mvest.closure.anchors import NOT_FOUND, Anchors, Kept, content_digest
-from mvest.closure.coordinates import Coordinates
+from mvest.closure.anchors import NOT_FOUND, Anchors, Coordinates, Kept, content_digest
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.estimation.prediction import Prediction
-from mvest.mechanics.forces.ties import TiedPoints
+from mvest.mechanics.forces.cables import TiedPoints
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import MechanicsSettings

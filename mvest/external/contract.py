@@ -25,9 +25,8 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
 from mvest.provenance import write_json
-from mvest.reading.json_file import read_mapping
-from mvest.reading.table import read_numbers, write_columns
-from mvest.reading.text import one_line
+from mvest.reading.documents import read_mapping
+from mvest.reading.text import one_line, read_numbers, write_columns
 from mvest.typing import FloatArray
 
 FORMAT, VERSION = "mvest-external", 1

@@ -14,8 +14,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.febio.laws import FebLaw
-from mvest.febio.mesh import FebMesh
+from mvest.febio.mesh import FebLaw, FebMesh
 from mvest.files import write_atomically
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding

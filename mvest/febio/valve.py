@@ -20,8 +20,7 @@ from mvest.febio.document import (
     Springs,
     Support,
 )
-from mvest.febio.laws import FebLaw, febio_law
-from mvest.febio.mesh import FebMesh, febio_mesh, opposite_faces
+from mvest.febio.mesh import FebLaw, FebMesh, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import Cables, Hinge, cable_force
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.system import System
@@ -45,7 +44,7 @@ class FebSettings:
     ----------
     law : str
         Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
-        keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.febio.laws`).
+        keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.febio.mesh`).
     contact : str
         ``potential``: FEBio's contact potential between the atrial faces; ``sliding``: its
         ``sliding-elastic`` between the leaflets; ``none``.

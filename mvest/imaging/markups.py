@@ -18,8 +18,8 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.reading.stated import fault
-from mvest.imaging.writing.slicer import checked_path
+from mvest.imaging.reading.data import fault
+from mvest.imaging.writing import checked_path
 from mvest.reading.bounded import refusing
 from mvest.reading.text import MAX_NUMBER, check_words, number, read_bytes, read_text
 from mvest.typing import FloatArray

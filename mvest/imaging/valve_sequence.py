@@ -1,14 +1,72 @@
-"""What the image step returns: one valve in every frame, with how sure it is."""
+"""Valves over time: as they are simulated, as the image step returns them, and their named points.
+
+A moving valve is what the TEE simulator images and what detectors learn from. All positions are mm
+in the valve's own axes: the annulus about the plane z = 0, z towards the atrium, y to the anterior
+side, x to the line between the leaflets at phi = 0.
+
+The image step returns one valve in every frame, with how sure it is. Named points of a valve in one
+frame are commissures, annulus, middles of the free edges and tips.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingValve:
+    """One simulated valve in every frame.
+
+    Attributes
+    ----------
+    name : str
+        Tells valves (not frames) apart when some are held out.
+    layout : ValveLayout
+    times : (T,) s
+        Increasing.
+    vertices : (T, n, 3)
+        Midsurface.
+    tips : (T, 2, 3)
+        Papillary tips, the first that at phi = 0.
+    thickness : (n,) mm
+    chord_phi, chord_s : (c,)
+        Where chordae insert, degrees and 0 to 1.
+    chord_tip : (c,)
+        From which tip.
+    """
+
+    name: str
+    layout: ValveLayout
+    times: FloatArray
+    vertices: FloatArray
+    tips: FloatArray
+    thickness: FloatArray
+    chord_phi: FloatArray
+    chord_s: FloatArray
+    chord_tip: IntArray
+
+    def __post_init__(self) -> None:
+        t, n, c = len(self.times), self.layout.size, len(self.chord_phi)
+        for name, shape in (
+            ("vertices", (t, n, 3)),
+            ("tips", (t, 2, 3)),
+            ("thickness", (n,)),
+            ("chord_s", (c,)),
+            ("chord_tip", (c,)),
+        ):
+            given = np.shape(getattr(self, name))
+            if given != shape:
+                raise InputError(f"moving valve {self.name}, {name}: shape {given}, not {shape}")
+        if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
+            raise InputError(f"moving valve {self.name}: times {self.times} s do not increase")
+
 
 MIN_CONFIDENCE = 0.7
 """Confidence from which on a frame shows a valve, wherever that is decided or drawn.
@@ -81,3 +139,114 @@ class ValveSequence:
     def free_edge(self) -> FloatArray:
         """``(T, columns, 3)`` mm."""
         return self.vertices[:, self.layout.free_edge]
+
+
+_ON_LEAFLETS: Final[dict[str, tuple[float, int]]] = {
+    "commissure_0": (0.0, 0),
+    "commissure_180": (180.0, 0),
+    "annulus_anterior": (90.0, 0),
+    "annulus_posterior": (270.0, 0),
+    "free_edge_anterior": (90.0, -1),
+    "free_edge_posterior": (270.0, -1),
+    "annulus_45": (45.0, 0),
+    "annulus_135": (135.0, 0),
+    "annulus_225": (225.0, 0),
+    "annulus_315": (315.0, 0),
+}
+TIPS: Final = ("tip_0", "tip_180")
+"""Names of the papillary tips."""
+
+ANNULUS_LABELS: Final = "AnnulusLabelsMarkup"
+"""What SlicerHeart calls its list of labelled points."""
+LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *TIPS)
+"""Every name, in the order of `landmarks`: those on the leaflets, then the papillary tips."""
+
+
+def landmark_vertices(layout: ValveLayout) -> dict[str, int]:
+    """Vertex of every landmark that lies on the leaflets (all but the tips), in fixed order.
+
+    ``commissure_0`` and ``commissure_180`` are where the lines between the leaflets meet the
+    annulus.
+
+    Raises
+    ------
+    InputError
+        The layout has no column at a multiple of 45 degrees.
+    """
+    return {name: layout.vertex(phi, row) for name, (phi, row) in _ON_LEAFLETS.items()}
+
+
+def landmarks(sequence: ValveSequence, frame: int) -> dict[str, FloatArray]:
+    """Positions ``(3,)`` LPS mm of the landmarks named in `LANDMARKS`, in that order.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    frame : int
+        From 0 on.
+
+    Raises
+    ------
+    InputError
+        There is no such frame, or the layout has no column at a multiple of 45 degrees.
+    """
+    if not 0 <= frame < len(sequence.times):
+        raise InputError(f"landmarks: frame {frame}, expected 0 to {len(sequence.times) - 1}")
+    vertices = sequence.vertices[frame]
+    positions = {name: vertices[v].copy() for name, v in landmark_vertices(sequence.layout).items()}
+    for name, tip in zip(TIPS, sequence.tips[frame], strict=True):
+        positions[name] = tip.copy()
+    return positions
+
+
+def slicerheart_labels(ring: FloatArray, end: int, down: FloatArray) -> dict[str, FloatArray]:
+    """Points ``(3,)`` of the annulus by the labels that SlicerHeart gives them.
+
+    ALC and PMC are the commissures, A and P the middles of the annulus between them, AL and PM
+    where the plane through the middle across the line from P to A meets the annulus, MC is the
+    middle (``ValveQuantificationLib/MeasurementPresetMitralValve.py`` there). From the atrium the
+    antero-lateral commissure lies on the left of the anterior leaflet.
+
+    Parameters
+    ----------
+    ring
+        ``(k, 3)`` mm, the annulus, of which the points 0 to ``end`` bound the anterior leaflet.
+    end
+    down
+        ``(3,)`` from the atrium to the ventricle.
+
+    Raises
+    ------
+    GeometryError
+        The annulus is no loop round its middle.
+    """
+    middle = ring.mean(axis=0)
+    anterior = _half_way(ring[: end + 1])
+    posterior = _half_way(np.vstack([ring[end:], ring[:1]]))
+    forward = anterior - posterior
+    left, right = ring[0], ring[end]
+    if np.linalg.det(np.stack([left - right, forward, down])) < 0:
+        left, right = right, left
+    height = (ring - middle) @ forward
+    following = np.roll(height, -1)
+    cut = np.flatnonzero((height >= 0) != (following >= 0))
+    if len(cut) != 2:
+        raise GeometryError(f"the annulus meets a plane through its middle {len(cut)} times, not 2")
+    share = (height[cut] / (height[cut] - following[cut]))[:, None]
+    sides = (1 - share) * ring[cut] + share * np.roll(ring, -1, axis=0)[cut]
+    at_left = int(np.argmin(np.linalg.norm(sides - left, axis=1)))
+    return {
+        "A": anterior,
+        "P": posterior,
+        "AL": sides[at_left],
+        "PM": sides[1 - at_left],
+        "ALC": left,
+        "PMC": right,
+        "MC": middle,
+    }
+
+
+def _half_way(curve: FloatArray) -> FloatArray:
+    """Point ``(3,)`` at half the length of a curve ``(k, 3)``."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    return np.array([np.interp(length[-1] / 2, length, axis) for axis in curve.T])

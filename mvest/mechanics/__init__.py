@@ -8,15 +8,14 @@ engineering shear). Lengths are mm, times s, masses tonne, forces N, stresses MP
 
 What is here, in the order data flows:
 
-* ``parameters``: what can be differentiated by; ``moduli``, ``law``: transversely isotropic moduli
-  and the law in Biot strain; ``exponential``: a second law, ``regional``: one for each leaflet;
-  ``solid``: strains, forces and tangents of all elements of a mesh; ``field``: moduli that vary
-  over a leaflet;
-* ``pressure``, ``cables`` (chordae, annular hinge), ``ties``, ``contact``: what acts on the solid;
+* ``parameters``: what can be differentiated by; ``law``: transversely isotropic moduli, the law in
+  Biot strain, an exponential one, laws made of others, and laws that differ from place to place;
+  ``solid``: strains, forces and tangents of all elements of a mesh;
+* ``forces``: what acts on the solid (pressure, chordae, annular hinge, ties, contact);
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
 * ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
   time steps, Newton's method, sensitivities; ``approach``: the way to a far equilibrium;
-* ``blocks``: boxes of cells and outer faces; ``body``: all of it without a valve.
+* ``body``: all of it without a valve, and boxes of cells.
 
 A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):
 

@@ -1,5 +1,5 @@
-from .blocks import box as box
-from .blocks import outer_faces as outer_faces
+from .body import box as box
+from .body import outer_faces as outer_faces
 from .body import simulate_body as simulate_body
 from .integrate import simulate as simulate
 from .law.biot import BiotLaw as BiotLaw

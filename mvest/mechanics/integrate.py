@@ -30,8 +30,7 @@ from mvest.errors import InputError
 from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact
-from mvest.mechanics.forces.pair_search import ContactPairs
-from mvest.mechanics.forces.passing import HARMLESS
+from mvest.mechanics.forces.pair_search import HARMLESS, ContactPairs
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import SolidState
 from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver

@@ -15,7 +15,7 @@ the element's polynomials p. The parameters alpha of an element solve ``int M^T 
 eliminated inside the element by Newton's method at every evaluation, so that to the outside the
 element has an energy of nodal positions only (its condensed tangent is the Schur complement). The
 modes integrate to zero against constant stress: the patch test holds. In elements for thin bodies
-E(u) is sampled at fewer points (:mod:`mvest.mechanics.sampled`). With the corotational law the
+E(u) is sampled at fewer points (:mod:`mvest.mechanics.element`). With the corotational law the
 strain is the linear one in a frame that turns with the element, which takes the place of F.
 """
 
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
+    Sampling,
     add_tangents,
     alpha_change,
     enhanced_strain,
@@ -38,10 +39,8 @@ from mvest.mechanics.element import (
     strain_derivative,
     strains,
 )
-from mvest.mechanics.law.corotational import EdgeRotations
-from mvest.mechanics.law.linear import LinearLaw
+from mvest.mechanics.law.linear import EdgeRotations, LinearLaw
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.sampled import Sampling
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 

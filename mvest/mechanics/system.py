@@ -20,11 +20,10 @@ from mvest.mechanics.assembly import (
     elements_of_nodes,
     scatter_blocks,
 )
-from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.cables import Cables, Hinge, Ties
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.forces.pressure import PressureLoad
-from mvest.mechanics.forces.ties import Ties
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of
 from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import BoolArray, FloatArray, IntArray

@@ -13,18 +13,15 @@ from typing import Protocol
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.cables import Cables, Hinge, TiedPoints
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
-from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
-from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli
-from mvest.mechanics.law.prestretch import PrestretchedLaw
-from mvest.mechanics.law.regional import RegionalLaw
-from mvest.mechanics.law.stiffening import StiffeningLaw
+from mvest.mechanics.law.regional import FieldBasis, FieldLaw, RegionalLaw, at_quadrature
+from mvest.mechanics.law.stiffening import PrestretchedLaw, StiffeningLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
 from mvest.mechanics.solid import Law, Solid

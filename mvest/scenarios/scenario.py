@@ -12,7 +12,7 @@ import scipy
 
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
-from mvest.mechanics.forces.ties import TiedPoints
+from mvest.mechanics.forces.cables import TiedPoints
 from mvest.quantities import Length, Percent, Place, Pressure, Stiffness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Motion, Valve

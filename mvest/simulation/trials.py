@@ -22,11 +22,10 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.evaluation import frame_errors, surface_distances
 from mvest.imaging.learning.training import Setting, render_frame
 from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.moving_valve import MovingValve
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
+from mvest.imaging.simulator.acquisition import Acquisition, draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area

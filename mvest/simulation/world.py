@@ -17,7 +17,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.mechanics.law.equivalent import as_stiff
+from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
 from mvest.quantities import Factor, Length, Share, Stretch

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import mvest.source
-from mvest.closure.anchors import Anchors, Kept, content_digest
-from mvest.closure.coordinates import Coordinates
+from mvest.closure.anchors import Anchors, Coordinates, Kept, content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.settings import ModulusField
@@ -318,6 +317,6 @@ def test_coordinates_there_and_back():
 
 def test_the_code_that_closes_valves_is_part_of_what_decides_them():
     parts = SOURCES.parts(("mvest.closure.model", "ClosureModel"))
-    reached = ("elements", "closure.coordinates", "mechanics.law.biot", "valve.mesh.embedding")
+    reached = ("elements", "closure.anchors", "mechanics.law.biot", "valve.mesh.solid_mesh")
     assert parts.keys() >= {f"mvest.{name}" for name in reached}
     assert "mvest.reporting.style" not in parts

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.law.prestretch import PrestretchedLaw
+from mvest.mechanics.law.stiffening import PrestretchedLaw
 from mvest.mechanics.valve_system import material_law
 from tests.closure.test_model import (
     CLOSING,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.coordinates import STIFFENED, Coordinates
+from mvest.closure.anchors import STIFFENED, Coordinates
 from mvest.mechanics.law.regional import RegionalLaw
 from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.settings import ExponentialTissue

@@ -8,9 +8,8 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
-from mvest.external import RunRequest, read_answer, write_request
-from mvest.external.differences import Differences
-from mvest.external.model import ProcessModel
+from mvest.external.contract import RunRequest, read_answer, write_request
+from mvest.external.model import Differences, ProcessModel
 from mvest.external.process import Command
 from tests.places import ROOT
 

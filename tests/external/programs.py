@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.external import Command, ProcessModel
+from mvest.external.model import ProcessModel
+from mvest.external.process import Command
 
 SPRINGS = '''
 """Two springs in a row, pulled by 2 N: x1 = 2 / k1, x2 = x1 + 2 / k2 (mm), y and z are constant."""

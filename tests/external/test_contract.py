@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import Prediction
-from mvest.external import (
+from mvest.external.contract import (
     RunRequest,
     read_answer,
     read_points,

@@ -7,7 +7,8 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
-from mvest.external import Command, Differences, ProcessModel
+from mvest.external.model import Differences, ProcessModel
+from mvest.external.process import Command
 from tests.external.programs import NAMES, SPRINGS, answering, model, springs
 
 M = np.array([0.8, 2.5])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mvest.errors import ConfigurationError
-from mvest.external import Command
+from mvest.external.process import Command
 
 SHOW = "import json, os, sys; print(json.dumps([sys.argv[1:], os.getcwd(), os.environ.get('LAW')]))"
 

@@ -7,8 +7,7 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
-from mvest.febio.laws import febio_law
-from mvest.febio.mesh import febio_mesh
+from mvest.febio.mesh import febio_law, febio_mesh
 from mvest.febio.program import febio_program, read_positions, run_febio
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law.linear import LinearLaw

@@ -7,9 +7,8 @@ import numpy as np
 from experiments.common.records.record import read_record, write_record
 from experiments.runner.planning.plan import Plan
 from mvest.cases.case import ErrorSamples
-from mvest.cases.error_file import write_error_samples
 from mvest.cases.exporting.febio import read_run
-from mvest.cases.folder import read_case
+from mvest.cases.folder import read_case, write_error_samples
 from mvest.estimation.prediction import Prediction
 from mvest.external.contract import (
     RunRequest,
@@ -20,12 +19,11 @@ from mvest.external.contract import (
 )
 from mvest.febio.program import read_positions
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.provenance import write_json
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import read_case_fields
-from mvest.simulation.motion.files import load_population, save_population
-from mvest.simulation.motion.population import Population
+from mvest.simulation.population import Population, load_population, save_population
 from mvest.valve.io.abaqus.recording import read_recording
 from tests.cases import folders
 from tests.experiments.studies.made_up import made_up

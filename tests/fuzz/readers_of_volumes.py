@@ -7,7 +7,7 @@ import nibabel
 import numpy as np
 import SimpleITK
 
-from mvest.cases.importing.labels import LabelsOptions, import_labels
+from mvest.cases.importing.segmented import LabelsOptions, import_labels
 from mvest.errors import GeometryError
 from mvest.imaging.markups import read_fcsv, read_markups
 from mvest.imaging.reading.nrrd_file import segment_names

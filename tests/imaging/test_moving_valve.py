@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve
 
 LAYOUT = ValveLayout(8, 3)
 

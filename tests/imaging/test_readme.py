@@ -8,8 +8,8 @@ import pytest
 from experiments.common.cases.settings import ImagedInput
 from experiments.studies.imaging.detectors import ImagingSettings
 from mvest.imaging.detection.trained_model import STAGES
-from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.valve_sequence import LANDMARKS
 from tests.places import ROOT
 
 OWN, PAGE = ROOT / "mvest" / "imaging" / "README.md", ROOT / "docs" / "volume.md"

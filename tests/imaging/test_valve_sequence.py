@@ -1,11 +1,14 @@
-"""Sequences of valves refuse arrays that do not belong together."""
+"""Sequences of valves refuse arrays that do not belong together.
+
+Named points: a wrong angle, row, tip or frame, and what a layout cannot give.
+"""
 
 import numpy as np
 import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import LANDMARKS, ValveSequence, landmark_vertices, landmarks
 
 LAYOUT = ValveLayout(8, 3)
 
@@ -46,3 +49,61 @@ def test_times_must_increase(times):
     # With "a difference <= 0" as the test, times that are no numbers pass.
     with pytest.raises(InputError, match="times"):
         ValveSequence(**(fields() | {"times": np.array(times)}))
+
+
+def coordinates(layout: ValveLayout, frames: int = 2) -> ValveSequence:
+    """A sequence whose vertices are (phi, s, frame), so that a position says which one it is."""
+    vertices = np.stack(
+        [np.stack([layout.phi, layout.s, np.full(layout.size, t)], axis=1) for t in range(frames)]
+    )
+    tips = np.array([[[-1.0, tip, t] for tip in (0.0, 180.0)] for t in range(frames)])
+    return ValveSequence(
+        layout,
+        np.arange(float(frames)),
+        vertices,
+        tips,
+        np.ones(frames),
+        np.ones((frames, layout.size)),
+        np.ones(layout.size),
+        5.0,
+    )
+
+
+def test_every_landmark_is_where_its_name_says() -> None:
+    found = landmarks(coordinates(ValveLayout(16, 4)), 1)
+    expected = {
+        "commissure_0": (0, 0, 1),
+        "commissure_180": (180, 0, 1),
+        "annulus_anterior": (90, 0, 1),
+        "annulus_posterior": (270, 0, 1),
+        "free_edge_anterior": (90, 1, 1),
+        "free_edge_posterior": (270, 1, 1),
+        "annulus_45": (45, 0, 1),
+        "annulus_135": (135, 0, 1),
+        "annulus_225": (225, 0, 1),
+        "annulus_315": (315, 0, 1),
+        "tip_0": (-1, 0, 1),
+        "tip_180": (-1, 180, 1),
+    }
+    assert tuple(found) == LANDMARKS == tuple(expected)
+    for name, position in expected.items():
+        np.testing.assert_allclose(found[name], position, err_msg=name)
+
+
+def test_a_landmark_is_a_copy() -> None:
+    sequence = coordinates(ValveLayout(16, 4))
+    landmarks(sequence, 0)["tip_0"][:] = 99.0
+    landmarks(sequence, 0)["commissure_0"][:] = 99.0
+    np.testing.assert_allclose(landmarks(sequence, 0)["tip_0"], (-1, 0, 0))
+    np.testing.assert_allclose(landmarks(sequence, 0)["commissure_0"], (0, 0, 0))
+
+
+@pytest.mark.parametrize("frame", [-1, 2])
+def test_no_frame_outside_the_sequence(frame: int) -> None:
+    with pytest.raises(InputError, match=rf"frame {frame}, expected 0 to 1"):
+        landmarks(coordinates(ValveLayout(16, 4)), frame)
+
+
+def test_a_layout_without_a_column_at_45_degrees_is_refused() -> None:
+    with pytest.raises(InputError, match="no column of 12 lies at 45 degrees"):
+        landmark_vertices(ValveLayout(12, 3))

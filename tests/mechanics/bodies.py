@@ -5,7 +5,7 @@ from scipy import sparse
 
 from mvest.elements import ELEMENTS
 from mvest.mechanics.assembly import BlockMatrix, SparsityPattern
-from mvest.mechanics.blocks import box, outer_faces
+from mvest.mechanics.body import box, outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad

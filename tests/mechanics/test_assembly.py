@@ -9,7 +9,7 @@ from mvest.mechanics.assembly import (
     elements_of_nodes,
     scatter_blocks,
 )
-from mvest.mechanics.blocks import outer_faces
+from mvest.mechanics.body import outer_faces
 from mvest.mechanics.forces.pressure import PressureLoad
 from tests.mechanics.bodies import block, block_matrix
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mvest.mechanics.assembly import SparsityPattern, add_forces, adjacency
-from mvest.mechanics.blocks import outer_faces
+from mvest.mechanics.body import outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw

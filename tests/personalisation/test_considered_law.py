@@ -8,7 +8,7 @@ import pytest
 
 from mvest.closure.model import ClosureModel
 from mvest.estimation.noise_family import ErrorColumns
-from mvest.mechanics.law.equivalent import as_stiff
+from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState

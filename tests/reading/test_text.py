@@ -10,10 +10,16 @@ import yaml
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.reading.json_file import parse_json, read_json, read_mapping
-from mvest.reading.table import read_columns, read_numbers
-from mvest.reading.text import check_words, number, one_line, read_bytes, read_text
-from mvest.reading.yaml_file import read_yaml
+from mvest.reading.documents import parse_json, read_json, read_mapping, read_yaml
+from mvest.reading.text import (
+    check_words,
+    number,
+    one_line,
+    read_bytes,
+    read_columns,
+    read_numbers,
+    read_text,
+)
 
 ODD = (
     "", " ", ".", "e5", "1e", "1_0", "0x10", "0b1", "1:30", "1:1:1:1", "nan", "inf", "-Infinity",

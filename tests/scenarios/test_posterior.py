@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction, Reason, observation_noise
-from mvest.scenarios import posterior_samples, summary_of
+from mvest.scenarios.predict import posterior_samples, summary_of
 
 MEAN, SHIFT = np.array([5.0, 2.0]), np.array([[1.0, 0.6], [0.0, 1.0]])
 

@@ -8,16 +8,10 @@ import pytest
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, Prediction, observation_noise
 from mvest.mechanics.steps import StepReason
-from mvest.scenarios import (
-    Clip,
-    Scenario,
-    measure_closed,
-    model_under,
-    posterior_samples,
-    predict,
-    predict_scenario,
-)
-from mvest.scenarios.measures import MEASURES, meaning_of
+from mvest.scenarios import predict
+from mvest.scenarios.measures import MEASURES, meaning_of, measure_closed
+from mvest.scenarios.predict import posterior_samples, predict_scenario
+from mvest.scenarios.scenario import Clip, Scenario, model_under
 from tests.scenarios.valves import NAMES, model
 
 SLOPE = np.array([[3.0, -1.0], [0.5, 2.0]])

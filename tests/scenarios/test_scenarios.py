@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError, InputError
-from mvest.scenarios import Annuloplasty, Clip, Scenario, model_under
-from mvest.scenarios.scenario import clip_points, plane_of
+from mvest.scenarios.scenario import (
+    Annuloplasty,
+    Clip,
+    Scenario,
+    clip_points,
+    model_under,
+    plane_of,
+)
 from mvest.valve.measure.annulus import measure_annulus
 from tests.scenarios.valves import model
 

@@ -11,7 +11,7 @@ from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import System
-from mvest.scenarios.stress import (
+from mvest.scenarios.measures import (
     _peaks,
     contact_pressure,
     nodal_stress,

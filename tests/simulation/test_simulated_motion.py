@@ -10,28 +10,31 @@ import pytest
 
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.problem.registration import REGISTRATION
+from mvest.simulation import imaged_patient as patients
+from mvest.simulation import motion, population
+from mvest.simulation.imaged_patient import simulate_imaged_patient
 from mvest.simulation.motion import (
+    ClosingFrames,
     MotionLimits,
     MotionSettings,
-    Population,
-    PopulationSettings,
     Refusal,
     RefusedError,
+    check_motion,
     close_in_motion,
-    closing,
+    frames_along,
+    with_tip_motion,
+)
+from mvest.simulation.population import (
+    Population,
+    PopulationSettings,
     draw_population,
     load_population,
-    population,
     population_hash,
     save_population,
-    simulate_imaged_patient,
 )
-from mvest.simulation.motion import patient as patients
-from mvest.simulation.motion.closing import ClosingFrames, frames_along, with_tip_motion
-from mvest.simulation.motion.refusal import check_motion
 from mvest.simulation.virtual_patient import PatientSimulation
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
 from mvest.valve.anatomy.template import Template
@@ -151,7 +154,7 @@ def test_chordae_of_a_motion_have_angles_of_the_layout(valve):
 
 
 def test_a_valve_that_does_not_close_is_refused(monkeypatch):
-    monkeypatch.setattr(closing, "GIVE_UP", {"max_iterations": 1, "max_halvings": 0})
+    monkeypatch.setattr(motion, "GIVE_UP", {"max_iterations": 1, "max_halvings": 0})
     with pytest.raises(RefusedError, match="simulated valve soft: the closure") as refused:
         close_in_motion("soft", TEMPLATE, VALUES, SMALL, MECHANICS)
     assert refused.value.reason is Refusal.NOT_CLOSED

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.equivalent import CLOSED_STRETCHES
-from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.law.exponential import CLOSED_STRETCHES, ExponentialLaw, biaxial_stress
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
 from mvest.simulation.world import World
 from mvest.valve.anatomy.template import Template

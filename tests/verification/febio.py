@@ -26,13 +26,11 @@ from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import Log
 from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
-from mvest.febio.laws import LAWS, febio_law
-from mvest.febio.mesh import febio_mesh
+from mvest.febio.mesh import LAWS, febio_law, febio_mesh
 from mvest.febio.program import FebRun, run_febio
 from mvest.febio.valve import CONTACTS, FebSettings, differences, valve_document
 from mvest.files import write_atomically
-from mvest.mechanics.blocks import box, outer_faces
-from mvest.mechanics.body import simulate_body
+from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import TransverselyIsotropic

@@ -18,8 +18,7 @@ import pandas as pd
 
 from mvest.elements import element
 from mvest.files import write_atomically
-from mvest.mechanics.blocks import box
-from mvest.mechanics.body import simulate_body
+from mvest.mechanics.body import box, simulate_body
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.steps import Simulation
 from mvest.typing import BoolArray, FloatArray, IntArray

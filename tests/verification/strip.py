@@ -16,8 +16,7 @@ import numpy as np
 import pandas as pd
 
 from mvest.files import write_atomically
-from mvest.mechanics.blocks import box, outer_faces
-from mvest.mechanics.body import simulate_body
+from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import NewtonSettings
 from tests.places import ROOT

@@ -61,7 +61,7 @@ def folder_hash(folder: str | None) -> str | None:
     """SHA-256 over the files of a case folder; None where there is none to read."""
     if not folder:
         return None
-    from mvest.cases.paths import files_of_case
+    from mvest.cases.schema import files_of_case
 
     files = contents(files_of_case(Path(folder)))
     return config_hash(files) if files else None

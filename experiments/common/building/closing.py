@@ -20,7 +20,7 @@ from mvest.errors import InputError
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Table, table
-from mvest.scenarios.stress import contact_pressure, nodal_stress
+from mvest.scenarios.measures import contact_pressure, nodal_stress
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed

@@ -21,7 +21,7 @@ from experiments.common.building.virtual_patients import (
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.provenance import write_json
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray

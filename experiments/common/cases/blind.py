@@ -32,7 +32,7 @@ from mvest.files import write_atomically
 from mvest.problem.record import EstimateRecord
 from mvest.processes import run
 from mvest.provenance import THREAD_VARIABLES, write_json
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 
 __all__ = [

@@ -19,7 +19,7 @@ __all__ = ["CaseInput", "ImagedInput", "PersonalSettings", "UnknownSettings", "V
 
 def _case(value: str, _beside: Mapping[str, Any]) -> Any:
     # Where no case is read this is not either.
-    from mvest.cases.paths import files_of_case
+    from mvest.cases.schema import files_of_case
 
     return contents(files_of_case(Path(value))) or value
 

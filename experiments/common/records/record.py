@@ -17,7 +17,7 @@ from mvest.errors import InputError
 from mvest.files import sha256_of
 from mvest.problem.record import EstimateRecord
 from mvest.provenance import provenance, require_sealed, sealed, write_json
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from mvest.reporting.tables import Table
 
 if TYPE_CHECKING:

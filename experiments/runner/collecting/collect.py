@@ -23,7 +23,7 @@ from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import InputError
 from mvest.provenance import config_hash, require_sealed, sealed
-from mvest.reading.json_file import parse_json
+from mvest.reading.documents import parse_json
 
 __all__ = ["ENDS", "NOT_RUN", "End", "collect", "overheads", "read_ends"]
 

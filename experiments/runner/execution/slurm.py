@@ -24,7 +24,7 @@ from experiments.runner.jobs.folder import is_done, require_writable, result_tim
 from experiments.runner.planning.plan import Plan, PlannedJob
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import write_json
-from mvest.reading.json_file import read_json
+from mvest.reading.documents import read_json
 
 __all__ = ["Submission", "record_dead", "submit", "submitted", "under_way", "wait_for"]
 

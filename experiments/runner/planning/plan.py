@@ -21,7 +21,7 @@ from experiments.runner.jobs.folder import RESULT
 from experiments.runner.jobs.request import Request
 from mvest.errors import InputError
 from mvest.provenance import git_state, write_json
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
 __all__ = ["PLAN", "Plan", "PlannedJob"]

@@ -31,7 +31,7 @@ from experiments.runner.tracking.sync import jobs_in
 from mvest.errors import InputError, MvestError
 from mvest.processes import Program
 from mvest.quantities import within
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 
 __all__ = ["Comparison", "allowed_hosts", "last_comparison", "main", "serving"]
 

@@ -20,7 +20,7 @@ from experiments.runner.tracking.store import Store, first_line, open_store
 from experiments.runner.tracking.summary import SWEEP, log_summary
 from experiments.runner.tracking.upload import REMEDY, is_complete, is_tracked, upload
 from mvest.errors import InputError, MvestError
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 
 __all__ = ["jobs_in", "log_sweep", "main", "open_early"]
 

@@ -21,7 +21,7 @@ from experiments.runner.jobs.folder import is_done
 from experiments.runner.tracking.store import Store, open_store, telling
 from mvest.errors import InputError, MvestError
 from mvest.provenance import write_json
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 
 __all__ = [
     "NO_SWEEP",

@@ -32,17 +32,18 @@ from mvest.imaging.learning.training import (
     volume_samples,
 )
 from mvest.imaging.models import MODEL_FILE
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.kept import Entry, get_or_make
 from mvest.processes import side_by_side
 from mvest.quantities import Count, Length, Processes, Seed, within
-from mvest.reading.json_file import parse_json
+from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
-from mvest.simulation.motion.files import load_population, save_population
-from mvest.simulation.motion.population import (
+from mvest.simulation.population import (
     Population,
     PopulationSettings,
     draw_population,
+    load_population,
+    save_population,
 )
 from mvest.simulation.trials import Trial
 from mvest.typing import FloatArray

@@ -24,7 +24,6 @@ from mvest.imaging.detection.trained_model import (
     load_model,
     save_model,
 )
-from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import (
     Correlogram,
@@ -34,6 +33,7 @@ from mvest.imaging.learning.accuracy import (
 )
 from mvest.imaging.learning.evaluation import best_threshold
 from mvest.imaging.models import MODEL_FILE
+from mvest.imaging.valve_sequence import landmark_vertices
 from mvest.provenance import provenance
 from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Column, Table, table

@@ -15,7 +15,7 @@ from mvest.errors import InputError
 from mvest.febio.valve import FebSettings, valve_document
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.problem.registration import REGISTRATION
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from mvest.valve.mesh.given import GivenValve
 
 GENERIC = {"anterior": (6.23, 6.23 / 2.35), "posterior": (2.09, 2.09 / 1.89)}

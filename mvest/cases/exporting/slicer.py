@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
-from mvest.cases.paths import CASE_FILE
 from mvest.cases.rims import commissures, directed
+from mvest.cases.schema import CASE_FILE
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.landmarks import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.markups import PointList, write_markups
+from mvest.imaging.valve_sequence import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.slicer import segment_name, write_segmentation
-from mvest.imaging.writing.voxels import voxelise_leaflets
+from mvest.imaging.writing import segment_name, voxelise_leaflets, write_segmentation
 from mvest.reading.bounded import refusing
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import CaseFields, read_case_fields

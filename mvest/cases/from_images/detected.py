@@ -29,14 +29,13 @@ from mvest.imaging.detection.trained_model import (
     default_model,
     load_model,
 )
-from mvest.imaging.landmarks import ANNULUS_LABELS, LANDMARKS
 from mvest.imaging.learning.accuracy import unlike_share
 from mvest.imaging.markups import read_markups
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import ANNULUS_LABELS, LANDMARKS, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
-from mvest.reading.table import read_numbers
+from mvest.reading.text import read_numbers
 from mvest.typing import FloatArray, IntArray
 
 IMAGES, CASE = "images", "case"

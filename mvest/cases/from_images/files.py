@@ -10,12 +10,15 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.landmarks import ANNULUS_LABELS, landmarks, slicerheart_labels
 from mvest.imaging.markups import PointList, write_markups
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import (
+    ANNULUS_LABELS,
+    ValveSequence,
+    landmarks,
+    slicerheart_labels,
+)
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.slicer import segment_name, write_segmentation
-from mvest.imaging.writing.voxels import voxelise_leaflets
+from mvest.imaging.writing import segment_name, voxelise_leaflets, write_segmentation
 from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface
 
 __all__ = ["write_for_slicer", "write_landmarks", "write_surfaces"]
@@ -49,7 +52,7 @@ def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -
 def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:
     """Write the named points of one frame as markups of 3D Slicer.
 
-    The lists are ``landmarks`` (see `mvest.imaging.landmarks`), ``annulus`` and ``free edge`` as
+    The lists are ``landmarks`` (see `mvest.imaging.layout`), ``annulus`` and ``free edge`` as
     closed curves, which begin at phi = 0, and SlicerHeart's labels of the annulus.
 
     Parameters

@@ -13,9 +13,8 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.landmarks import TIPS
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import TIPS, ValveSequence
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.clinical import (
     MeasuredLeaflets,

@@ -12,7 +12,7 @@ from mvest.errors import InputError
 from mvest.reading.text import one_line
 from mvest.units import mpa_to_mmhg
 from mvest.valve.io.abaqus.deck_file import read_deck
-from mvest.valve.io.abaqus.leaflet_mesh import SetNames
+from mvest.valve.io.abaqus.mesh import SetNames
 from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
 
 STD_MM, CORRELATED_MM = 1.0, 10.0

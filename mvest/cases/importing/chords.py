@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.chord_layout import FAMILIES
 from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError
-from mvest.reading.table import write_columns
+from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 

@@ -14,9 +14,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.chord_layout import LeafletBand
-from mvest.cases.ears import without_ears
 from mvest.cases.importing.leaflet import Leaflet, loop_length
-from mvest.cases.rims import loop_vector_area, two_loops
+from mvest.cases.rims import loop_vector_area, two_loops, without_ears
 from mvest.cases.surface_files import RegionSurface
 from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray

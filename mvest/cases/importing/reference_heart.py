@@ -1,4 +1,7 @@
-"""The mitral valve of a reference heart: thick leaflets and papillary muscles, each closed."""
+"""The mitral valve of a reference heart: thick leaflets and papillary muscles, each closed.
+
+Nothing marks the papillary tips: they are found on the surfaces of the whole muscles.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,8 @@ from scipy.ndimage import gaussian_filter1d
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.cases.chord_layout import LeafletBand, assumed_closure, lay_out_chordae
 from mvest.cases.frames import MM_PER
-from mvest.cases.importing.papillary import HEAD_MM, papillary_tip
 from mvest.cases.surface_files import part_of
-from mvest.errors import InputError
+from mvest.errors import GeometryError, InputError
 from mvest.quantities import Length, Share, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
@@ -24,6 +26,40 @@ from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 from mvest.valve.io.leaflet_surfaces import read_surface
 from mvest.valve.io.vtk_xml import SurfaceFile
+
+HEAD_MM = 5.0
+"""mm, height of the head of a muscle, from all of which its chordae rise."""
+MIN_SLENDER = 1.5
+"""Length of a muscle over its width, below which it has no long axis and so no tip."""
+
+
+def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
+    """The middle ``(3,)`` mm of a muscle's head: its last `HEAD_MM` along its own long axis.
+
+    Parameters
+    ----------
+    muscle
+        ``(n, 3)`` mm, vertices of the muscle's surface.
+    leaflets
+        ``(m, 3)`` mm; the head is at the end that is nearer to their middle.
+
+    Raises
+    ------
+    GeometryError
+        The muscle is not longer than wide.
+    """
+    middle = muscle.mean(axis=0)
+    _, _, axes = np.linalg.svd(muscle - middle, full_matrices=False)
+    length, width = (float(np.ptp((muscle - middle) @ axis)) for axis in axes[:2])
+    if length < MIN_SLENDER * width:
+        raise GeometryError(
+            f"papillary muscle near {np.round(middle, 1).tolist()}: {length:.1f} mm long and "
+            f"{width:.1f} mm wide, so which end is its tip is not known; give tips instead"
+        )
+    axis = axes[0] * np.sign((leaflets.mean(axis=0) - middle) @ axes[0])
+    along = (muscle - middle) @ axis
+    return np.asarray(muscle[along >= along.max() - HEAD_MM].mean(axis=0))
+
 
 DATA_VARIABLE = "MVEST_HRA"
 """Environment variable that names the file of the heart, or a folder with its parts."""

@@ -26,8 +26,8 @@ from mvest.cases.importing.joining import (
 )
 from mvest.cases.importing.leaflet import Leaflet
 from mvest.cases.importing.slicerheart_folder import PHASES, SeenPhase, read_batch, read_fem
-from mvest.cases.paths import CASE_FILE
 from mvest.cases.rims import two_loops
+from mvest.cases.schema import CASE_FILE
 from mvest.cases.surface_files import RegionSurface
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError

@@ -19,7 +19,7 @@ from mvest.cases.importing.chords import chord_lines
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.markups import TO_LPS, read_fcsv, read_markups
 from mvest.reading.bounded import refusing
-from mvest.reading.table import numbers, read_columns
+from mvest.reading.text import numbers, read_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import check_finite
 from mvest.valve.io.vtk_legacy import PolyDataFile, read_polydata

@@ -8,15 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.imaging.detection.fit import Pulls, fit_shape, relax
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.position import PLACES
+from mvest.imaging.detection.pose_search import PLACES
+from mvest.imaging.detection.shape_model import Pulls, fit_shape, relax
 from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.detection.trained_model import DetectionModel
-from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence, landmark_vertices
 from mvest.quantities import Count, Length, Weight
 from mvest.typing import FloatArray, IntArray
 
@@ -44,7 +43,7 @@ class FitSettings:
         Neighbouring vertices see much the same: what is seen counts as if there were this many
         times fewer of them.
     stiffness, hold : float
-        Of the free displacement at the end, see :func:`mvest.imaging.detection.fit.relax`.
+        Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`.
     """
 
     modes: tuple[Count, ...] = (14, 25, 40)

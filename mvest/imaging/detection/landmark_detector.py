@@ -1,4 +1,7 @@
-"""Single points of the valve, each with trees of its own."""
+"""Single points of the valve, each found by votes of trees of its own.
+
+Every candidate says where the point lies from it, and most are right.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,41 @@ from numpy.typing import NDArray
 
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.votes import consensus
-from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
 from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
+from mvest.imaging.valve_sequence import landmark_vertices
 from mvest.typing import FloatArray, IntArray
+
+ROUNDS = 4
+
+
+def consensus(votes: FloatArray, width_mm: float = 1.5) -> tuple[FloatArray, FloatArray]:
+    """Where votes agree.
+
+    Parameters
+    ----------
+    votes : (P, V, d) mm
+        V votes for each of P points.
+    width_mm : float
+        Votes farther than this from the consensus count little (Cauchy weights).
+
+    Returns
+    -------
+    points : (P, d) mm
+    spread : (P,) mm
+        Weighted root mean square distance of the votes: how much they disagree.
+    """
+    centre = np.median(votes, axis=1)
+    for _ in range(ROUNDS):
+        gap = ((votes - centre[:, None]) ** 2).sum(axis=2)
+        weight = 1 / (1 + gap / width_mm**2)
+        weight /= weight.sum(axis=1, keepdims=True)
+        centre = (weight[..., None] * votes).sum(axis=1)
+    gap = ((votes - centre[:, None]) ** 2).sum(axis=2)
+    return centre, np.sqrt((weight * gap).sum(axis=1))
+
 
 MISSES = Misses(0.0, 4.0, 0.03)
 START_MM = 4.0
@@ -35,7 +66,7 @@ PATTERN = _pattern()
 
 
 def landmark_points(true: TrueValve, layout: ValveLayout) -> FloatArray:
-    """``(L, 3)`` mm, in the order of :data:`mvest.imaging.landmarks.LANDMARKS`."""
+    """``(L, 3)`` mm, in the order of :data:`mvest.imaging.layout.LANDMARKS`."""
     return np.concatenate([true.vertices[list(landmark_vertices(layout).values())], true.tips])
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.landmark_detector import consensus
 from mvest.imaging.detection.shape_model import ShapeModel
-from mvest.imaging.detection.votes import consensus
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
 from mvest.imaging.learning.sampling import SamplePattern, features

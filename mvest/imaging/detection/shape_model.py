@@ -1,21 +1,30 @@
-"""How valves differ: a mean shape and its principal modes, pose taken off.
+"""How valves differ (a mean shape and its principal modes, pose taken off), and fitting a shape.
 
 Papillary tips have a mean only; they are found by themselves, since a shape fitted to the leaflets
 moves them for no reason of their own.
+
+The fitted shape is the most probable one that agrees with what was seen, then takes up what the
+model cannot show. Everything seen is a pull: a vertex is to move by so much along a direction, give
+or take a standard deviation. Pose and coefficients follow from a linear least-squares problem with
+the shape model's prior (maximum a posteriori), repeated with weights that make little of what
+disagrees; a smooth displacement of the vertices then takes up the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import Poses, pose_of
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
-from mvest.typing import FloatArray
+from mvest.imaging.valve_sequence import MovingValve
+from mvest.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,3 +105,134 @@ def fit_shape_model(valves: Sequence[MovingValve], modes: int) -> ShapeModel:
         values[:modes],
         np.tensordot(weight, np.stack(tips), axes=1),
     )
+
+
+ROUNDS = 3
+TAIL = 2.5
+"""Standard deviations beyond which a pull loses weight (Cauchy)."""
+
+POSE_STD = np.array([4.0, 4.0, 4.0, 0.25, 0.25, 0.25, 0.12])
+"""mm, radians and log scale: how far one fit may move the pose; wide."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pulls:
+    """What was seen of some vertices.
+
+    Attributes
+    ----------
+    vertex : (m,)
+    direction : (m, 3)
+        Unit vectors.
+    offset : (m,) mm
+        Along the direction, from where the vertex is now.
+    std : (m,) mm
+    """
+
+    vertex: IntArray
+    direction: FloatArray
+    offset: FloatArray
+    std: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Pulls]) -> Pulls:
+        """All pulls of several."""
+        return cls(
+            np.concatenate([p.vertex for p in parts]),
+            np.concatenate([p.direction for p in parts]),
+            np.concatenate([p.offset for p in parts]),
+            np.concatenate([p.std for p in parts]),
+        )
+
+    @classmethod
+    def to_points(
+        cls, vertex: IntArray, now: FloatArray, points: FloatArray, std: FloatArray
+    ) -> Pulls:
+        """To points ``(m, 3)`` mm, along all three axes of the world."""
+        return cls(
+            np.repeat(vertex, 3),
+            np.tile(np.eye(3), (len(vertex), 1)),
+            (points - now).ravel(),
+            np.repeat(std, 3),
+        )
+
+
+def fit_shape(
+    model: ShapeModel, pose: Poses, coefficients: FloatArray, pulls: Pulls
+) -> tuple[Poses, FloatArray]:
+    """Pose (one) and coefficients ``(K,)`` that agree best with pulls on the shape they give.
+
+    Parameters
+    ----------
+    pose : Poses
+        One; where pulls start from, together with ``coefficients (K,)``.
+    """
+    k = len(coefficients)
+    local = model.shape(coefficients[None])[0][pulls.vertex] * np.exp(pose.log_scale[0])
+    along = pulls.direction @ pose.rotation[0]
+    modes = model.modes[:k][:, pulls.vertex] * np.exp(pose.log_scale[0])
+    design = np.concatenate(
+        [
+            along,
+            np.cross(local, along),
+            (along * local).sum(axis=1, keepdims=True),
+            np.einsum("mi,kmi->mk", along, modes),
+        ],
+        axis=1,
+    )
+    prior = np.concatenate([1 / POSE_STD**2, 1 / model.std[:k] ** 2])
+    pull_back = np.concatenate([np.zeros(7), -coefficients / model.std[:k] ** 2])
+    by = np.zeros(7 + k)
+    for _ in range(ROUNDS):
+        residual = (design @ by - pulls.offset) / pulls.std
+        weight = 1 / (pulls.std**2 * (1 + (residual / TAIL) ** 2))
+        normal = design.T @ (weight[:, None] * design) + np.diag(prior)
+        by = np.linalg.solve(normal, design.T @ (weight * pulls.offset) + pull_back)
+    return pose.moved(by[None, :7]), coefficients + by[7:]
+
+
+def relax(
+    vertices: FloatArray, layout: ValveLayout, pulls: Pulls, stiffness: float, hold: float
+) -> FloatArray:
+    """Vertices ``(n, 3)`` mm moved smoothly as pulls ask.
+
+    Parameters
+    ----------
+    stiffness : float
+        1/mm^2, on the square of the displacement's second differences between neighbours.
+    hold : float
+        1/mm^2, on the square of the displacement.
+    """
+    n = layout.size
+    bend = stiffness * _bending(layout) + hold * sparse.identity(n)
+    weight = 1 / pulls.std**2
+    row = np.arange(len(pulls.vertex))
+    design = sparse.csr_array(
+        (
+            pulls.direction.ravel(),
+            (np.repeat(row, 3), (3 * pulls.vertex[:, None] + np.arange(3)).ravel()),
+        ),
+        shape=(len(row), 3 * n),
+    )
+    matrix = sparse.kron(bend, sparse.identity(3)) + design.T @ sparse.diags_array(weight) @ design
+    right = np.asarray(design.T @ (weight * pulls.offset), dtype=np.float64)
+    by = splu(sparse.csc_array(matrix)).solve(right)
+    return vertices + by.reshape(n, 3)
+
+
+@lru_cache(maxsize=4)
+def _bending(layout: ValveLayout) -> sparse.csr_array:
+    """Square of the graph Laplacian of the layout's grid ``(n, n)``."""
+    number = np.arange(layout.size).reshape(layout.rows, layout.columns)
+    pairs = np.concatenate(
+        [
+            np.stack([number.ravel(), np.roll(number, -1, 1).ravel()], 1),
+            np.stack([number[:-1].ravel(), number[1:].ravel()], 1),
+        ]
+    )
+    n = layout.size
+    ones = np.ones(len(pairs))
+    adjacency = sparse.coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    adjacency = adjacency + adjacency.T
+    laplacian = sparse.diags_array(adjacency.sum(axis=1)) - adjacency
+    return sparse.csr_array(laplacian.T @ laplacian)

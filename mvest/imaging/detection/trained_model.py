@@ -17,16 +17,15 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.detection.boundary import BoundaryDetector
 from mvest.imaging.detection.landmark_detector import LandmarkDetector
-from mvest.imaging.detection.pose_search import REFINEMENTS, PoseSearch
-from mvest.imaging.detection.position import PositionDetector
+from mvest.imaging.detection.pose_search import REFINEMENTS, PoseSearch, PositionDetector
 from mvest.imaging.detection.rim_detector import RimDetector
 from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.detection.shape_start import MODES, ShapeStart
-from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
 from mvest.imaging.models import MODEL_FILE
-from mvest.reading.json_file import parse_json
+from mvest.imaging.valve_sequence import LANDMARKS
+from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line, read_bytes
 from mvest.typing import FloatArray

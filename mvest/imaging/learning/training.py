@@ -19,27 +19,27 @@ from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.landmark_detector import landmark_samples
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
+    PLACES,
     REFINED,
     REFINEMENTS,
     PoseSearch,
+    PositionDetector,
     coarse_samples,
     fine_samples,
+    position_samples,
     refinement_samples,
 )
-from mvest.imaging.detection.position import PLACES, PositionDetector, position_samples
 from mvest.imaging.detection.rim_detector import rim_samples
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.shape_start import MODES, shape_start_samples
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
-from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
 from mvest.imaging.learning.degrade import degrade
 from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.moving_valve import MovingValve
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
+from mvest.imaging.simulator.acquisition import Acquisition, draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.valve_sequence import LANDMARKS, MovingValve
 from mvest.imaging.volume import VolumeSequence
 from mvest.processes import side_by_side
 from mvest.quantities import Count

@@ -20,9 +20,16 @@ import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.reading.data import beside, read_exactly
+from mvest.imaging.reading.data import (
+    FieldNames,
+    Header,
+    StatedTimes,
+    StatedVolume,
+    beside,
+    fault,
+    read_exactly,
+)
 from mvest.imaging.reading.plausible import check_size
-from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
 from mvest.typing import FloatArray
 

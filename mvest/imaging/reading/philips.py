@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from mvest.imaging.reading.data import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.imaging.reading.plausible import check_size
-from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
 
 SOP_CLASS = "1.2.840.113543.6.6.1.3.10002"

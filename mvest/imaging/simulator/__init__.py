@@ -1,5 +1,1 @@
 """Simulated transoesophageal echo volumes of a moving valve, for training and testing detectors."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

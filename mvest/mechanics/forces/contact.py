@@ -31,7 +31,7 @@ active in the stress-free state and the same rule serves pleats, commissures and
 
 No passing: no Newton step takes from a known pair more than three quarters of its distance to the
 barrier, nor the triangulated midsurface samples through each other
-(:mod:`mvest.mechanics.forces.passing`).
+(:mod:`mvest.mechanics.forces.pair_search`).
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.pair_search import ContactPairs, search_pairs
-from mvest.mechanics.forces.passing import Passing
+from mvest.mechanics.forces.pair_search import ContactPairs, Passing, search_pairs
 from mvest.mechanics.settings import ContactSettings
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding

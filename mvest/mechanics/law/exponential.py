@@ -32,19 +32,26 @@ parabola, so that a Newton iterate far away does not overflow; no tissue gets th
 Kelvin-Voigt damping adds the stress ``rate (E - E_n) V`` with ``rate = beta / dt`` and the constant
 isotropic V = ``viscous`` (MPa; half of it for engineering shear). It acts on the rate of the
 Green-Lagrange strain and so leaves rigid rotation alone.
+
+In a biaxial test a thin sheet is stretched along and across its fibres. The stress across the
+thickness is zero, which decides the stretch of the thickness. From it follows the exponential
+tissue that is as stiff as a linear one where closed leaflets are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields, replace
+from functools import lru_cache
+from typing import Protocol
 
 import numba as nb
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.parameters import Parameter, known_names
-from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, TissueSettings
 from mvest.typing import FloatArray, IntArray
 
 MAX_EXPONENT = 12.0
@@ -297,3 +304,78 @@ def _partial_stress(
                 out[e, p, i] = by_a * da + by_volume * h[i]
             out[e, p, 0] += by_f
     return out
+
+
+MAX_ITERATIONS = 100
+TOLERANCE = 1e-12
+"""Change of the thickness strain at which the stretch of the thickness is found."""
+
+
+class _Stressed(Protocol):
+    def response(
+        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
+    ) -> tuple[FloatArray, FloatArray]: ...
+
+
+def biaxial_stress(law: _Stressed, stretches: FloatArray, region: int = 0) -> FloatArray:
+    """Nominal stresses ``(n, 2)`` MPa along and across the fibres.
+
+    Parameters
+    ----------
+    law : Law
+    stretches : (n, 2)
+        Along and across the fibres.
+    region : int
+        Of the law.
+
+    Raises
+    ------
+    InputError
+        If stretches are not positive, or no thickness is found for them.
+    """
+    stretches = np.asarray(stretches, dtype=np.float64)
+    if stretches.ndim != 2 or stretches.shape[1] != 2 or not np.all(stretches > 0):
+        raise InputError("stretches: expected (n, 2) positive numbers")
+    green = np.zeros((len(stretches), 1, 6))
+    green[:, 0, :2] = 0.5 * (stretches**2 - 1)
+    thickness = 1 / stretches.prod(axis=1)
+    where, none = np.full(len(stretches), region), np.zeros_like(green)
+    for _ in range(MAX_ITERATIONS):
+        green[:, 0, 2] = 0.5 * (thickness**2 - 1)
+        stress, tangent = law.response(green, where, none, 0.0)
+        # In the logarithm of the thickness, which stays positive whatever the step.
+        slope = tangent[:, 0, 2, 2] * thickness**2 + 2 * stress[:, 0, 2]
+        change = -stress[:, 0, 2] / np.where(slope > 0, slope, tangent[:, 0, 2, 2] * thickness**2)
+        thickness = thickness * np.exp(np.clip(change, -0.1, 0.1))
+        if np.abs(change).max(initial=0.0) < TOLERANCE:
+            return np.asarray(stretches * stress[:, 0, :2])
+    raise InputError("no thickness without stress was found at these stretches")
+
+
+CLOSED_STRETCHES = (1.0, 1.11)
+"""Along the fibres and across them: the medians of closed leaflets (``results/law.md``)."""
+
+
+def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> ExponentialTissue:
+    """The tissue with all stresses scaled to those of a linear one of modulus ``E_f`` MPa.
+
+    At `CLOSED_STRETCHES` the stresses along and across the fibres then have the same mean.
+    """
+    factor = E_f * _scale(tissue, linear)
+    exponents = {"c1", "c2"}
+    return replace(
+        tissue,
+        **{
+            each.name: factor * getattr(tissue, each.name)
+            for each in fields(tissue)
+            if each.name not in exponents
+        },
+    )
+
+
+@lru_cache(maxsize=64)
+def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
+    """Factor on the tissue for a modulus of 1 MPa, to which all stresses are in proportion."""
+    stretches = np.array([CLOSED_STRETCHES])
+    wanted = biaxial_stress(BiotLaw.of([linear.moduli(1.0).material]), stretches).mean()
+    return float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())

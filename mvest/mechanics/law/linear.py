@@ -1,4 +1,16 @@
-"""The law that is linear in the strain it is given."""
+r"""The law that is linear in the strain it is given, and the corotational tetrahedron.
+
+The usual corotational tetrahedron, which the paper's simulation has, is linear in a turned frame.
+The force of an element at positions x is that of linear elasticity in a frame that turns with it,
+
+.. math:: f = R K (R^T x - X), \qquad K = V B^T C B,
+
+with the element's own R: of the matrix of its edges from its first node, :math:`A = (x_1 - x_0, x_2
+- x_0, x_3 - x_0)`, the polar factor at x times the inverse of that at X. (It is the "polar" form of
+SOFA's tetrahedra; R is not the polar factor of the deformation gradient.) The tangent is taken at
+fixed R: :math:`R K R^T`. Neither is exact for a law with an energy; :mod:`mvest.mechanics.law.biot`
+is what replaces it here.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +23,7 @@ from mvest.errors import InputError
 from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter, known_names
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,7 +31,7 @@ class LinearLaw:
     """Stress ``C : (e + rate (e - e_n))`` of the strain e that it is given.
 
     Of the Green-Lagrange strain it is St. Venant's law, FEBio's ``orthotropic elastic``. Of the
-    linear strain in the turned frame of the element (`mvest.mechanics.law.corotational`) the second
+    linear strain in the turned frame of the element (`mvest.mechanics.law.linear`) the second
     Piola-Kirchhoff stress is the stress in that frame.
 
     Attributes
@@ -99,3 +112,56 @@ class LinearLaw:
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """The change of the strain itself."""
         return d_green
+
+
+class EdgeRotations:
+    """Frames of linear tetrahedra that turn with their edges.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    frames : ndarray
+        ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
+
+    Raises
+    ------
+    InputError
+        If the elements are not linear tetrahedra.
+    """
+
+    def __init__(self, mesh: SolidMesh, frames: FloatArray) -> None:
+        if mesh.element_type != "tet4":
+            raise InputError(
+                f"the corotational law is that of linear tetrahedra (tet4), not {mesh.element_type}"
+            )
+        self._elements = mesh.elements
+        self._start = _polar(self._edges(mesh.nodes))
+        self._frames = frames
+
+    def _edges(self, x: FloatArray) -> FloatArray:
+        corners = x[self._elements]
+        return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+    def __call__(self, x: FloatArray, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Linear strain ``(e, 1, 6)`` in the turned frames, and these ``(e, 1, 3, 3)``.
+
+        Parameters
+        ----------
+        x : ndarray
+            ``(n, 3)`` mm.
+        deformation : ndarray
+            ``(e, 1, 3, 3)`` F in the fibre frame.
+        """
+        rotation = _polar(self._edges(x)) @ np.swapaxes(self._start, 1, 2)
+        frames = rotation[:, None] @ self._frames
+        h = np.swapaxes(frames, 2, 3) @ deformation - np.eye(3)
+        normal = [h[..., i, i] for i in range(3)]
+        shear = [h[..., i, j] + h[..., j, i] for i, j in ((1, 2), (0, 2), (0, 1))]
+        return np.stack(normal + shear, axis=-1), np.ascontiguousarray(frames)
+
+
+def _polar(a: FloatArray) -> FloatArray:
+    """The rotation ``(e, 3, 3)`` that is nearest to each matrix, also where one is inverted."""
+    u, _, v = np.linalg.svd(a)
+    u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
+    return u @ v

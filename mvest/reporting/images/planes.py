@@ -12,8 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from mvest.errors import GeometryError
-from mvest.imaging.landmarks import landmarks
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence, landmarks
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.geometry.proximity import plane_section

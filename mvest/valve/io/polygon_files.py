@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from mvest.errors import GeometryError, InputError
 from mvest.reading.bounded import array_of_words, refusing
-from mvest.reading.json_file import parse_json
+from mvest.reading.documents import parse_json
 from mvest.reading.text import MAX_TEXT, read_bytes
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.vtk_xml import MAX_SURFACE, SurfaceFile

@@ -5,8 +5,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from mvest.cases.importing.papillary import HEAD_MM
-from mvest.cases.importing.reference_heart import PARTS
+from mvest.cases.importing.reference_heart import HEAD_MM, PARTS
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.thickening import thicken
 

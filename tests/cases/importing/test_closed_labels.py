@@ -11,7 +11,7 @@ import SimpleITK
 from scipy.interpolate import PchipInterpolator
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.importing.labels import LabelsOptions, import_labels
+from mvest.cases.importing.segmented import LabelsOptions, import_labels
 from mvest.errors import InputError
 from mvest.valve.anatomy.valve import LeafletSurface, band_grid
 from mvest.valve.geometry.proximity import closest_points

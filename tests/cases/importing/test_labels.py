@@ -11,8 +11,7 @@ import SimpleITK
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
-from mvest.cases.importing.labels import LabelsOptions, import_labels
-from mvest.cases.importing.segmented import segmentation_std
+from mvest.cases.importing.segmented import LabelsOptions, import_labels, segmentation_std
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.typing import FloatArray

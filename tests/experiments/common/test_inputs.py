@@ -19,10 +19,10 @@ from experiments.run import main
 from experiments.studies.imported import DonorSettings, recorded_valve
 from mvest.cases.importing.reference_heart import PARTS
 from mvest.cases.writer import write_case
-from mvest.external import write_points
+from mvest.external.contract import write_points
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.imaging.writing import write_sequence_nrrd
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 from tests.cases.from_images.test_imaged_case import sequence
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies import test_imported

@@ -11,7 +11,7 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
-from mvest.simulation.motion import PopulationSettings
+from mvest.simulation.population import PopulationSettings
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from experiments.common.records.record import read_record
 from experiments.runner.collecting import comparison
-from mvest.reading.json_file import read_mapping
+from mvest.reading.documents import read_mapping
 
 
 def logged(folder: Path) -> dict[str, float]:

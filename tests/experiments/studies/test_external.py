@@ -8,7 +8,7 @@ import pytest
 from experiments.common.records.record import read_record
 from experiments.common.study import Job
 from experiments.studies.external import STUDY, ExternalSettings, ModelSettings, Settings
-from mvest.external import write_points
+from mvest.external.contract import write_points
 from tests.experiments.configured import composed, plain
 from tests.external.programs import SPRINGS, springs
 

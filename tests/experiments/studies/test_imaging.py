@@ -31,7 +31,7 @@ from mvest.imaging.detection.trained_model import (
     load_model,
     save_model,
 )
-from mvest.imaging.simulator import SMALL
+from mvest.imaging.simulator.acquisition import SMALL
 from mvest.simulation.trials import KINDS, WITHOUT_VALVE, Trial
 from tests.experiments.configured import composed, plain
 

@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
-from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.template import Template
 from tests.made_up_sequence import leaflets
@@ -238,7 +237,6 @@ def use_geometry(monkeypatch, truths):
         boundary,
         landmark_detector,
         pose_search,
-        position,
         rim_detector,
         shape_start,
     )
@@ -251,7 +249,7 @@ def use_geometry(monkeypatch, truths):
     def shells(frame, points):
         return geometry(frame, None, points, np.broadcast_to(np.eye(3), (len(points), 3, 3)))
 
-    monkeypatch.setattr(position, "_shell_features", shells)
+    monkeypatch.setattr(pose_search, "_shell_features", shells)
     monkeypatch.setattr(
-        position, "_places", lambda frame: truths[0].pose.centre[0] + [1.3, -0.7, 2.1] + grid
+        pose_search, "_places", lambda frame: truths[0].pose.centre[0] + [1.3, -0.7, 2.1] + grid
     )

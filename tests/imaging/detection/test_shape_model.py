@@ -1,13 +1,18 @@
-"""Principal modes of shapes: what they must be whatever the valves' poses and frames."""
+"""Principal modes of shapes: what they must be whatever the valves' poses and frames.
+
+Shapes that agree with pulls: exact ones, contradictory ones, and what the model cannot show.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
-from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.detection.shape_model import fit_shape_model
+from mvest.imaging.detection import shape_model
+from mvest.imaging.detection.pose import Poses, pose_of
+from mvest.imaging.detection.shape_model import Pulls, fit_shape, fit_shape_model, relax
 from mvest.imaging.layout import ValveLayout
 from tests.imaging.detection.made_up import moving_valve, poses
 
@@ -96,3 +101,216 @@ def test_too_few_shapes_and_other_layouts_are_refused():
         fit_shape_model(valves, 4)
     with pytest.raises(InputError, match="same layout"):
         fit_shape_model([*valves, moving_valve(2, 2, ValveLayout(24, 7))], 2)
+
+
+def to_all(model, pose, b, target, std=0.05):
+    """Pulls of all vertices to where they belong."""
+    now = pose.world(model.shape(b[None]))[0]
+    every = np.arange(len(target))
+    return Pulls.to_points(every, now, target, np.full(len(target), std))
+
+
+def same_pose(a, b, mm=1e-3, radians=1e-4):
+    by = a.towards(b)[0]
+    assert np.abs(by[:3]).max() < mm
+    assert np.abs(by[3:6]).max() < radians
+    assert abs(by[6]) < radians
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_pulls_give_pose_and_coefficients_back(shape, seed):
+    # A wrong sign in the turn's columns, a scale that the modes do not follow, or coefficients
+    # added to the wrong ones do not converge.
+    rng = np.random.default_rng(seed)
+    true, b = poses(1, seed), rng.standard_normal(8) * shape.std[:8]
+    target = true.world(shape.shape(b[None]))[0]
+    pose, found = true.moved(rng.standard_normal((1, 7)) * [3, 3, 3, 0.2, 0.2, 0.2, 0.08]), b * 0
+    for _ in range(12):
+        pose, found = fit_shape(shape, pose, found, to_all(shape, pose, found, target, 0.02))
+    same_pose(pose, true)
+    np.testing.assert_allclose(found, b, atol=2e-3 * shape.std[0])
+
+
+def test_pulls_along_normals_alone_count_along_normals_only(shape):
+    # A pull of nothing along z must hold nothing in x and y.
+    pose, b = poses(1, 3), np.zeros(4)
+    at = np.arange(shape.layout.size)
+    z = np.tile(pose.rotation[0][:, 2], (len(at), 1))
+    found, _ = fit_shape(
+        shape, pose, b, Pulls(at, z, np.full(len(at), 2.0), np.full(len(at), 0.02))
+    )
+    by = pose.towards(found)[0]
+    assert by[2] == pytest.approx(2.0, abs=0.05)
+    assert np.abs(by[:2]).max() < 0.3
+
+
+def test_one_coefficient_shrinks_as_the_analytic_solution_says(shape, monkeypatch):
+    # MAP: b = pull / (1 + std^2 / (s^2 |a|^2)) where a is how far the pulled points move for b = 1.
+    k, mode_std, std = 1, float(shape.std[0]), 0.8
+    pose = Poses(np.zeros((1, 3)), np.eye(3)[None], np.zeros(1))
+    a = shape.modes[0]
+    vertex = int(np.argmax(np.linalg.norm(a, axis=1)))
+    size = np.linalg.norm(a[vertex])
+    direction = a[vertex] / size
+    offset = 0.05  # far below std: robust weights are 1
+    monkeypatch.setattr(
+        shape_model, "POSE_STD", shape_model.POSE_STD * 1e-6
+    )  # the pose does not move at all
+    _, found = fit_shape(
+        shape,
+        pose,
+        np.zeros(k),
+        Pulls(np.array([vertex]), direction[None], np.array([offset]), np.array([std])),
+    )
+    expected = (offset * size / std**2) / (size**2 / std**2 + 1 / mode_std**2)
+    assert found[0] == pytest.approx(expected, rel=1e-3)
+    # From an earlier estimate the prior draws towards zero, not towards that estimate.
+    _, again = fit_shape(
+        shape,
+        pose,
+        found + 0.3,
+        Pulls(
+            np.array([vertex]),
+            direction[None],
+            np.array([offset - (found[0] + 0.3) * size]),
+            np.array([std]),
+        ),
+    )
+    assert again[0] == pytest.approx(expected, abs=2e-3 * mode_std)
+
+
+def test_modes_grow_with_the_valve(shape):
+    # A valve half as large again: a pull is as many coefficients less, in a single step.
+    pose = poses(1, 5)
+    pose = Poses(pose.centre, pose.rotation, np.log([1.5]))
+    b = np.zeros(5)
+    b[0] = 0.3 * shape.std[0]
+    target = pose.world(shape.shape(b[None]))[0]
+    found_pose, found = fit_shape(shape, pose, 0 * b, to_all(shape, pose, 0 * b, target, 0.5))
+    same_pose(found_pose, pose, 0.05, 0.005)
+    np.testing.assert_allclose(found, b, atol=0.03 * b[0])
+
+
+def test_a_prior_keeps_what_is_not_seen_at_the_mean(shape):
+    # Nothing but weak pulls: coefficients return towards zero.
+    pose, b = poses(1, 5), 1.0 * shape.std[:6]
+    at = np.array([3])
+    pulls = Pulls(at, np.eye(3)[:1], np.zeros(1), np.array([1e4]))
+    _, found = fit_shape(shape, pose, b, pulls)
+    np.testing.assert_allclose(found, 0, atol=1e-3)
+
+
+def test_outliers_lose_weight(shape):
+    # A tenth of the vertices are pulled 15 mm astray: with least squares the valve goes along.
+    rng = np.random.default_rng(2)
+    true = poses(1, 8)
+    target = true.world(shape.shape(np.zeros((1, 1))))[0]
+    wrong = target.copy()
+    astray = rng.choice(len(target), len(target) // 10, replace=False)
+    wrong[astray] += np.array([15.0, 0.0, 0.0])
+    pose, b = true.moved(np.array([[1.0, 0.5, -0.5, 0.03, 0, 0, 0.0]])), np.zeros(6)
+    for _ in range(6):
+        pose, b = fit_shape(shape, pose, b, to_all(shape, pose, b, wrong, 0.5))
+    x = pose.world(shape.shape(b[None]))[0]
+    rest = np.setdiff1d(np.arange(len(target)), astray)
+    assert np.linalg.norm(x - target, axis=1)[rest].mean() < 0.3
+
+
+# --- relax --------------------------------------------------------------------------------------
+
+SMALL = ValveLayout(8, 4)
+
+
+def some_pulls(count, seed=0):
+    rng = np.random.default_rng(seed)
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return Pulls(
+        rng.integers(SMALL.size, size=count),
+        direction,
+        rng.standard_normal(count),
+        rng.uniform(0.5, 1.5, count),
+    )
+
+
+def test_pulls_of_nothing_change_nothing():
+    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+    pulls = some_pulls(30)
+    pulls = Pulls(pulls.vertex, pulls.direction, np.zeros(30), pulls.std)
+    np.testing.assert_allclose(relax(x, SMALL, pulls, 4.0, 0.3), x, atol=1e-12)
+
+
+def test_a_common_shift_is_taken_whole_by_a_stiff_sheet_without_hold():
+    # If stiffness resisted a shift of all vertices together, rows would lag behind.
+    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+    d = np.array([1.0, -2.0, 0.5])
+    at = np.array([0, 5, 13, 22, 31])
+    pulls = Pulls.to_points(at, x[at], x[at] + d, np.full(5, 0.5))
+    np.testing.assert_allclose(relax(x, SMALL, pulls, 1e4, 1e-9), x + d, atol=1e-4)
+
+
+def test_hold_keeps_what_is_not_pulled_in_place():
+    x = np.zeros((SMALL.size, 3))
+    pulls = Pulls.to_points(np.array([0]), x[:1], np.array([[1.0, 0, 0]]), np.array([0.1]))
+    far = SMALL.vertex(180.0, -1)
+    loose, held = relax(x, SMALL, pulls, 4.0, 1e-6), relax(x, SMALL, pulls, 4.0, 1.0)
+    assert loose[0, 0] > 0.9
+    assert held[far, 0] < 0.05 * loose[far, 0]
+
+
+def dense(x, layout, pulls, stiffness, hold):
+    """The same problem written out: neighbours in a ring of columns and a line of rows."""
+    n = layout.size
+    laplacian = np.zeros((n, n))
+    for j in range(layout.rows):
+        for i in range(layout.columns):
+            a = j * layout.columns + i
+            for b in (
+                j * layout.columns + (i + 1) % layout.columns,
+                j * layout.columns + (i - 1) % layout.columns,
+                (j + 1) * layout.columns + i if j + 1 < layout.rows else None,
+                (j - 1) * layout.columns + i if j > 0 else None,
+            ):
+                if b is not None:
+                    laplacian[a, a] += 1
+                    laplacian[a, b] -= 1
+    matrix = np.kron(stiffness * laplacian.T @ laplacian + hold * np.eye(n), np.eye(3))
+    right = np.zeros(3 * n)
+    for v, d, o, s in zip(pulls.vertex, pulls.direction, pulls.offset, pulls.std, strict=True):
+        at = slice(3 * v, 3 * v + 3)
+        matrix[at, at] += np.outer(d, d) / s**2
+        right[at] += d * o / s**2
+    return x + np.linalg.solve(matrix, right).reshape(n, 3)
+
+
+def test_relax_equals_the_dense_solution():
+    # Columns not joined in a ring, or several pulls of one vertex of which one counts.
+    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+    pulls = some_pulls(60)
+    assert len(np.unique(pulls.vertex)) < 60
+    np.testing.assert_allclose(
+        relax(x, SMALL, pulls, 3.0, 0.2), dense(x, SMALL, pulls, 3.0, 0.2), atol=1e-9
+    )
+
+
+def test_relax_turns_with_the_valve():
+    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+    turn = Rotation.from_rotvec([0.4, -1.0, 0.7]).as_matrix()
+    pulls = some_pulls(40)
+    turned = Pulls(pulls.vertex, pulls.direction @ turn.T, pulls.offset, pulls.std)
+    np.testing.assert_allclose(
+        relax(x @ turn.T, SMALL, turned, 3.0, 0.2),
+        relax(x, SMALL, pulls, 3.0, 0.2) @ turn.T,
+        atol=1e-9,
+    )
+
+
+def test_pulls_to_points_are_along_the_worlds_axes():
+    now, to = np.zeros((2, 3)), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    pulls = Pulls.to_points(np.array([7, 9]), now, to, np.array([0.1, 0.2]))
+    moved = np.zeros((10, 3))
+    np.add.at(moved, pulls.vertex, pulls.direction * pulls.offset[:, None])
+    np.testing.assert_array_equal(moved[[7, 9]], to)
+    np.testing.assert_array_equal(pulls.std, [0.1] * 3 + [0.2] * 3)
+    both = Pulls.joined([pulls, pulls])
+    np.testing.assert_array_equal(both.vertex, np.tile([7, 7, 7, 9, 9, 9], 2))

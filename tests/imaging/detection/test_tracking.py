@@ -1,19 +1,21 @@
-"""All frames together: the consistent path, smoothing in time, landmarks by hand, no valve."""
+"""All frames together: the consistent path, smoothing in time, landmarks by hand, no valve.
+
+Smoothing in time: what goes, what stays, and by whose weight.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mvest.imaging.detection import position, tracking
+from mvest.imaging.detection import pose_search, tracking
 from mvest.imaging.detection.detect import NoValveError, fit_frame, search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import PoseSearch
-from mvest.imaging.detection.position import PositionDetector
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.pose_search import PoseSearch, PositionDetector
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
-from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
+from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from tests.imaging.detection.made_up import (
     FIT,
@@ -213,7 +215,7 @@ def test_a_tip_by_hand_stays_while_the_others_are_smoothed(shape, truths):
 
 
 def test_frames_without_any_place_to_look_at_show_no_valve(shape, truths, monkeypatch):
-    monkeypatch.setattr(position, "_places", lambda frame: np.zeros((0, 3)))
+    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
     with pytest.raises(NoValveError, match="no valve found"):
         detect_valve(volume(), oracle_model(shape, truths), TOLD)
 
@@ -310,3 +312,88 @@ def test_hypotheses_that_are_about_the_same_count_once():
     # 1 is best; 0 and 2 lie upon it; 3 is turned by 57 degrees and 4 is 12 mm away.
     np.testing.assert_array_equal(kept, [1, 3, 4])
     np.testing.assert_array_equal(some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 2), [1, 3])
+
+
+UNEVEN = np.array([0.0, 0.02, 0.03, 0.07, 0.08, 0.13, 0.15])
+S = np.array([0.0, 0.5, 1.0])
+
+
+def smooth(vertices, tips=None, weight=None, frame_weight=None, times=(0.06, 0.06, 0.06)):
+    count = len(UNEVEN)
+    return smooth_in_time(
+        UNEVEN,
+        vertices,
+        np.zeros((count, 2, 3)) if tips is None else tips,
+        np.ones(vertices.shape[:2]) if weight is None else weight,
+        np.ones(count) if frame_weight is None else frame_weight,
+        S,
+        times,
+    )
+
+
+def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
+    # Second differences over frames instead of seconds bend it.
+    rng = np.random.default_rng(0)
+    start, speed = rng.standard_normal((2, 3, 3)) * 10
+    line = start + UNEVEN[:, None, None] * speed * 10
+    weight = rng.uniform(0.05, 1.0, (len(UNEVEN), 3))
+    vertices, tips = smooth(line, line[:, :2], weight, weight[:, 0])
+    np.testing.assert_allclose(vertices, line, atol=1e-7)
+    np.testing.assert_allclose(tips, line[:, :2], atol=1e-7)
+
+
+def test_no_smoothing_is_none_at_all():
+    x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
+    vertices, tips = smooth(x, x[:, :2], times=(0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(vertices, x)
+    np.testing.assert_array_equal(tips, x[:, :2])
+    # The annulus alone: the free edge stays as it is, what is in between moves a little.
+    x = np.repeat(x[:, :1], 3, 1)
+    vertices, _ = smooth(x, times=(0.06, 0.0, 0.0))
+    np.testing.assert_allclose(vertices[:, 2], x[:, 2], atol=1e-9)
+    moved = np.abs(vertices - x).mean(axis=(0, 2))
+    assert moved[0] > moved[1] > 0.01
+
+
+def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
+    # Weights that do not count, or count the other way round, are seen here.
+    x = np.zeros((len(UNEVEN), 3, 3))
+    x[3] = 5.0
+    weight = np.ones((len(UNEVEN), 3))
+    weight[3] = [1.0, 1.0, 0.01]
+    vertices, _ = smooth(x, weight=weight, times=(0.02, 0.02, 0.02))
+    assert vertices[3, 2, 0] < 0.5
+    assert vertices[3, 0, 0] > 2 * vertices[3, 2, 0]
+    assert np.abs(vertices[[0, 6], 2]).max() < 0.3
+
+
+def test_weights_count_relative_to_the_others():
+    x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
+    rng = np.random.default_rng(1)
+    weight = rng.uniform(0.2, 1.0, (len(UNEVEN), 3))
+    np.testing.assert_allclose(
+        smooth(x, weight=weight)[0], smooth(x, weight=0.3 * weight)[0], atol=1e-9
+    )
+
+
+def test_fast_changes_go_and_slow_ones_stay():
+    # Smoothing over 0.06 s: a wave of 0.03 s goes, one of 1.5 s stays.
+    times = 0.01 * np.arange(60)
+    slow, fast = (np.sin(2 * np.pi * times / period) for period in (1.5, 0.03))
+    x = np.stack([slow, fast, slow + fast], axis=1)[..., None] * np.ones(3)
+    found, _ = smooth_in_time(
+        times, x, np.zeros((60, 2, 3)), np.ones((60, 3)), np.ones(60), S, (0.06, 0.06, 0.0)
+    )
+    inner = slice(10, -10)
+    np.testing.assert_allclose(found[inner, 0], x[inner, 0], atol=0.06)
+    assert np.abs(found[inner, 1]).max() < 0.05
+    np.testing.assert_allclose(found[:, 2], found[:, 0] + found[:, 1], atol=1e-9)
+
+
+def test_two_frames_are_left_as_they_are():
+    x = np.random.default_rng(0).standard_normal((2, 3, 3))
+    found, tips = smooth_in_time(
+        np.array([0.0, 0.1]), x, x[:, :2], np.ones((2, 3)), np.ones(2), S, (0.1, 0.1, 0.1)
+    )
+    np.testing.assert_array_equal(found, x)
+    np.testing.assert_array_equal(tips, x[:, :2])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.imaging.reading import read_volume
+from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
 from tests.imaging.reading import test_metaimage, test_nifti, test_philips
 from tests.imaging.reading import volumes as v

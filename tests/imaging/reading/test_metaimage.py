@@ -6,7 +6,7 @@ import pytest
 import SimpleITK
 
 from mvest.errors import InputError
-from mvest.imaging.reading import read_volume
+from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
 from tests.imaging.reading import volumes as v
 

@@ -8,7 +8,7 @@ from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from mvest.errors import InputError
-from mvest.imaging.reading import read_volume
+from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality
 from tests.imaging.reading import volumes as v
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.valve.anatomy.template import Template
 
 FRAMES = 3

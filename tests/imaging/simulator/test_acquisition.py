@@ -5,13 +5,15 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.imaging.simulator import SMALL, Acquisition, draw_acquisition
-from mvest.imaging.simulator.acquisition_ranges import (
+from mvest.imaging.simulator.acquisition import (
     SHIFTED,
+    SMALL,
     TRAINING,
     WIDE,
+    Acquisition,
     AcquisitionRanges,
     Range,
+    draw_acquisition,
 )
 
 # Echo strengths and compensation may be those of training in both.

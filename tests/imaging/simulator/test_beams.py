@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.imaging.simulator import SMALL, Acquisition
+from mvest.imaging.simulator.acquisition import SMALL, Acquisition
 from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
 from mvest.imaging.simulator.scene import Echoes, cell_volume
 

@@ -7,7 +7,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 from mvest.errors import InputError
-from mvest.imaging.reading import read_volume
+from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.imaging.writing import voxelise_leaflets, write_segmentation
 from tests.imaging.reading import volumes as v

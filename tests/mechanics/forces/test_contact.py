@@ -13,8 +13,7 @@ from mvest.mechanics.forces.contact import (
     BARRIER,
     Contact,
 )
-from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs
-from mvest.mechanics.forces.passing import _longest_edges
+from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs, _longest_edges
 from mvest.mechanics.settings import ContactSettings
 from mvest.valve.mesh.solid_mesh import Embedding
 from tests.mechanics.bodies import grid_triangles, point_masses

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.ties import TiedPoints, Ties
+from mvest.mechanics.forces.cables import TiedPoints, Ties
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid

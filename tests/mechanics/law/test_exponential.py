@@ -9,9 +9,8 @@ from scipy.optimize import brentq
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import MAX_EXPONENT, ExponentialLaw
+from mvest.mechanics.law.exponential import MAX_EXPONENT, ExponentialLaw, biaxial_stress
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue

@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
+from mvest.mechanics.law.regional import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import MechanicsSettings, ModulusField, StiffPatch, TissueSettings
 from mvest.mechanics.solid import Solid

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import ExponentialLaw
-from mvest.mechanics.law.prestretch import PrestretchedLaw
+from mvest.mechanics.law.exponential import ExponentialLaw, biaxial_stress
+from mvest.mechanics.law.stiffening import PrestretchedLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
 

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.equivalent import CLOSED_STRETCHES, as_stiff
-from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.law.exponential import (
+    CLOSED_STRETCHES,
+    ExponentialLaw,
+    as_stiff,
+    biaxial_stress,
+)
 from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings

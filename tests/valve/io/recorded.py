@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.valve.io.abaqus.leaflet_mesh import SetNames
+from mvest.valve.io.abaqus.mesh import SetNames
 
 REGIONS = ("anterior", "septal", "posterior")
 NAMES = SetNames({name: f"{name}_Quads" for name in REGIONS}, "Rim", "free_edge")

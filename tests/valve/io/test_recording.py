@@ -9,9 +9,8 @@ import pytest
 
 from experiments.studies.imported import DATA_VARIABLE, DONOR_CITATION
 from mvest.errors import GeometryError, InputError
-from mvest.valve.io.abaqus.chords import trace_cables, truss_stiffness
 from mvest.valve.io.abaqus.deck import ElementSection, blocks_of
-from mvest.valve.io.abaqus.leaflet_mesh import SetNames
+from mvest.valve.io.abaqus.mesh import SetNames, trace_cables, truss_stiffness
 from mvest.valve.io.abaqus.recording import Recording, read_recording
 from mvest.valve.mesh.remesh import remesh
 from mvest.valve.mesh.structured import layered_wedges

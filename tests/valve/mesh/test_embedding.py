@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError, InputError
-from mvest.mechanics.blocks import box
+from mvest.mechanics.body import box
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 from mvest.valve.mesh.structured import structured_mesh

@@ -27,10 +27,17 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
-from mvest.valve.io.abaqus.chords import ChordPaths, trace_cables, truss_stiffness
 from mvest.valve.io.abaqus.deck import TRUSSES, Deck, ElementSection
 from mvest.valve.io.abaqus.deck_file import read_deck
-from mvest.valve.io.abaqus.leaflet_mesh import LeafletMesh, SetNames, leaflet_mesh, shell_numbers
+from mvest.valve.io.abaqus.mesh import (
+    ChordPaths,
+    LeafletMesh,
+    SetNames,
+    leaflet_mesh,
+    shell_numbers,
+    trace_cables,
+    truss_stiffness,
+)
 from mvest.valve.io.vtk_xml import read_vtu
 from mvest.valve.mesh.remesh import Remeshed
 

@@ -16,16 +16,16 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import REGISTRATION
-from mvest.simulation.motion.closing import (
+from mvest.simulation.motion import (
     MotionSettings,
+    check_motion,
     closing_frames,
     moving_valve,
     with_tip_motion,
 )
-from mvest.simulation.motion.refusal import check_motion
 from mvest.simulation.virtual_patient import (
     CLOSED,
     REFERENCE,
