@@ -100,11 +100,15 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
         "budget": table(
             rows("budget"),
             part=Column(label="source of error"),
+            modulus=Column(),
             without=Column(label="SD without it"),
             alone=Column(label="SD of it alone"),
         ),
         "image_errors": table(
-            rows("image_errors"), samples=HIDDEN, share_of_variance=Column(digits=".2f")
+            rows("image_errors"),
+            parameter=Column(label="modulus"),
+            samples=HIDDEN,
+            share_of_variance=Column(digits=".2f"),
         ),
         "image_frames": _chosen(rows("image_frames")),
         "settings": table(rows("settings")),
