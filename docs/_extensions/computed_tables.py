@@ -17,10 +17,10 @@ from study_pages import comment_of
 
 from experiments.common.config import PARTS, Config
 from experiments.common.schema import ranges
-from experiments.common.skill import GENERIC, skill_table, stated
 from experiments.common.study import load_settings, study_names
 from experiments.results.keep import records_of
 from mvest.mechanics.parameters import KINDS
+from mvest.reporting.skill import GENERIC, skill_table, stated
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -19,7 +19,6 @@ import numpy as np
 from experiments.common.building.anatomy import template_of
 from experiments.common.building.closure import closure_model, mechanics_of
 from experiments.common.building.filters import require_one_each
-from experiments.common.building.virtual_patients import PatientSettings, draw_patient_values
 from experiments.common.cases.own_case import settings_of
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar, say
@@ -54,6 +53,7 @@ from mvest.quantities import (
     TimeStep,
 )
 from mvest.reporting.tables import Column, Table, table
+from mvest.simulation.drawn_patient import PatientSettings, draw_patient_values
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template

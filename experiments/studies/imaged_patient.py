@@ -18,28 +18,10 @@ from scipy.stats import linregress, sem
 
 from experiments.common.building.anatomy import template_of
 from experiments.common.building.closure import mechanics_of
-from experiments.common.building.store import Store
-from experiments.common.building.virtual_patients import (
-    EchoSettings,
-    PatientSettings,
-    draw_patient_values,
-    first_that_closes,
-    require_patient,
-)
 from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words, write_report
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.records.record import Record
-from experiments.common.skill import (
-    GENERIC,
-    interval,
-    interval_columns,
-    moduli_figure,
-    skill_table,
-    stated,
-    trust_of,
-    verdict_table,
-)
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples, ValveCase
 from mvest.cases.chord_layout import SEEN_CLOSURE
@@ -57,9 +39,27 @@ from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation.error_budget import EVERYTHING
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.skill import generic_guess
+from mvest.problem.stored import Store
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
+from mvest.reporting.skill import (
+    GENERIC,
+    interval,
+    interval_columns,
+    moduli_figure,
+    skill_table,
+    stated,
+    trust_of,
+    verdict_table,
+)
 from mvest.reporting.tables import Column, Table, table
+from mvest.simulation.drawn_patient import (
+    EchoSettings,
+    PatientSettings,
+    draw_patient_values,
+    first_that_closes,
+    require_patient,
+)
 from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion import MotionSettings
 from mvest.simulation.population import draw_tip_motion

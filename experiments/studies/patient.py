@@ -22,13 +22,18 @@ from scipy.stats import binom, chi2, norm
 
 from experiments.common.building.gate import gate_of
 from experiments.common.building.patient_store import PatientPlace, make_patient
-from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.own_case import case_words, expect_own, write_report
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import build
-from experiments.common.skill import (
+from experiments.common.study import Job, Result, Results, Study
+from mvest.errors import InputError
+from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
+from mvest.problem.skill import prior_alone, score
+from mvest.problem.verdict import TRUSTWORTHY
+from mvest.reading.npz import read_npz
+from mvest.reporting.skill import (
     GENERIC,
     VERDICTS,
     interval,
@@ -39,13 +44,8 @@ from experiments.common.skill import (
     trust_of,
     verdict_table,
 )
-from experiments.common.study import Job, Result, Results, Study
-from mvest.errors import InputError
-from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
-from mvest.problem.skill import prior_alone, score
-from mvest.problem.verdict import TRUSTWORTHY
-from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Column, Table, table
+from mvest.simulation.drawn_patient import PatientSettings
 from mvest.typing import FloatArray
 
 if TYPE_CHECKING:

@@ -9,24 +9,25 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import yaml
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.spatial.transform import Rotation
 
 from experiments.common.building.patient_store import make_patient
-from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Number, Record
-from experiments.common.skill import (
+from experiments.common.study import Job, Result, Results, Study
+from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.folder import read_case
+from mvest.cases.writer import write_case
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.registration import REGISTRATION
+from mvest.problem.skill import prior_alone
+from mvest.reporting.skill import (
     VERDICTS,
     interval,
     interval_columns,
@@ -35,60 +36,16 @@ from experiments.common.skill import (
     stated,
     trust_of,
 )
-from experiments.common.study import Job, Result, Results, Study
-from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.folder import read_case
-from mvest.cases.importing.segmented import LabelsOptions, import_labels
-from mvest.cases.importing.slicerheart import SlicerheartOptions, import_slicerheart
-from mvest.cases.schema import CASE_FILE
-from mvest.cases.writer import write_case
-from mvest.errors import ConfigurationError
-from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.registration import REGISTRATION, displace
-from mvest.problem.skill import prior_alone
-from mvest.quantities import Length
 from mvest.reporting.tables import Column, Table, table
-from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.simulation.arrival import KINDS, DoorSettings, arrive
+from mvest.simulation.drawn_patient import PatientSettings
+from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.io.leaflet_surfaces import write_surface
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FINE_MM", "STUDY", "DoorSettings", "arrive", "drawn_leaflets", "run_surfaces"]
-
-KINDS = ("vertices", "surfaces", "slicerheart", "labels")
-"""Of doors, in the order of tables."""
-
-POSE = Rotation.from_euler("xz", [1.0, 0.4]).as_matrix()
-SHIFT = np.array([31.0, -12.0, 140.0])
-"""From the axes of a simulated valve to LPS mm: so that nothing lies along an axis."""
-
-SCENE = "simulated"
-LANDMARKS = {
-    "A": (0.0, 1.0), "P": (0.0, -1.0), "AL": (-1.0, 0.0), "PM": (1.0, 0.0), "ALC": (-1.0, 0.25),
-    "PMC": (1.0, 0.25),
-}  # fmt: skip
-"""Direction (x, y) of SlicerHeart's landmarks from the middle of the template's annulus."""
-
-FINE_MM, MARGIN_MM = 0.2, 6.0
-"""Of the grid on which leaflets are drawn before they are sampled at voxels."""
-
 PRIOR = "prior alone"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DoorSettings:
-    """How the geometry of a virtual patient arrives."""
-
-    kind: str  # vertices, surfaces, slicerheart or labels
-    label: str  # what tables call it
-    seen_with_errors: bool = False  # the closed surface has the errors of the patient's case
-    voxel_mm: Length | None = None  # of a label map
-    closed: bool = False  # the closed frame is a label map as well
-    std_mm: Length = 0.6  # of the closed surface, where the case itself does not say it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,263 +144,6 @@ def _cpu_of_children() -> float:
     """S of all processes that were started from here and have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-# -- on its way -----------------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True, eq=False)
-class Arrived:
-    """A case, and where its open and closed midsurfaces truly were, in the axes of the case."""
-
-    case: ValveCase
-    opened: Frame
-    closed: Frame
-
-
-def arrive(
-    case: ValveCase,
-    positions: FloatArray,
-    registration: FloatArray,
-    door: DoorSettings,
-    folder: Path,
-) -> Arrived:
-    """What becomes of a virtual patient's geometry on its way.
-
-    Parameters
-    ----------
-    case : ValveCase
-        Of the patient, whose vertices correspond.
-    positions : ndarray
-        ``(n, 3)`` mm, where these truly were in the closed frame.
-    registration : ndarray
-        ``(6,)`` by which they are displaced against the annulus and the tips that the case states.
-    door : DoorSettings
-    folder : Path
-        Empty; what is exported and imported is left there.
-
-    Raises
-    ------
-    MvestError
-        If there is no such door, or what was exported is refused.
-    """
-    opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
-    patient = Arrived(case, opened, replace(closed, vertices=positions))
-    drawn = closed.vertices if door.seen_with_errors else positions
-    closed = replace(closed, vertices=drawn, free_edge=drawn[case.free_edge], corresponds=False)
-    if door.kind == "vertices":
-        return patient
-    if door.kind == "surfaces":
-        return replace(patient, case=replace(case, frames=(opened, closed)))
-    if door.kind not in KINDS:
-        raise ConfigurationError(f"door.kind = {door.kind!r}, expected one of {', '.join(KINDS)}")
-    # Leaflets, annulus and tips are drawn in one image.
-    tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
-    closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)
-    seen = (_in_lps(opened), _in_lps(closed))
-    through = _through_slicerheart if door.kind == "slicerheart" else _through_labels
-    imported = replace(through(patient, seen, door, folder), simulated=True)
-    return Arrived(imported, _in_lps(opened), _in_lps(patient.closed))
-
-
-def _through_slicerheart(
-    patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
-) -> ValveCase:
-    annulus = patient.opened.annulus[:, :2] - patient.opened.annulus[:, :2].mean(axis=0)
-    landmarks = {name: int(np.argmax(annulus @ np.array(to))) for name, to in LANDMARKS.items()}
-    phases = dict(zip(("MD", "MS"), frames, strict=True))
-    _write_slicerheart(folder / "slicerheart", phases, patient.case.surface, landmarks)
-    options = SlicerheartOptions(pressure_mmHg=frames[1].pressure_mmHg, std_mm=door.std_mm)
-    return import_slicerheart(folder / "slicerheart", options)
-
-
-def _through_labels(
-    patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
-) -> ValveCase:
-    thickness = patient.case.surface.thickness
-    if door.voxel_mm is None:
-        raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
-    opened, closed = (folder / f"{frame.name}.nii.gz" for frame in frames)
-    tips = [tuple(frame.papillary_tips.ravel().tolist()) for frame in frames]
-    options = LabelsOptions(tips=tips[0], observer_mm=0.0)
-    _write_label_map(opened, frames[0], thickness, door.voxel_mm)
-    if not door.closed:
-        imported = import_labels(opened, options)
-        return _with_closed(imported, frames[1], door.std_mm, folder / "by_hand")
-    _write_label_map(closed, frames[1], thickness, door.voxel_mm)
-    pressure = frames[1].pressure_mmHg
-    both = replace(options, closed=str(closed), tips_closed=tips[1], pressure_mmHg=pressure)
-    return import_labels(opened, both)
-
-
-def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:
-    """A case of an open frame with a closed one added by hand, as midsurface.
-
-    Its chordae are laid out again, by both frames.
-    """
-    write_case(folder, case)
-    document = yaml.safe_load((folder / CASE_FILE).read_text(encoding="utf-8"))
-    region = {"region": np.asarray(closed.region)}
-    write_surface(folder / "closed.vtp", closed.vertices, closed.triangles, {}, region)
-    document["frames"].append(
-        {
-            "name": closed.name,
-            "time": closed.time,
-            "role": closed.role.value,
-            "surface": "closed.vtp",
-            "papillary_tips": closed.papillary_tips.tolist(),
-            "pressure": closed.pressure_mmHg,
-            "corresponds": False,
-        }
-    )
-    document["observation"] = {"std_mm": std_mm, "correlation_length_mm": 10.0}
-    del document["chordae"]
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    (folder / CASE_FILE).write_text(text, encoding="utf-8")
-    return read_case(folder)
-
-
-def _in_lps(frame: Frame) -> Frame:
-    """A frame in the axes of an image, LPS, the left tip first."""
-    tips = frame.papillary_tips[np.argsort(frame.papillary_tips[:, 0])]
-    shapes = {"vertices": frame.vertices, "annulus": frame.annulus, "free_edge": frame.free_edge}
-    moved = {name: points @ POSE.T + SHIFT for name, points in shapes.items()}
-    return replace(frame, papillary_tips=tips @ POSE.T + SHIFT, **moved)
-
-
-# -- exports --------------------------------------------------------------------------------------
-def _write_slicerheart(
-    folder: Path,
-    frames: Mapping[str, Frame],
-    surface: LeafletSurface,
-    landmarks: Mapping[str, int],
-) -> None:
-    """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
-
-    Frames by phase (MD, MS, ...) are midsurfaces (LPS mm; tips antero-lateral first); the atrial
-    side of a leaflet lies half its mean thickness from them. Landmarks are points of the annulus.
-    """
-    import pandas as pd
-
-    folder.mkdir()
-    contour: list[dict[str, str]] = []
-    marks: list[dict[str, str]] = []
-    for number, (phase, frame) in enumerate(frames.items()):
-        index, ring = str(3 + 9 * number), frame.annulus
-        about = {"Filename": SCENE, "Phase": phase, "FrameNumber": index, "Valve": "mitral"}
-        for label, name in enumerate(surface.region_names):
-            thick = float(surface.thickness[surface.vertex_region == label].mean())
-            stem = f"{SCENE}_mitral_frame_{index}_{phase}_atrial_mitral_{name}_leaflet"
-            _write_model(folder / f"{stem}.vtk", _atrial_side(frame, label, thick))
-        between = 0.5 * (ring + np.roll(ring, -1, axis=0))
-        for point in np.stack([ring, between], axis=1).reshape(-1, 3):
-            contour.append(about | _in_ras("AnnulusContour", "XYZ", point))
-        for name, k in landmarks.items():
-            marks.append(about | {"LandmarkLabel": name} | _in_ras("Landmark", "RAS", ring[k]))
-        muscles = ("antero-lateral", "postero-medial")
-        for muscle, tip in zip(muscles, frame.papillary_tips, strict=True):
-            middle = ring.mean(axis=0)
-            points = (tip + 0.4 * (tip - middle), tip, middle)
-            _write_points(folder / f"PapillaryMarkup-{muscle}-{phase}.fcsv", points)
-    table_of = pd.DataFrame(contour).assign(AnnulusContourLabel="")
-    table_of.to_csv(folder / "AnnulusContourPoints.csv", index=False)
-    pd.DataFrame(marks).to_csv(folder / "ValveLandmarkPoints.csv", index=False)
-
-
-def _in_ras(name: str, axes: str, point: FloatArray) -> dict[str, str]:
-    """R, A, S of a point, as exported tables have them."""
-    values = point * (-1, -1, 1)
-    return {f"{name}{axis}": f"{value:.2f}" for axis, value in zip(axes, values, strict=True)}
-
-
-def _atrial_side(frame: Frame, label: int, thickness_mm: float) -> Any:
-    """One leaflet with triangles of its own, moved to the atrium by half its thickness."""
-    try:
-        import pyvista
-    except ImportError as error:
-        raise ConfigurationError(
-            "folders of SlicerHeart are written by VTK: pip install mvest[viz]"
-        ) from error
-
-    def surface(points: FloatArray, triangles: IntArray) -> Any:
-        return pyvista.PolyData.from_regular_faces(points, triangles)
-
-    normals = surface(frame.vertices, frame.triangles).compute_normals(
-        cell_normals=False, split_vertices=False, consistent_normals=False
-    )
-    points = frame.vertices - 0.5 * thickness_mm * np.asarray(normals.point_data["Normals"])
-    leaflet = surface(points, frame.triangles[frame.region == label]).clean()
-    return leaflet.subdivide(1, subfilter="linear").decimate_pro(0.4, preserve_topology=True)
-
-
-def _write_model(file: Path, model: Any) -> None:
-    """A binary legacy model with the header of 3D Slicer, which names its axes."""
-    model.clear_data()
-    model.save(file, binary=True)
-    version, _, *rest = file.read_bytes().split(b"\n", 2)
-    file.write_bytes(b"\n".join([version, b"3D Slicer output. SPACE=LPS", *rest]))
-
-
-def _write_points(file: Path, points: Sequence[FloatArray]) -> None:
-    rows = [f"{k},{x},{y},{z},0,0,0,1,1,1,0,muscle-{k + 1},," for k, (x, y, z) in enumerate(points)]
-    head = (
-        "# Markups fiducial file version = 5.0",
-        "# CoordinateSystem = LPS",
-        "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID",
-    )
-    file.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
-
-
-def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_mm: float) -> None:
-    """Write thick leaflets (LPS mm) as a NIfTI of labels: 1 anterior, 2 posterior, 0 elsewhere.
-
-    A voxel belongs to the leaflets if more than half of it does, to the larger part of the two.
-    """
-    import nibabel
-
-    normals = smooth_vertex_normals(frame.vertices, frame.triangles)
-    drawn, low = drawn_leaflets(frame, normals, thickness_mm)
-    shape = [int(np.ceil(n * FINE_MM / voxel_mm)) for n in drawn.shape]
-    # Voxels lie anywhere against the leaflets.
-    start = 0.37 * voxel_mm
-    at = np.indices(shape).reshape(3, -1) * voxel_mm / FINE_MM + start / FINE_MM
-    share = []
-    for label in (1, 2):
-        # The mean over a voxel, as far as a normal distribution of its variance is one.
-        blurred = gaussian_filter((drawn == label).astype(np.float32), voxel_mm / FINE_MM / 12**0.5)
-        share.append(map_coordinates(blurred, at, order=1).reshape(shape))
-    anterior, posterior = share
-    labels = np.where(anterior + posterior > 0.5, 1 + (posterior > anterior), 0)
-    # Axes of NIfTI are R, A, S.
-    turned = np.array([-1.0, -1.0, 1.0])
-    affine = np.diag([*(turned * voxel_mm), 1.0])
-    affine[:3, 3] = turned * (low + start)
-    image: Any = nibabel.Nifti1Image  # its constructor has no types
-    nibabel.save(image(labels.astype(np.uint8), affine), file)
-
-
-def drawn_leaflets(
-    frame: Frame | LeafletSurface, normals: FloatArray, thickness_mm: FloatArray
-) -> tuple[NDArray[np.uint8], FloatArray]:
-    """Labels on a fine grid, and where its first point is (LPS mm)."""
-    vertices, triangles = frame.vertices, frame.triangles
-    corner = vertices[triangles]
-    longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
-    k = int(np.ceil(longest / (0.8 * FINE_MM)))
-    i, j = np.meshgrid(np.arange(k + 1), np.arange(k + 1))
-    inside = i + j <= k
-    weights = np.column_stack([i[inside], j[inside], k - i[inside] - j[inside]]) / k
-    points = np.einsum("ka,tai->tki", weights, corner).reshape(-1, 3)
-    along = np.einsum("ka,tai->tki", weights, normals[triangles]).reshape(-1, 3)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    # Points are drawn as cells of the fine grid, half of one beyond where they are.
-    reach = np.einsum("ka,ta->tk", weights, thickness_mm[triangles]).ravel() - FINE_MM
-    leaflet = np.repeat(frame.region + 1, len(weights)).astype(np.uint8)
-    low = vertices.min(axis=0) - MARGIN_MM
-    shape = np.ceil((np.ptp(vertices, axis=0) + 2 * MARGIN_MM) / FINE_MM).astype(int) + 1
-    drawn: NDArray[np.uint8] = np.zeros(shape, dtype=np.uint8)
-    for zeta in np.linspace(-0.5, 0.5, int(np.ceil(thickness_mm.max() / (0.8 * FINE_MM))) + 1):
-        cell = np.round((points + zeta * reach[:, None] * along - low) / FINE_MM).astype(int)
-        drawn[tuple(cell.T)] = leaflet
-    return drawn, low
 
 
 # -- tables ---------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.common.building.extrapolated import Extrapolated
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin
@@ -27,6 +26,7 @@ from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.record import EstimateRecord, Unknown, record_of
 from mvest.problem.registration import unit_of
+from mvest.problem.stored import Extrapolated
 from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
 from mvest.valve.measure.annulus import annulus_plane

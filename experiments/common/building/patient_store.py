@@ -11,18 +11,18 @@ import numpy as np
 
 from experiments.common.building.anatomy import template_of
 from experiments.common.building.closure import mechanics_of
-from experiments.common.building.store import Store
-from experiments.common.building.virtual_patients import (
+from mvest.cases.writer import write_case
+from mvest.errors import InputError
+from mvest.problem.stored import Store
+from mvest.provenance import write_json
+from mvest.reading.documents import read_mapping
+from mvest.reading.npz import read_npz
+from mvest.simulation.drawn_patient import (
     PatientSettings,
     draw_patient_values,
     first_that_closes,
     require_patient,
 )
-from mvest.cases.writer import write_case
-from mvest.errors import InputError
-from mvest.provenance import write_json
-from mvest.reading.documents import read_mapping
-from mvest.reading.npz import read_npz
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
 

@@ -8,12 +8,11 @@ from typing import Any
 
 from experiments.common.building.anatomy import Anatomy, build_mesh, guide_of
 from experiments.common.building.closure import closure_model, mesh_store
-from experiments.common.building.extrapolated import Extrapolated
-from experiments.common.building.store import Store, StoredModel
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
+from mvest.problem.stored import Extrapolated, Store, StoredModel
 
 __all__ = ["MADE_BY", "build_truth", "truth_mechanics", "truth_mesh"]
 

@@ -12,9 +12,7 @@ import numpy as np
 from experiments.common.building.anatomy import anatomy_of, guide_of
 from experiments.common.building.closure import closure_model, mechanics_of
 from experiments.common.building.errors import Correlations, observation_errors
-from experiments.common.building.extrapolated import Extrapolated
 from experiments.common.building.filters import as_numbers, build_filter, require_one_each
-from experiments.common.building.store import StoredModel
 from experiments.common.building.truth import build_truth, truth_mechanics
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
@@ -31,6 +29,7 @@ from mvest.observation.errors import (
 )
 from mvest.observation.vertices import require_frames
 from mvest.problem.problem import Problem
+from mvest.problem.stored import Extrapolated, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve

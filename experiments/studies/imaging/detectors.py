@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.common.building.closure import mechanics_of
-from experiments.common.building.store import Store, key_of
 from experiments.common.progress import PartBar
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.tracking import TrackingSettings
@@ -34,6 +33,7 @@ from mvest.imaging.learning.training import (
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.kept import Entry, get_or_make
+from mvest.problem.stored import Store, key_of
 from mvest.processes import side_by_side
 from mvest.quantities import Count, Length, Processes, Seed, within
 from mvest.reading.documents import parse_json

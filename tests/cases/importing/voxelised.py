@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import SimpleITK
 
-from experiments.studies.surfaces import FINE_MM, drawn_leaflets
+from mvest.simulation.arrival import FINE_MM, drawn_leaflets
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases import blind
 from experiments.common.records.record import Record
 from experiments.common.study import Job, Results
@@ -29,6 +28,7 @@ from mvest.personalisation.error_budget import EVERYTHING, IMAGES
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, Verdict
 from mvest.reporting.tables import table
+from mvest.simulation.drawn_patient import PatientSettings
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import a_result
 

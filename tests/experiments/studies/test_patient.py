@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from experiments.common.building import patient_store
-from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import SECRET, read_estimate, write_estimate
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import PersonalSettings
@@ -19,6 +18,7 @@ from experiments.studies.patient import Settings, expect_patient, reveal, run_pa
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.problem.verdict import ONE_STATE
+from mvest.simulation.drawn_patient import PatientSettings
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up_patients import a_result

@@ -11,9 +11,7 @@ from experiments.common.cases import blind
 from experiments.common.schema import build
 from experiments.common.study import Job, Results
 from experiments.studies.surfaces import (
-    DoorSettings,
     Settings,
-    arrive,
     figure,
     keep,
     run_surfaces,
@@ -26,6 +24,7 @@ from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
+from mvest.simulation.arrival import DoorSettings, arrive
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.cases.folders import template_case
 from tests.experiments.configured import composed, plain

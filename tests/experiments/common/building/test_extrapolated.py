@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.common.building.extrapolated import Extrapolated
-from experiments.common.building.store import StoredModel
 from experiments.common.building.twin import build_twin
 from mvest.errors import ConfigurationError
 from mvest.estimation.prediction import Prediction
+from mvest.problem.stored import Extrapolated, StoredModel
 from tests.experiments.configured import composed, plain
 
 

@@ -13,12 +13,12 @@ import experiments
 import mvest.closure.model
 import mvest.files
 import mvest.source
-from experiments.common.building.store import Store, StoredModel, key_of
 from experiments.common.building.truth import MADE_BY
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.kept import Counts
+from mvest.problem.stored import Store, StoredModel, key_of
 from mvest.source import Sources
 
 
@@ -89,7 +89,7 @@ def test_what_was_written_half_is_never_read(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(experiments.common.building.store.np, "savez", interrupted)
+        patched.setattr(mvest.problem.stored.np, "savez", interrupted)
         with pytest.raises(KeyboardInterrupt):
             StoredModel(model, tmp_path, "key")(AT)
     assert not list(tmp_path.glob("*.npz"))

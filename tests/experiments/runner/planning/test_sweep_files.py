@@ -11,7 +11,6 @@ from omegaconf import OmegaConf
 
 from experiments.common.building.filters import build_filter
 from experiments.common.building.twin import build_twin
-from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import SECRET
 from experiments.common.config import hash_of, register, require_in_range
 from experiments.common.schema import build
@@ -22,6 +21,7 @@ from experiments.runner.plugins import register_plugins
 from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
 from mvest.problem.record import EstimateRecord
+from mvest.simulation.drawn_patient import PatientSettings
 from tests.places import CONF
 
 SWEEPS = ("initial_guess", "covariance", "noise", "discrepancy", "filter")

@@ -1,6 +1,6 @@
-from experiments.common.skill import moduli_figure, skill_table, stated, trust_of
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Verdict
+from mvest.reporting.skill import moduli_figure, skill_table, stated, trust_of
 
 
 def answered(truth, estimate, low, high, generic) -> Unknown:
