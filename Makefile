@@ -95,7 +95,7 @@ sync: $(INSTALLED) ## upload to MLflow what is on disk and not there yet
 	$(BIN)/python -m experiments.runner.tracking.sync
 
 screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium)
-	$(BIN)/python -m experiments.runner.tracking.screenshot
+	$(BIN)/python -m tests.experiments.runner.tracking.screenshot
 
 slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from experiments.results.page import write_report
-from experiments.runner.tracking.screenshot import look_at
 from mvest.reporting.case.report import report
 from tests.experiments.results.test_report import publish_sweep
+from tests.experiments.runner.tracking.screenshot import look_at
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep
 from tests.reporting.case.made_up_case import (
     LINE,

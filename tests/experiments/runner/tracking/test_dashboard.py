@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.runner.tracking import dashboard, screenshot
+from experiments.runner.tracking import dashboard
 from mvest.errors import InputError
+from tests.experiments.runner.tracking import screenshot
 from tests.places import ROOT
 from tests.processes import until
 
