@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -24,6 +26,7 @@ __all__ = [
     "TEXT",
     "WIDTH",
     "headline",
+    "levels",
     "log_axis",
     "panels",
     "plain_axes",
@@ -84,3 +87,8 @@ def log_axis(axis: Any) -> None:
     """Label a logarithmic axis with 0.01, 0.1, 1 instead of powers of ten."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
     axis.set_minor_formatter(NullFormatter())
+
+
+def levels(n: int) -> list[Any]:
+    """N colours in order from dark to light, light enough to part and dark enough to see."""
+    return [colormaps["viridis"](value) for value in np.linspace(0.0, 0.85, max(n, 1))]

@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.sweeps.collected import read_sweep
 from tests.places import ROOT
 
 JOBS, SHARDS = 10_000, 2
@@ -88,12 +89,12 @@ def measure(folder: Path, jobs: int, shards: int) -> dict[str, object]:
     )
     again = Spent(folder, [[DRAIN, WORKER, "worker", str(FOLDER), "--shard", f"1/{shards}"]])
     collected = Spent(folder, [[DRAIN, WORKER, "collect", str(FOLDER)]])
-    found = json.loads((swept / "sweep.json").read_text())
-    states = [job["status"] for job in found["jobs"]]
+    found = read_sweep(swept / "sweep.json")
+    states = [record.status for record in found.records]
     ran = (folder / "runs").read_text().split()
     if states != ["converged"] * jobs or sorted(map(int, ran)) != list(range(jobs)):
         raise RuntimeError("a job was lost, or done twice")
-    overheads = sorted(cost["overhead"] for cost in found["cost"] if cost["overhead"] is not None)
+    overheads = sorted(job.overhead for job in found.jobs if job.overhead is not None)
     results = [path for path in swept.glob("*/*") if path.is_file()]
     return {
         "jobs": jobs,

@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from experiments.common.records.record import Record
+from experiments.sweeps.collected import read_sweep
 from tests.places import ROOT
 
 PATIENCE = 600.0
@@ -77,9 +79,9 @@ def job_process(raw_id: str) -> str:
     return ""
 
 
-def rows(folder: Path) -> dict[str, dict]:
-    swept = json.loads((folder / "outputs" / "sweep_debug" / "sweep.json").read_text())
-    return {job["hash"]: job for job in swept["jobs"]}
+def rows(folder: Path) -> dict[str, Record]:
+    swept = read_sweep(folder / "outputs" / "sweep_debug" / "sweep.json")
+    return {job.hash: job.record for job in swept.jobs}
 
 
 def results(folder: Path) -> dict[str, int]:
@@ -100,7 +102,7 @@ def test_jobs_that_die_cost_their_rows_and_run_again(tmp_path) -> None:
     subprocess.run(["scancel", f"{array}_3"], check=True)
     out = end(sweep)
     assert sweep.returncode == 1
-    reasons = {row["reason"] for row in rows(tmp_path).values() if row["status"] != "converged"}
+    reasons = {row.reason for row in rows(tmp_path).values() if row.status != "converged"}
     assert len(reasons) == 2
     assert any("its process died" in reason for reason in reasons), reasons
     assert any("cancelled" in reason for reason in reasons), reasons
@@ -111,7 +113,7 @@ def test_jobs_that_die_cost_their_rows_and_run_again(tmp_path) -> None:
     again = start(tmp_path)
     end(again)
     assert again.returncode == 0
-    assert {row["status"] for row in rows(tmp_path).values()} == {"converged"}
+    assert {row.status for row in rows(tmp_path).values()} == {"converged"}
     after = results(tmp_path)
     assert len(after) == 4
     assert {name: after[name] for name in done} == done, "a job that was done ran again"
@@ -140,8 +142,8 @@ def test_tasks_of_several_jobs_are_left_to_themselves_and_collected_later(tmp_pa
     out = end(late)
     assert late.returncode == 1
     assert "7 of 8 jobs done, 1 without an estimate" in out
-    (lost,) = [row for row in rows(tmp_path).values() if row["status"] != "converged"]
-    assert lost["reason"].startswith(f"Slurm job {first}_1: its process died; its output is in ")
+    (lost,) = [row for row in rows(tmp_path).values() if row.status != "converged"]
+    assert lost.reason.startswith(f"Slurm job {first}_1: its process died; its output is in ")
     done = results(tmp_path)
     assert folders[0] in done
     assert len(done) == 7
@@ -162,10 +164,10 @@ def test_a_job_over_its_memory_costs_its_row(tmp_path) -> None:
     assert sweep.returncode == 1
     found = rows(tmp_path).values()
     assert len(found) == 2
-    assert {row["status"] for row in found} == {"failed"}
+    assert {row.status for row in found} == {"failed"}
     for row in found:
-        assert "memory" in row["reason"] or "its process died" in row["reason"], row["reason"]
-        assert Path(row["reason"].rsplit(" ", 1)[1]).is_file(), "where to read on"
+        assert "memory" in row.reason or "its process died" in row.reason, row.reason
+        assert Path(row.reason.rsplit(" ", 1)[1]).is_file(), "where to read on"
 
 
 def test_what_slurm_refuses_is_one_line(tmp_path) -> None:

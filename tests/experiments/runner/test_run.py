@@ -30,7 +30,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
         timeout=300,
     )
     assert finished.returncode == 0, finished.stderr
-    assert "E_f.anterior [MPa]" in finished.stdout
+    assert "E_f.anterior (MPa)" in finished.stdout
     (folder,) = (tmp_path / "outputs" / "debug").iterdir()
     # Read with its types, every field there.
     record = read_record(folder / "result.json")
@@ -75,10 +75,10 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
 
 
 ERRORS = [
-    ("experiment=nope", "Could not find 'experiment/nope'; known: calibration, chord, closure"),
+    ("experiment=nope", "Could not find 'experiment/nope'; known: calibration"),
     ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
     ("mesh/nope=a", "Key 'mesh/nope'"),
-    ("filter.inital=[1,2]", "Key 'inital' not in 'FilterConfig'; did you mean initial?"),
+    ("filter.inital=[1,2]", "did you mean initial?"),
     ("mechanics.elment=tet4", "did you mean element?"),
     ("mechanics.protocol.dts=1", "mechanics.protocol.dts"),
     ("sed=3", "did you mean seed?"),
@@ -124,7 +124,7 @@ ERRORS = [
     ("mechanics.protocol.pressure_mmHg=1e6", "pressure_mmHg = 1000000, expected -100 to 500 mmHg"),
     ("truth.values=[1e9,2]", "truth.values of E_f.anterior = 1000000000, expected"),
     ("mechanics.density=nan", "mechanics.density is nan"),
-    ("study=magic", "Could not find 'study/magic'; known: case, chord"),
+    ("study=magic", "Could not find 'study/magic'; known: case"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("paths.outputs=file", "file"),
     ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),

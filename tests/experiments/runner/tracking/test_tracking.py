@@ -66,7 +66,6 @@ def make_config(outputs: Path, **changes) -> dict:
         },
         "observation": {"frames": ["open", "closed"], "noise_mm": 0.5},
         "truth": {"values": [6.23, 2.09], "source": None},
-        "donor": {"vertices": 430},
         "paths": {"outputs": str(outputs)},
         "tracking": {"enabled": True, "uri": None},
     }
@@ -144,7 +143,7 @@ def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
     assert found["noise"] == "0.5"
     assert found["kind"] == "white"
     assert found["truth.posterior"] == "2.09"
-    assert not [name for name in found if name.startswith(("paths", "tracking", "donor"))]
+    assert not [name for name in found if name.startswith(("paths", "tracking"))]
     assert "truth.source" not in found, "a setting that is not set would make its axis no number"
 
 
@@ -185,7 +184,9 @@ def test_a_job_becomes_one_flat_run(tmp_path) -> None:
     tags = run.data.tags
     assert tags["sweep_id"] == "sweep-1"
     assert (tags["config_hash"], tags["mesh_hash"]) == (("job" * 64)[:64], "m" * 64)
-    assert (tags["git_sha"], tags["status"], tags["reason"]) == ("a" * 40, "converged", "tolerance")
+    assert (tags["git_sha"], tags["status"], tags["reason"]) == (
+        SOURCE.git.sha, "converged", "tolerance",
+    )  # fmt: skip
     assert "mlflow.parentRunId" not in tags
     assert float(run.data.params["P0"]) == 0.01
     assert run.data.metrics["error.anterior"] == pytest.approx(4.0)
