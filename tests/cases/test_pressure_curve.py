@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mvest.cases.pressure_curve import ATRIUM, VENTRICLE, PressureCurve, generic_curve
+from mvest.cases.folder import ATRIUM, VENTRICLE, PressureCurve, generic_curve
 from mvest.errors import InputError
 
 

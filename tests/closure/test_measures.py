@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.measures import measure_steps
 from mvest.closure.model import ClosureModel
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.scenarios.measures import measure_steps
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
 

@@ -14,13 +14,12 @@ from scipy.spatial import cKDTree
 from experiments.common.building.anatomy import anatomy_of
 from experiments.common.building.closure import closure_model
 from experiments.common.progress import SolveBar
-from mvest.closure.measures import measure_steps
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.errors import InputError
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Table, table
-from mvest.scenarios.measures import contact_pressure, nodal_stress
+from mvest.scenarios.measures import contact_pressure, measure_steps, nodal_stress
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed
@@ -39,7 +38,7 @@ COLUMNS = {
     "smallest det F": ":.2f",
     "Newton iterations": "",
 }
-"""Names and units of `mvest.closure.measures.StepMeasures`, in its order."""
+"""Names and units of `mvest.scenarios.measures.StepMeasures`, in its order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +72,7 @@ class Closing:
         return replace(self, result=replace(self.result, simulation=two))
 
     def steps(self) -> Table:
-        """What each step measures (`mvest.closure.measures.StepMeasures`)."""
+        """What each step measures (`mvest.scenarios.measures.StepMeasures`)."""
         steps = measure_steps(self.model, self.result, self.contact_distance_mm, self.normals)
         rows = [dict(zip(COLUMNS, asdict(step).values(), strict=True)) for step in steps]
         return table(rows, **COLUMNS)

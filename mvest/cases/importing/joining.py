@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.chord_layout import LeafletBand
-from mvest.cases.importing.leaflet import Leaflet, loop_length
+from mvest.cases.importing.parts import Leaflet, loop_length
 from mvest.cases.rims import loop_vector_area, two_loops, without_ears
 from mvest.cases.surface_files import RegionSurface
 from mvest.errors import GeometryError

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
-from mvest.cases.importing.chords import write_chords
 from mvest.cases.importing.joining import (
     REGIONS,
     Commissures,
@@ -24,7 +23,7 @@ from mvest.cases.importing.joining import (
     drawn_anew,
     joined,
 )
-from mvest.cases.importing.leaflet import Leaflet
+from mvest.cases.importing.parts import Leaflet, write_chords
 from mvest.cases.importing.slicerheart_folder import PHASES, SeenPhase, read_batch, read_fem
 from mvest.cases.rims import two_loops
 from mvest.cases.schema import CASE_FILE

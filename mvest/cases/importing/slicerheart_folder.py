@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.cases.importing.chords import chord_lines
+from mvest.cases.importing.parts import chord_lines
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.markups import TO_LPS, read_fcsv, read_markups
 from mvest.reading.bounded import refusing
