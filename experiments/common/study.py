@@ -180,7 +180,8 @@ class Study(Generic[S]):
     captions : mapping
         Name of a figure -> its caption.
     latex : tuple of str
-        Tables of results that are also written as LaTeX, and their figures as PDF: the paper's own.
+        Tables that are also written as LaTeX, and figures as PDF, by the names of their files: the
+        paper's own.
     words : callable or None
         Record -> text for the terminal; by default its tables.
     files : callable or None

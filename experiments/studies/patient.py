@@ -643,7 +643,7 @@ STUDY = Study(
         "ranks": "Where the truth lies in the posterior: difference of its distribution from the "
         "uniform one. Grey: right intervals stay there in 95 of 100 samples. Simulated.",
     },
-    latex=("patients",),
+    latex=("patients_table_2", "patients_table_3", "patients_figure_3"),
     words=case_words,
     files=write_report,
     keep=keep,

@@ -60,6 +60,6 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
         {"table": shortened(by_setting(sweep))},
         sweep.records,
         captions=CAPTIONS,
-        latex=True,
+        latex=(f"{base.name}_table",),
     )
     return [*tables, *written]

@@ -7,7 +7,7 @@ tables, for programs), ``NAME.md`` (the page: what readers see of the tables), `
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +41,7 @@ def write_results(folder: Path, study: Study[Any], results: Results, name: str =
         If a file cannot be written.
     """
     base = folder / (name or results.first.table)
-    print_too = results.first.table in study.latex
-    drawn = _write_figures(base, study, results, pdf=print_too)
+    drawn = _write_figures(base, study, results)
     written = write_tables(
         base,
         results.first.title,
@@ -50,7 +49,7 @@ def write_results(folder: Path, study: Study[Any], results: Results, name: str =
         study.summary(results) if study.summary is not None else None,
         list(results.records.values()),
         captions=study.captions,
-        latex=print_too,
+        latex=study.latex,
     )
     return [*written, *drawn]
 
@@ -63,7 +62,7 @@ def write_tables(
     records: Sequence[Record],
     *,
     captions: Mapping[str, str] | None = None,
-    latex: bool = False,
+    latex: Collection[str] = (),
 ) -> list[Path]:
     """Write tables as CSV, and the page that shows them and the figures that are there already.
 
@@ -80,8 +79,8 @@ def write_tables(
         Those that the tables follow from.
     captions : mapping of str to str
         Part -> caption of its figure.
-    latex : bool
-        Whether readers' tables are written as LaTeX, too.
+    latex : collection of str
+        Names of readers' tables that are written as LaTeX, too.
 
     Raises
     ------
@@ -103,7 +102,7 @@ def write_tables(
             parts.append(f"## {_heading(part)}")
         file = _named(base, part, ".csv").name
         parts.append(table.markdown() if len(table) <= LONGEST else f"{len(table)} rows: {file}")
-        if latex:
+        if _named(base, part).name in latex:
             text = f"% {provenance_of(records)}\n{table.latex()}"
             written.append(write_atomically(_named(base, part, ".tex"), text))
     for part, caption in (captions or {}).items():
@@ -155,7 +154,7 @@ def provenance_of(records: Sequence[Record]) -> str:
     return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
 
 
-def _write_figures(base: Path, study: Study[Any], results: Results, *, pdf: bool) -> list[Path]:
+def _write_figures(base: Path, study: Study[Any], results: Results) -> list[Path]:
     if study.figure is None:
         return []
     from mvest.reporting.figures import save_figure_with
@@ -164,11 +163,11 @@ def _write_figures(base: Path, study: Study[Any], results: Results, *, pdf: bool
     if drawn is None:
         return []
     line = provenance_of(list(results.records.values()))
-    return [
-        path
-        for part, figure in (drawn if isinstance(drawn, Mapping) else {"": drawn}).items()
-        for path in save_figure_with(_named(base, part), figure, line, pdf=pdf)
-    ]
+    written = []
+    for part, figure in (drawn if isinstance(drawn, Mapping) else {"": drawn}).items():
+        place = _named(base, part)
+        written += save_figure_with(place, figure, line, pdf=place.name in study.latex)
+    return written
 
 
 def _named(base: Path, part: str, suffix: str = "") -> Path:
