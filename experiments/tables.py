@@ -12,6 +12,7 @@ from experiments.runner.jobs.interruption import interruptible
 from experiments.sweeps.collected import read_sweeps
 from experiments.sweeps.report import write_sweep
 from mvest.errors import MvestError
+from mvest.reporting.pictures import lighten
 
 __all__ = ["main"]
 
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             written += write_sweep(results, sweep)
         written.append(write_report(results))
         for path in written:
-            print(path)
+            print(lighten(path) if path.suffix == ".png" else path)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

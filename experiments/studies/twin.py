@@ -359,7 +359,7 @@ STUDY = Study(
         "": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
         "valve": "The fitted valve, open and closed. Simulated.",
     },
-    latex=("table1", "table1_valve"),
+    latex=("table1",),
     checks=lambda: (TwinExpectation(),),
     require=require_twin,
     keeps_failures=True,
