@@ -81,7 +81,6 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.closure",
         "mvest.problem",
         "mvest.cases",
-        "mvest.reporting",
         "mvest.febio",
     ),
     "mvest.personalisation": (

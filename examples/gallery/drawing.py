@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from mvest.problem.fields import CaseFields
 from mvest.reporting.case.drawing import (
     ATRIUM,
     draw_valve,
@@ -9,7 +10,6 @@ from mvest.reporting.case.drawing import (
     paint_leak,
     same_scale,
 )
-from mvest.reporting.case.fields import CaseFields
 
 __all__ = ["draw", "fields_of", "same_scale"]
 

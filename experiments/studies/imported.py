@@ -339,7 +339,7 @@ def moduli_table(records: list[EstimateRecord]) -> Table:
 
 
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
-    """As those of a case (`mvest.reporting.case.fields`)."""
+    """As those of a case (`mvest.problem.fields`)."""
     surface, tips = valve.coarse.surface, valve.recording.papillary_tips
     away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
     return {

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mvest.reporting.case.fields import CaseFields
+    from mvest.problem.fields import CaseFields
 
 __all__ = ["STUDY", "expect_patient", "reveal", "run_patient"]
 
@@ -472,7 +472,7 @@ def figure(results: Results) -> dict[str, Figure]:
         return {"moduli": moduli_figure(_drawn(patients))}
     if results.first.table == CALIBRATION:
         return {"ranks": ranks_figure(_by_scenario(patients))}
-    from mvest.reporting.case.fields import read_case_fields
+    from mvest.problem.fields import read_case_fields
 
     names = {id(record): name for name, record in results.records.items()}
     places = {estimate.case: names[id(record)] for record, estimate in patients}

@@ -25,10 +25,10 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.fields import valve_fields
 from mvest.problem.record import EstimateRecord, record_of
 from mvest.quantities import AxisCount, Count, Logarithm, within
 from mvest.reading.npz import read_npz
-from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.predict import (
     PredictedScenario,

@@ -24,10 +24,10 @@ from mvest.estimation.noise import observation_noise
 from mvest.estimation.wrappers import SharedStart
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.fields import valve_fields
 from mvest.problem.record import EstimateRecord, Unknown, record_of
 from mvest.problem.registration import unit_of
 from mvest.problem.stored import Extrapolated
-from mvest.reporting.case.fields import valve_fields
 from mvest.reporting.tables import Column, Table, table
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
@@ -180,7 +180,7 @@ def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements 
 
 
 def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
-    """The last observed and fitted frame, as those of a case (`mvest.reporting.case.fields`)."""
+    """The last observed and fitted frame, as those of a case (`mvest.problem.fields`)."""
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
     return {

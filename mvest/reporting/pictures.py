@@ -62,7 +62,7 @@ def lighten(path: Path) -> Path:
         about = PngInfo()
         for key, value in image.info.items():
             if isinstance(value, str):
-                about.add_text(key, value)
+                about.add_text(str(key), value)
         dpi = image.info.get("dpi", (100, 100))
         small = image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE)
     return write_atomically(

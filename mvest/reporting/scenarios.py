@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from mvest.errors import InputError
+from mvest.problem.fields import read_case_fields
 from mvest.reporting.case.drawing import (
     ATRIUM,
     BLOOD,
@@ -25,7 +26,6 @@ from mvest.reporting.case.drawing import (
     paint_gap,
     same_scale,
 )
-from mvest.reporting.case.fields import read_case_fields
 from mvest.reporting.style import COLOURS, SMALL, TEXT, plain_axes
 
 Row = Mapping[str, Any]
@@ -46,7 +46,7 @@ def scenarios_figure(
     Parameters
     ----------
     fields : Path
-        As `mvest.reporting.case.fields.read_case_fields` reads it: the frames are the titles of the
+        As `mvest.problem.fields.read_case_fields` reads it: the frames are the titles of the
         scenarios, the fitted shapes the closed valves, NaN where one did not close.
     rows : sequence of mapping
         ``patient``, ``scenario``, ``measure`` and what

@@ -20,9 +20,9 @@ from mvest.external.contract import (
 from mvest.febio.program import read_positions
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
+from mvest.problem.fields import read_case_fields
 from mvest.provenance import write_json
 from mvest.reading.npz import read_npz
-from mvest.reporting.case.fields import read_case_fields
 from mvest.simulation.population import Population, load_population, save_population
 from mvest.valve.io.abaqus.recording import read_recording
 from tests.cases import folders

@@ -7,9 +7,9 @@ import pytest
 
 from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, label_of, record_of_case
+from mvest.problem.fields import read_case_fields
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import ONE_STATE
-from mvest.reporting.case.fields import read_case_fields
 from tests.made_up_closure import TISSUE, made_up_case, settings, use
 
 

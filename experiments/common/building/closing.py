@@ -151,8 +151,8 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     InputError
         If the file cannot be read.
     """
+    from mvest.problem.fields import CaseFields
     from mvest.reporting.case import drawing
-    from mvest.reporting.case.fields import CaseFields
 
     try:
         arrays = read_npz(path)

@@ -19,9 +19,9 @@ from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing import segment_name, voxelise_leaflets, write_segmentation
+from mvest.problem.fields import CaseFields, read_case_fields
 from mvest.reading.bounded import refusing
 from mvest.reading.npz import read_npz
-from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import principal_stretches
 from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface_series

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from mvest.reporting.case.fields import CaseFields
+from mvest.problem.fields import CaseFields
 from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, SIDE, VIEWS, View
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals

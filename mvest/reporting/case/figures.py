@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
+from mvest.problem.fields import CaseFields, read_case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     ATRIUM,
@@ -25,7 +26,6 @@ from mvest.reporting.case.drawing import (
     paint_leak,
     same_scale,
 )
-from mvest.reporting.case.fields import CaseFields, read_case_fields, turn_of
 from mvest.reporting.figures import COLOURS, DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
@@ -126,7 +126,7 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     Parameters
     ----------
     fields : CaseFields or Path
-        A path is read by `mvest.reporting.case.fields.read_case_fields`.
+        A path is read by `mvest.problem.fields.read_case_fields`.
     names : sequence of str
         Of the leaflets, written beside them.
 
@@ -200,7 +200,7 @@ def fitted_figure(fields: Path) -> Figure:
     Parameters
     ----------
     fields : Path
-        As `mvest.reporting.case.fields.read_case_fields` reads it, with the fitted shape and its
+        As `mvest.problem.fields.read_case_fields` reads it, with the fitted shape and its
         distances.
 
     Raises

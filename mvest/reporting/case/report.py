@@ -21,8 +21,8 @@ from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Personalised
+from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord
-from mvest.reporting.case.fields import CaseFields, case_fields
 from mvest.reporting.case.figures import (
     MIDSURFACES,
     case_figure,

@@ -12,8 +12,8 @@ import plotly.graph_objects as go
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from mvest.problem.fields import CaseFields
 from mvest.reporting.case.drawing import BLOOD, TISSUE, gap_corners, gap_of
-from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.case.figures import distance_top
 from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.reporting.markup import shown_text

@@ -24,9 +24,9 @@ from experiments.studies.patient import (
     summary,
 )
 from mvest.errors import InputError
+from mvest.problem.fields import read_case_fields
 from mvest.problem.record import Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
-from mvest.reporting.case.fields import read_case_fields
 from tests.experiments.studies.made_up import SOURCE
 from tests.experiments.studies.made_up_patients import (
     alone,

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.collections import PolyCollection, QuadMesh
 
 from mvest.errors import InputError
+from mvest.problem.fields import read_case_fields
 from mvest.reporting.case.drawing import (
     ATRIUM,
     BLOOD,
@@ -16,7 +17,6 @@ from mvest.reporting.case.drawing import (
     gap_of,
     quartered,
 )
-from mvest.reporting.case.fields import read_case_fields
 from mvest.reporting.case.figures import (
     case_figure,
     distance_top,
