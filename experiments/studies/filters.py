@@ -18,6 +18,7 @@ from experiments.common.building.filters import filter_of
 from experiments.common.building.twin import build_twin
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import Mesh
+from experiments.common.schema import BY_PARAMETER
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -31,6 +32,7 @@ from mvest.estimation.noise import observation_noise
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.transform import Log, to_filter
 from mvest.observation.vertices import observed_frames
+from mvest.quantities import Degree, Length, Logarithm, PointsAlong, PointsAround, Seed, Value
 from mvest.reporting.tables import Column, table
 from mvest.typing import FloatArray
 
@@ -64,15 +66,15 @@ class FilterProblem:
 
     title: str
     parameters: tuple[str, ...]
-    truth: tuple[float, ...]
-    initial: tuple[float, ...]  # prior median
+    truth: tuple[Value, ...]
+    initial: tuple[Value, ...]  # prior median
     # Prior standard deviation of the logarithms.
-    log_std: tuple[Annotated[float, Field(gt=0, le=10)], ...]
-    fixed: dict[str, float] = field(default_factory=dict)  # what is known
-    columns: Annotated[int, Field(ge=3, le=1000)] = 28
-    rows: Annotated[int, Field(ge=2, le=500)] = 8
+    log_std: tuple[Logarithm, ...]
+    fixed: Annotated[dict[str, float], BY_PARAMETER] = field(default_factory=dict)  # known
+    columns: PointsAround = 28
+    rows: PointsAlong = 8
     every: Annotated[int, Field(ge=1, le=100_000)] = 1  # of so many vertices one is seen
-    noise_mm: Annotated[float, Field(gt=0, le=1000)]  # of each coordinate of the closed frame
+    noise_mm: Length  # of each coordinate of the closed frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,9 +83,9 @@ class SurrogateDesign:
 
     surrogate_runs: Annotated[int, Field(ge=1, le=100_000)] = 32
     held_out: Annotated[int, Field(ge=1, le=100_000)] = 8
-    reach: Annotated[float, Field(gt=0, le=10)] = 3.2  # standard deviations of the prior
-    degree: Annotated[int, Field(ge=0, le=20)] = 5  # at most
-    surrogate_seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    reach: Logarithm = 3.2  # standard deviations of the prior
+    degree: Degree = 5  # at most
+    surrogate_seed: Seed = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -50,6 +50,7 @@ from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
 from mvest.problem.problem import Problem
 from mvest.problem.record import EstimateRecord, record_of
+from mvest.quantities import Share
 from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
@@ -145,7 +146,7 @@ class HeartSettings:
     source: Annotated[str | None, Reads(_parts)] = None
     options: ReferenceHeartOptions = field(default_factory=ReferenceHeartOptions)
     # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).
-    closures: dict[str, dict[str, float]] = field(default_factory=dict)
+    closures: dict[str, dict[str, Share]] = field(default_factory=dict)
     gate: tuple[str, ...] = ()  # variations of the gate
     # Of each twin, what its truth has otherwise than the estimator's model (settings of truth).
     twins: dict[str, Any] = field(default_factory=dict)

@@ -24,7 +24,7 @@ from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.processes import side_by_side
 from mvest.provenance import config_hash
-from mvest.quantities import Factor, Length, Logarithm
+from mvest.quantities import Factor, Length, Logarithm, Modulus
 from mvest.reading.npz import check_array, read_npz
 from mvest.simulation.motion import MotionSettings, RefusedError, close_in_motion
 from mvest.typing import FloatArray
@@ -58,7 +58,7 @@ class PopulationSettings:
 
     motion: MotionSettings = field(default_factory=MotionSettings)
     scale: tuple[Factor, Factor] = (1.0, 1.5)
-    moduli: Mapping[str, float] = field(
+    moduli: Mapping[str, Modulus] = field(
         default_factory=lambda: {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
     )
     moduli_spread: Logarithm = 0.35

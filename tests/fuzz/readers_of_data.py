@@ -26,7 +26,7 @@ from mvest.reading.npz import read_npz
 from mvest.simulation.population import Population, load_population, save_population
 from mvest.valve.io.abaqus.recording import read_recording
 from tests.cases import folders
-from tests.experiments.studies.made_up import made_up
+from tests.experiments.studies.made_up import made_up, made_up_estimate
 from tests.fuzz.trial import Reader
 from tests.valve.io import recorded
 
@@ -111,7 +111,7 @@ def fields(folder: Path) -> Path:
 
 
 def record(folder: Path) -> Path:
-    write_record(folder / "result.json", made_up({"estimate": [1.5, 2.0], "std": [0.1, None]}))
+    write_record(folder / "result.json", made_up(estimates=(made_up_estimate(),)))
     return folder / "result.json"
 
 

@@ -13,6 +13,7 @@ from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation.considered_geometry import ConsideredGeometry
 from mvest.personalisation.settings import CaseMesh, PaperSettings, PressureErrors
+from mvest.quantities import Count, Logarithm, Tolerance, Value
 
 __all__ = ["CaseInput", "ImagedInput", "PersonalSettings", "UnknownSettings", "VolumeInput"]
 
@@ -41,8 +42,8 @@ VolumeInput = Annotated[str | None, Reads(_volume)]
 class UnknownSettings:
     """One quantity that is not known of a case: its prior, and what becomes of it."""
 
-    mean: float
-    std: float
+    mean: Value
+    std: Value
     treatment: str = "estimated"  # or considered, or fixed
 
 
@@ -52,9 +53,9 @@ class PersonalSettings:
 
     unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
     mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: float = 2e-3
-    max_iterations: int = 15
-    largest_change: float = 0.2  # of a parameter's logarithm from one equilibrium to the next
+    tolerance: Tolerance = 2e-3
+    max_iterations: Count = 15
+    largest_change: Logarithm = 0.2  # of a parameter's logarithm from one equilibrium to the next
     paper: PaperSettings | None = None
     moduli_only: bool = False  # estimate also with all nuisances fixed
     confirm: bool = False  # close the fitted valve anew from the open one

@@ -9,6 +9,7 @@ from typing import Any
 from mvest.errors import InputError
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE
 from mvest.imaging.volume import Modality
+from mvest.quantities import BeatTime, Count, Pressure, Share, Thickness
 
 LEAFLETS = ("anterior", "posterior")
 """Order of ``thickness_mm``."""
@@ -53,17 +54,17 @@ class ImagedSettings:
 
     model: str | None = None
     modality: str | None = None
-    frame_interval_s: float | None = None
+    frame_interval_s: BeatTime | None = None
     time_unit: str | None = None
     landmarks: tuple[Any, ...] = ()
-    open_frame: int | None = None
-    closed_frame: int | None = None
-    pressure_mmHg: float | None = None
+    open_frame: Count | None = None
+    closed_frame: Count | None = None
+    pressure_mmHg: Pressure | None = None
     pressure_curve: str | None = None
     held_out: tuple[Any, ...] = ()
-    thickness_mm: tuple[float, ...] = ()
-    min_confidence: float = MIN_CONFIDENCE
-    error_samples: int = 200
+    thickness_mm: tuple[Thickness, ...] = ()
+    min_confidence: Share = MIN_CONFIDENCE
+    error_samples: Count = 200
     name: str | None = None
     description: str = ""
     source: str = ""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import read_only
+from mvest.quantities import Count, Factor, within
 from mvest.typing import FloatArray
 
 __all__ = ["Draws", "LogDensity", "SamplerSettings", "draw", "split_r_hat"]
@@ -39,11 +40,11 @@ class SamplerSettings:
         Effective draws of each parameter.
     """
 
-    chains: int = 4
-    walkers: int = 24
-    steps: int = 1500
-    largest_r_hat: float = 1.02
-    least_effective: float = 1000.0
+    chains: Count = 4
+    walkers: Count = 24
+    steps: Count = 1500
+    largest_r_hat: Factor = 1.02
+    least_effective: Annotated[float, within(0, 100_000, "", "draws")] = 1000.0
 
     def __post_init__(self) -> None:
         if self.chains < 2 or self.walkers < 4 or self.steps < 20:
