@@ -182,7 +182,7 @@ READERS = (
     Reader("recording", lambda path: read_recording(path.parent, recorded.NAMES), (deck, frame)),
     Reader("arrays", read_npz, (arrays, packed)),
     Reader("fields", read_case_fields, (fields,)),
-    Reader("record", lambda path: read_record(path, dict), (record,)),
+    Reader("record", read_record, (record,)),
     Reader("plan", lambda path: Plan.read(path.parent), (plan,)),
     Reader("answer", lambda path: read_answer(path.parent, REQUEST),
            (answer("response.json"), answer("observation.csv"), answer("jacobian.csv"))),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from experiments.common.building.closure import mechanics_of
 from experiments.common.progress import PartBar
+from experiments.common.schema import NOT_HASHED
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
@@ -97,9 +98,11 @@ class ImagingSettings:
     detection: TrackingSettings = field(default_factory=TrackingSettings)
     evaluate: bool = True
     held_out: HeldOutSettings
-    processes: Processes = 1
+    processes: Annotated[Processes, NOT_HASHED] = 1
     model: str | None = None  # file or "package": detectors to be tested; null trains them
-    publish_model: bool = False  # make the detectors those that come with the package
+    publish_model: Annotated[bool, NOT_HASHED] = (
+        False  # make the detectors those that come with the package
+    )
 
 
 class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]):

@@ -51,7 +51,7 @@ def test_the_settings_that_name_files_are_found():
         ("volume", "volume"),
         ("volume", "imaged.model"),
         ("volume", "imaged.landmarks"),
-        ("donor", "donor.recording"),
+        ("imported", "donor.recording"),
         ("external", "external.command"),
         ("external", "external.inputs"),
     } <= set(SETTINGS)
@@ -72,6 +72,8 @@ def configuration(study: str, name: str, value: object) -> dict:
     inner = values
     for part in parts:
         inner = inner.setdefault(part, {})
+        if part == "models":  # by any name
+            inner = inner.setdefault("one", {})
     inner[last] = value
     return values
 
@@ -95,7 +97,8 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
         return str(folder), folder / PARTS[0]
     listed = {"imaged.landmarks": [[2, str(file)]], "external.inputs": [str(file)]}
     listed["external.command"] = [sys.executable, f"--mesh={file}"]
-    return listed.get(name, str(file)), file
+    listed["external.python"] = f"{file}:function"
+    return listed.get(name.replace(".models", ""), str(file)), file
 
 
 @pytest.mark.parametrize(("study", "name"), SETTINGS)
