@@ -10,9 +10,10 @@ import meshio
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
+from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
@@ -204,11 +205,26 @@ def run(run):
     # Merged vertices are numbered anew, which two frames must be alike.
     [*((kind, False) for kind in FORMATS), ("stl", True), ("obj objects", True)],
 )
-def test_every_format_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, kind, corresponds):
-    # What is read is tested here, not what a closure would tell of it.
-    monkeypatch.setattr(ClosureModel, "__call__", lambda *_: Prediction.failed("not closed here"))
+def test_every_format_is_read_alike(tmp_path, seen, kind, corresponds):
     # A closed leaflet lies across the annulus' axis: without a table of chordae its own angle round
     # the valve is needed, and an angle about that axis has the wrong period.
+    case, reference = (
+        read_case(write(tmp_path / at, seen, FORMATS[name], Scanner(3), corresponds))
+        for at, name in (("own", kind), ("reference", "vtp"))
+    )
+    assert [frame.corresponds for frame in case.frames] == [True, corresponds]
+    assert len(case.chordae) == 34
+    for one, other in zip(case.frames, reference.frames, strict=True):
+        assert len(one.triangles) == len(other.triangles)
+        nearest = cKDTree(other.vertices).query(one.vertices)[0]
+        # STL and PLY hold single precision.
+        assert nearest.max() < 1e-4
+
+
+@pytest.mark.parametrize(("kind", "corresponds"), [("text ply", False), ("stl", True)])
+def test_a_case_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, kind, corresponds):
+    # What is read is tested here, not what a closure would tell of it.
+    monkeypatch.setattr(ClosureModel, "__call__", lambda *_: Prediction.failed("not closed here"))
     folder = write(tmp_path / "mine", seen, FORMATS[kind], Scanner(3), corresponds)
     status, out, err = run(folder, "check=true", "figures=false")
     assert status == 0, err
