@@ -117,9 +117,12 @@ class Settings:
 
 def run(job: Job[Settings]) -> Result:
     """Compare designs of the configured valve, or those of a virtual patient's frames."""
-    if job.settings.frames is not None and job.settings.patient is not None:
-        return _patient_designs(job, job.settings.frames, job.settings.patient)
-    return _valve_designs(job.values, job.settings.designs)
+    try:
+        if job.settings.frames is not None and job.settings.patient is not None:
+            return _patient_designs(job, job.settings.frames, job.settings.patient)
+        return _valve_designs(job.values, job.settings.designs)
+    except GeometryError as error:
+        return Result(status="failed", reason=str(error))
 
 
 # -- one configured valve -------------------------------------------------------------------------
