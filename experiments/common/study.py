@@ -127,6 +127,11 @@ class Results:
         return next(iter(self.records.values()))
 
     @property
+    def is_empty(self) -> bool:
+        """Whether no record has anything to show: all of them failed early."""
+        return not any(one.tables or one.estimates for one in self.records.values())
+
+    @property
     def table_names(self) -> tuple[str, ...]:
         """Names of the tables of any record."""
         return tuple(dict.fromkeys(name for one in self.records.values() for name in one.tables))

@@ -46,7 +46,7 @@ def write_results(folder: Path, study: Study[Any], results: Results, name: str =
         base,
         results.first.title,
         {part: results.table(part) for part in results.table_names},
-        study.summary(results) if study.summary is not None else None,
+        None if study.summary is None or results.is_empty else study.summary(results),
         list(results.records.values()),
         captions=study.captions,
         latex=study.latex,
@@ -116,11 +116,11 @@ def write_tables(
 def words_of(study: Study[Any], record: Record) -> str:
     """What a finished run says on the terminal: its cautions, numbers and readers' tables."""
     parts = cautions([record])
-    if study.words is not None:
-        return "\n".join([*parts, study.words(record)])
     results = Results({record.experiment: record})
+    if study.words is not None and not results.is_empty:
+        return "\n".join([*parts, study.words(record)])
     tables = {part: results.table(part) for part in results.table_names}
-    if study.summary is not None:
+    if study.summary is not None and not results.is_empty:
         tables = dict(study.summary(results))
     parts += numbers_of(record)
     for part, table in tables.items():
@@ -155,7 +155,7 @@ def provenance_of(records: Sequence[Record]) -> str:
 
 
 def _write_figures(base: Path, study: Study[Any], results: Results) -> list[Path]:
-    if study.figure is None:
+    if study.figure is None or results.is_empty:
         return []
     from mvest.reporting.figures import save_figure_with
 
