@@ -21,8 +21,6 @@ from experiments.runner.jobs.interruption import interruptible
 from mvest import __version__
 from mvest.errors import MvestError
 
-__all__ = ["experiments_in", "main", "quoted"]
-
 COMMANDS = {
     "list": "the experiments, one sentence each",
     "run": "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",

@@ -27,8 +27,6 @@ from mvest.cases import exporting, importing
 from mvest.cases.writer import require_new, write_case
 from mvest.errors import ConfigurationError, MvestError
 
-__all__ = ["Door", "doors", "export_command", "import_command"]
-
 
 @dataclass(frozen=True, slots=True)
 class Door:

@@ -28,8 +28,6 @@ from experiments.runner.plugins import FailedSweepError, register_plugins
 from experiments.runner.tracking.beside import logging_beside
 from mvest.errors import MvestError
 
-__all__ = ["main"]
-
 PRIMARY = "In 'config': "
 """How Hydra begins messages about the primary configuration."""
 

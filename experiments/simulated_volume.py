@@ -35,8 +35,6 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing import checked_path, write_sequence_nrrd
 from mvest.simulation.motion import MotionSettings, close_in_motion
 
-__all__ = ["SimulatedVolumeOptions", "simulate_command", "write_simulated_volume"]
-
 SUFFIX = ".seq.nrrd"
 
 CONFIGURED = ("valve", "mechanics")

@@ -14,8 +14,6 @@ from experiments.sweeps.report import write_sweep
 from mvest.errors import MvestError
 from mvest.reporting.pictures import lighten
 
-__all__ = ["main"]
-
 
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -3,13 +3,8 @@
 import numpy as np
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.case.drawing import (
-    ATRIUM,
-    draw_valve,
-    leaflet_colours,
-    paint_leak,
-    same_scale,
-)
+from mvest.reporting.case.drawing import draw_valve, leaflet_colours, paint_leak, same_scale
+from mvest.reporting.figures import ATRIUM
 
 __all__ = ["draw", "fields_of", "same_scale"]
 

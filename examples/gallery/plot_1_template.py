@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 from drawing import draw, same_scale
 
 import mvest
-from mvest.reporting.case.drawing import ATRIUM, SIDE
+from mvest.reporting.figures import ATRIUM, SIDE
 from mvest.valve.anatomy.dimensions import (
     AnnulusDimensions,
     FreeEdge,

@@ -11,7 +11,7 @@ import numpy as np
 from drawing import draw, same_scale
 
 import mvest
-from mvest.reporting.case.drawing import ATRIUM
+from mvest.reporting.figures import ATRIUM
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import orifice_area
 

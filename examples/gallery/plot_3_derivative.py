@@ -13,7 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 import mvest
-from mvest.reporting.case.drawing import ATRIUM
+from mvest.reporting.figures import ATRIUM
 
 template = mvest.Template()
 tissue = {"anterior": mvest.TissueSettings(2.65), "posterior": mvest.TissueSettings(1.11)}

@@ -17,7 +17,7 @@ from drawing import draw, same_scale
 
 import mvest
 from mvest.personalisation import CaseMesh
-from mvest.reporting.case.drawing import ATRIUM
+from mvest.reporting.figures import ATRIUM
 
 case = mvest.read_case(Path.cwd().parent / "case")
 print(case)

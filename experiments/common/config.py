@@ -61,8 +61,6 @@ from mvest.quantities import (
 )
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
-__all__ = ["hash_of", "is_hashed", "plain", "register", "require_in_range", "without_places"]
-
 GROUP = "study"
 """The configuration group of the studies."""
 

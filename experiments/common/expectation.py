@@ -18,8 +18,6 @@ from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
 
-__all__ = ["TwinExpectation", "noise_words"]
-
 OF_THE_MODEL = ("valve", "mesh", "mechanics", "parameters", "fixed", "guided")
 """Parts of a configuration on which a closure depends, besides where it is computed."""
 

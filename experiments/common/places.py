@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-__all__ = ["ANATOMIES", "CHECKOUT", "CONF", "EXPERIMENTS", "GATE_RECORDS"]
-
 _PACKAGE = Path(__file__).resolve().parent.parent
 
 CHECKOUT = _PACKAGE.parent

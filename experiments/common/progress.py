@@ -16,15 +16,6 @@ from tqdm import tqdm
 from mvest.mechanics.solid import kernels_are_compiled
 from mvest.typing import FloatArray
 
-__all__ = [
-    "TYPICAL_SOLVES",
-    "PartBar",
-    "SolveBar",
-    "announce_compilation",
-    "duration",
-    "say",
-]
-
 SAY = 30.0
 """Seconds between two lines about the pieces of a part where no terminal shows its bar."""
 

@@ -21,23 +21,6 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.files import sha256_of
 from mvest.reading.text import check_words
 
-__all__ = [
-    "BY_PARAMETER",
-    "NOT_HASHED",
-    "InputFile",
-    "Reads",
-    "build",
-    "contents",
-    "hints_of",
-    "marked",
-    "ranges",
-    "require_admissible_values",
-    "require_within",
-    "schema",
-    "with_contents",
-    "without",
-]
-
 T = TypeVar("T")
 
 MAX_ENTRIES, MAX_LETTERS = 10_000, 10_000

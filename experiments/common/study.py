@@ -21,17 +21,6 @@ from mvest.reporting.tables import Table, joined
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "Check",
-    "Job",
-    "Result",
-    "Results",
-    "Study",
-    "load_settings",
-    "load_study",
-    "study_names",
-]
-
 S = TypeVar("S")
 
 Check = Callable[[Mapping[str, Any], Path], str]

@@ -22,8 +22,6 @@ from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.reading.documents import parse_json
 
-__all__ = ["RECORDS", "arrays_of", "publish", "records_of", "regenerate", "write_records"]
-
 RECORDS = "records"
 """Folder of the kept records within the results."""
 

@@ -20,8 +20,6 @@ from mvest.reporting.markup import shown_text
 from mvest.reporting.page import rendered
 from mvest.reporting.pictures import embedded
 
-__all__ = ["REPORT", "write_report"]
-
 REPORT = "report.html"
 
 PICTURE = re.compile(r"^!\[(.*)\]\(([\w-]+)\.png\)$", re.MULTILINE)

@@ -11,8 +11,6 @@ from mvest.errors import InputError, MvestError
 from mvest.problem.record import EstimateRecord
 from mvest.reporting.markup import number
 
-__all__ = ["compared", "main"]
-
 SAME = 1e-5
 """Relative difference of estimates that machines and versions of libraries may make."""
 

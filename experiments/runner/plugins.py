@@ -10,8 +10,6 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-__all__ = ["FailedSweepError", "PlannedSweeper", "register_plugins"]
-
 PLACE = "hydra_plugins.mvest"
 """Where Hydra finds plugins: it takes them from modules of that package only."""
 

@@ -33,8 +33,6 @@ from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.quantities import Gigabytes, Processes, within
 
-__all__ = ["collect_sweep", "run_sweep"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LauncherSettings:

@@ -24,8 +24,6 @@ from mvest.cases.plausibility import doubts, require_plausible
 from mvest.personalisation.gate import gate_case, gate_lines
 from mvest.personalisation.model import build_model
 
-__all__ = ["STUDY", "check_case"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:

@@ -42,8 +42,6 @@ from mvest.typing import FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STUDY", "run_cycle"]
-
 Values = Mapping[str, Any]
 Row = dict[str, Any]
 EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
@@ -330,7 +328,8 @@ def _over_seeds(rows: Sequence[Row]) -> Table:
 
 def figure(results: Results) -> Figure:
     """What sets of frames could tell, beside the estimates if there are any."""
-    from mvest.reporting.style import COLOURS, MARKERS, SMALL, log_axis, panels
+    from mvest.reporting.figures import COLOURS, MARKERS
+    from mvest.reporting.style import SMALL, log_axis, panels
 
     estimated = "estimates" in results.table_names
     drawn, (axes,) = panels(1, 1 + estimated, 4.6)
@@ -350,7 +349,7 @@ def figure(results: Results) -> Figure:
 
 def _draw_estimates(axes: Any, rows: Any) -> None:
     """Errors ± 2 standard deviations, a group for each parameter."""
-    from mvest.reporting.style import COLOURS
+    from mvest.reporting.figures import COLOURS
 
     kinds: list[str] = []
     groups = list(rows.groupby("estimate from", sort=False))

@@ -63,8 +63,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-__all__ = ["STUDY", "run"]
-
 Values = Mapping[str, Any]
 Row = dict[str, Any]
 

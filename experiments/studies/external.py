@@ -38,8 +38,6 @@ from mvest.typing import FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STUDY", "ExternalSettings", "ModelSettings", "Settings"]
-
 Values = Mapping[str, Any]
 
 FITTED = "fitted.csv"
@@ -343,7 +341,8 @@ def check_external(values: Values, folder: Path) -> str:
 
 def figure(results: Results) -> Figure | None:
     """Each parameter, iterate by iterate, with each model."""
-    from mvest.reporting.style import COLOURS, GREY, MARKERS, SMALL, panels
+    from mvest.reporting.figures import COLOURS, MARKERS
+    from mvest.reporting.style import GREY, SMALL, panels
 
     drawn = [one for one in results.first.estimates if one.iterates]
     if not drawn:

@@ -39,8 +39,6 @@ from mvest.typing import FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["REFERENCE", "STUDY"]
-
 Values = Mapping[str, Any]
 
 REFERENCE = "monte_carlo"

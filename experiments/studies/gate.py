@@ -30,8 +30,6 @@ from mvest.valve.measure.passing_ball import largest_passing_ball
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STUDY"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
@@ -197,7 +195,8 @@ def _moments(orifice: FloatArray) -> list[int]:
 
 def _draw_curves(part: Any, values: Mapping[str, Any], moments: list[int], at_rest: bool) -> None:
     """Measures over time, the drawn moments marked; the equilibrium is at no time, so apart."""
-    from mvest.reporting.style import COLOURS, plain_axes
+    from mvest.reporting.figures import COLOURS
+    from mvest.reporting.style import plain_axes
 
     time = np.array(values["time"], dtype=float)
     moving = len(time) - at_rest

@@ -38,12 +38,11 @@ from mvest.imaging.writing import write_sequence_nrrd
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation.error_budget import EVERYTHING
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.skill import generic_guess
+from mvest.problem.skill import GENERIC, generic_guess
 from mvest.problem.stored import Store
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import (
-    GENERIC,
     interval,
     interval_columns,
     moduli_figure,
@@ -68,8 +67,6 @@ from mvest.valve.anatomy.template import Template
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["STUDY", "make_imaged_patient", "run_imaged_patient"]
 
 Values = Mapping[str, Any]
 Made = tuple[ImagedPatient, Probe, VolumeSequence, int]

@@ -68,15 +68,6 @@ from mvest.valve.mesh.structured import layered_wedges
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "DATA_VARIABLE",
-    "DONOR_CITATION",
-    "STUDY",
-    "DonorSettings",
-    "Recorded",
-    "recorded_valve",
-]
-
 Values = Mapping[str, Any]
 
 DATA_VARIABLE = "MVEST_TRIVALVE"

@@ -30,11 +30,10 @@ from experiments.common.schema import build
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
-from mvest.problem.skill import prior_alone, score
+from mvest.problem.skill import GENERIC, prior_alone, score
 from mvest.problem.verdict import TRUSTWORTHY
 from mvest.reading.npz import read_npz
 from mvest.reporting.skill import (
-    GENERIC,
     VERDICTS,
     interval,
     interval_columns,
@@ -53,8 +52,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mvest.problem.fields import CaseFields
-
-__all__ = ["STUDY", "expect_patient", "reveal", "run_patient"]
 
 MANY = POPULATION, CALIBRATION = "population", "calibration"
 """Published tables other than that of the five patients."""
@@ -513,9 +510,9 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    from mvest.reporting.case.drawing import ATRIUM, draw_valve, paint_leak, same_scale
+    from mvest.reporting.case.drawing import draw_valve, paint_leak, same_scale
     from mvest.reporting.case.figures import corner_colours, distance_top
-    from mvest.reporting.figures import DISTANCE_MAP
+    from mvest.reporting.figures import ATRIUM, DISTANCE_MAP
 
     distances = []
     for valve in fields.values():

@@ -35,8 +35,6 @@ from mvest.valve.measure.measurements import ClosureMeasurements, measure_closur
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STUDY", "run_twin"]
-
 LOCKING = (
     "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
     "belong to the mesh, not to the tissue"

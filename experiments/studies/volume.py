@@ -12,8 +12,6 @@ from experiments.common.cases.settings import ImagedInput, PersonalSettings, Vol
 from experiments.common.schema import build
 from experiments.common.study import Job, Result, Study
 
-__all__ = ["STUDY"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:

@@ -20,16 +20,6 @@ from mvest.problem.record import EstimateRecord
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping
 
-__all__ = [
-    "SWEEPS",
-    "Sweep",
-    "SweptJob",
-    "head_of",
-    "read_sweep",
-    "read_sweeps",
-    "write_sweep_file",
-]
-
 SWEEPS = "sweeps"
 """Folder of the published sweeps within the results."""
 

@@ -14,8 +14,6 @@ from experiments.sweeps.collected import Sweep
 from experiments.sweeps.runs import by_setting, runs_of, shortened
 from mvest.errors import InputError
 
-__all__ = ["write_sweep"]
-
 CAPTIONS = {
     "": "Errors and intervals along each factor.",
     "matrix": "Errors over two factors.",

@@ -20,8 +20,6 @@ from mvest.reporting.tables import Column, Table, table
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-__all__ = ["by_setting", "factors_of", "good_of", "is_number", "runs_of", "shortened", "values_of"]
-
 CONVERGED = "converged"
 
 SEED = "seed"

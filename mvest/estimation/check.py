@@ -12,8 +12,6 @@ from mvest.estimation.noise import ObservationNoise
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
-__all__ = ["ApproximationCheck", "check_against_runs", "principal_points", "worst"]
-
 DISTANCE_LIMIT = 0.25
 """Error of a distance of one standard deviation. Twice as far a distance is wrong by about four
 times as much: an end of a 95 % interval by a fifth of the interval."""

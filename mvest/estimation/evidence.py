@@ -38,8 +38,6 @@ from mvest.estimation.noise_family import (
 )
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Evidence", "LearnedNoise", "LearnedQuantity", "NoiseLearner"]
-
 TOLERANCE = 1e-3
 """Slope of the evidence, per standard deviation of the prior, at which it is greatest."""
 

@@ -38,18 +38,6 @@ from mvest.estimation.noise import ObservationNoise, low_rank_noise, stacked_noi
 from mvest.estimation.prediction import read_only, require_finite
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "BANDS",
-    "Basis",
-    "ErrorColumns",
-    "LogNormal",
-    "NoiseBlock",
-    "NoiseFamily",
-    "Spectrum",
-    "matern",
-    "smooth_basis",
-]
-
 MAX_RANK = 500
 """Points by which a smooth part is represented."""
 

@@ -43,8 +43,6 @@ from mvest.estimation.noise import ObservationNoise, low_rank_noise
 from mvest.estimation.prediction import require_finite
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["SampledErrors", "SampledPosterior"]
-
 LEVEL = 0.95
 """Of the intervals that are to be right."""
 

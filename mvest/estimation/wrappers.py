@@ -9,8 +9,6 @@ import numpy as np
 from mvest.estimation.prediction import ObservationModel, Predicted, Prediction, predict
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Remembered", "Restartable", "SharedStart", "of_some"]
-
 State = TypeVar("State")
 
 

@@ -16,8 +16,6 @@ from mvest.problem.estimate import StudyResult
 from mvest.problem.registration import REGISTRATION
 from mvest.typing import FloatArray
 
-__all__ = ["error_budget", "image_share", "narrower"]
-
 BETTER = 5.0
 """How many times as well as beforehand a nuisance may be measured."""
 

@@ -16,8 +16,6 @@ from mvest.problem.estimate import StudyResult
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 
-__all__ = ["ComparedFrames", "compare_frames", "largest_difference_anew", "predicted_frames"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedFrames:

@@ -34,19 +34,6 @@ from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 
-__all__ = [
-    "ConsideredGeometry",
-    "GeometryColumns",
-    "GeometryModes",
-    "closure_at",
-    "displacement",
-    "geometry_columns",
-    "geometry_modes",
-    "observed_change",
-    "of_low_rank",
-    "smooth_modes",
-]
-
 SEEN = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
 

@@ -27,8 +27,6 @@ from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 
-__all__ = ["LAW", "law_columns"]
-
 LAW = "law"
 """What the columns are called."""
 

@@ -23,8 +23,6 @@ from mvest.estimation.sampled import SampledErrors
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 
-__all__ = ["EVERYTHING", "IMAGES", "MOTION", "BudgetRow", "budget_rows", "sample_parts"]
-
 EVERYTHING = "everything"
 """Row of what is not known, all of it; alone, it is nothing but the noise of the frame."""
 

@@ -36,8 +36,6 @@ from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
 
-__all__ = ["CaseEstimation", "OnStep"]
-
 ROUGH = 0.05
 """Relative tolerance of an estimate about which the geometry is linearised."""
 

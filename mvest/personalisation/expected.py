@@ -14,8 +14,6 @@ from mvest.personalisation.estimation import CaseEstimation
 from mvest.problem.estimate import StudyResult
 from mvest.typing import FloatArray
 
-__all__ = ["GeometryShift", "geometry_shifts", "law_share"]
-
 _UNITS = {
     "shape": ("mm", 1.0),
     "annulus": ("mm", 1.0),

@@ -25,8 +25,6 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.triangles import directed_edges
 
-__all__ = ["BLURRED_MM", "SURFACE_MM", "FittedFrames"]
-
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
 

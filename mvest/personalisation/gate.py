@@ -11,8 +11,6 @@ from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.personalisation.model import build_model
 from mvest.personalisation.settings import PersonaliseSettings
 
-__all__ = ["gate_case", "gate_lines"]
-
 
 def gate_case(
     case: ValveCase,

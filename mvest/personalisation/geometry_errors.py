@@ -33,16 +33,6 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
 from mvest.valve.geometry.proximity import closest_points
 
-__all__ = [
-    "GeometryErrors",
-    "WeighedObservation",
-    "errors_of",
-    "frame_errors",
-    "localised_samples",
-    "sample_geometry",
-]
-
-
 FIELD_SHARE = 0.95
 """Of the variance of the field by which samples are localised."""
 

@@ -20,8 +20,6 @@ from mvest.problem.problem import Observed
 from mvest.problem.verdict import APPROXIMATION, Held, Indications
 from mvest.typing import FloatArray
 
-__all__ = ["indications_of"]
-
 NEIGHBOURS = 6
 """Of a point that was seen, as on a surface of triangles."""
 SAME_MM = 0.5

@@ -19,8 +19,6 @@ from mvest.personalisation.observation_errors import ObservationErrors
 from mvest.problem.problem import Observed
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["JointPosterior", "damped_step"]
-
 T = TypeVar("T")
 
 TRIALS = 4

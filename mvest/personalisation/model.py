@@ -19,8 +19,6 @@ from mvest.valve.anatomy.band import Band
 from mvest.valve.mesh.given import GivenValve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["build_coarse", "build_model", "frames_model", "held_state", "with_pressures"]
-
 
 def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> PersonaliseSettings:
     """The settings with the pressures' errors among the unknowns, where a case has several frames.

@@ -41,8 +41,6 @@ from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 
-__all__ = ["ObservationErrors"]
-
 KNOWN = "what is considered"
 """Name of all columns whose size is not learned."""
 

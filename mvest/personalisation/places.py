@@ -15,8 +15,6 @@ from mvest.personalisation.observation_errors import ObservationErrors
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 
-__all__ = ["CaseClosure", "Place"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaseClosure:

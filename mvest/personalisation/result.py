@@ -17,8 +17,6 @@ from mvest.problem.estimate import StudyResult
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["FrameDistance", "Personalised"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDistance:

@@ -21,8 +21,6 @@ from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth
 from mvest.typing import FloatArray
 
-__all__ = ["Modulus", "StudyResult", "estimate"]
-
 
 @dataclass(frozen=True, slots=True)
 class Modulus:

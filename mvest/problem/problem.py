@@ -15,8 +15,6 @@ from mvest.estimation.transform import Transform
 from mvest.mechanics.settings import TissueSettings
 from mvest.typing import FloatArray
 
-__all__ = ["Observed", "Problem"]
-
 
 class Observed(Protocol):
     """What an estimation needs of an observation, whatever its kind."""

@@ -23,21 +23,6 @@ from mvest.problem.registration import unit_of
 from mvest.problem.verdict import NONE, Verdict
 from mvest.typing import FloatArray
 
-__all__ = [
-    "Confounded",
-    "EstimateRecord",
-    "FrameFit",
-    "Innovation",
-    "Numbers",
-    "Row",
-    "Spread",
-    "Unknown",
-    "confounded",
-    "finite",
-    "record_of",
-    "spread",
-]
-
 Numbers = tuple[float | None, ...]
 Row = Mapping[str, Any]
 

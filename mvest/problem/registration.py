@@ -22,8 +22,6 @@ from mvest.mechanics.parameters import KINDS
 from mvest.quantities import within
 from mvest.typing import FloatArray
 
-__all__ = ["REGISTRATION", "RegisteredModel", "displace", "range_of", "registration_of", "unit_of"]
-
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
 """Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
 

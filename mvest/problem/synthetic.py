@@ -13,8 +13,6 @@ from mvest.observation.errors import ObservationError, SpatialCorrelation, obser
 from mvest.observation.vertices import FRAMES, Observation, require_frames, select_frames
 from mvest.typing import FloatArray
 
-__all__ = ["Truth", "TwinData", "simulate_observation"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:

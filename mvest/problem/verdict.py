@@ -17,21 +17,6 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-__all__ = [
-    "APPROXIMATION",
-    "DOUBTFUL",
-    "NONE",
-    "ONE_STATE",
-    "TRUSTWORTHY",
-    "Ground",
-    "Held",
-    "Indications",
-    "Trust",
-    "Verdict",
-    "judge",
-]  # fmt: skip
-
-
 Trust: TypeAlias = Literal["trustworthy", "doubtful", "none"]
 """How far an estimate may be believed; of ``none`` no number is stated."""
 

@@ -20,18 +20,6 @@ from mvest.files import write_atomically
 from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray
 
-__all__ = [
-    "ATRIUM",
-    "COLOURS",
-    "LEAFLET_COLOURS",
-    "MARKERS",
-    "SIDE",
-    "VIEWS",
-    "View",
-    "iterates_figure",
-    "save_figure_with",
-]
-
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008)."""
 

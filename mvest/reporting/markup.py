@@ -11,19 +11,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = [
-    "MISSING",
-    "ended",
-    "latex_rows",
-    "latex_text",
-    "listed",
-    "markdown_rows",
-    "markdown_text",
-    "number",
-    "shown_text",
-    "with_std",
-]
-
 MISSING = "–"
 
 ACTING = re.compile(

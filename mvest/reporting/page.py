@@ -10,8 +10,6 @@ from markupsafe import Markup
 
 from mvest.reporting.markup import shown_text
 
-__all__ = ["TEMPLATES", "rendered"]
-
 TEMPLATES = Path(__file__).parent / "templates"
 
 LONGEST = 1000

@@ -14,8 +14,6 @@ from PIL.PngImagePlugin import PngInfo
 from mvest.errors import InputError
 from mvest.files import write_atomically
 
-__all__ = ["embedded", "lighten"]
-
 WIDEST_PIXELS = 1500
 """Two for each pixel of a page's column."""
 WEBP_QUALITY = 85

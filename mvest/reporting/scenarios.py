@@ -17,7 +17,6 @@ from matplotlib.patches import Patch
 from mvest.errors import InputError
 from mvest.problem.fields import read_case_fields
 from mvest.reporting.case.drawing import (
-    ATRIUM,
     BLOOD,
     TISSUE,
     draw_valve,
@@ -26,7 +25,8 @@ from mvest.reporting.case.drawing import (
     paint_gap,
     same_scale,
 )
-from mvest.reporting.style import COLOURS, SMALL, TEXT, plain_axes
+from mvest.reporting.figures import ATRIUM, COLOURS
+from mvest.reporting.style import SMALL, TEXT, plain_axes
 
 Row = Mapping[str, Any]
 

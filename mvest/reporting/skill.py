@@ -13,18 +13,6 @@ from mvest.reporting.tables import Column, Table, table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "GENERIC",
-    "VERDICTS",
-    "interval",
-    "interval_columns",
-    "moduli_figure",
-    "skill_table",
-    "stated",
-    "trust_of",
-    "verdict_table",
-]
-
 VERDICTS = (TRUSTWORTHY, DOUBTFUL, NONE)
 COLOURS = {TRUSTWORTHY: "#2b6ca3", DOUBTFUL: "#d08a2e", NONE: "#a9a9a9", "": "0.2"}
 """Of verdicts in figures."""

@@ -13,25 +13,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from mvest.reporting.figures import COLOURS, MARKERS
-
-__all__ = [
-    "BAD",
-    "COLOURS",
-    "GOOD",
-    "GREY",
-    "MARKERS",
-    "SEQUENTIAL",
-    "SMALL",
-    "TEXT",
-    "WIDTH",
-    "headline",
-    "levels",
-    "log_axis",
-    "panels",
-    "plain_axes",
-    "plain_number",
-]
+from mvest.reporting.figures import COLOURS
 
 WIDTH = 8.3
 """Inches."""

@@ -19,9 +19,6 @@ from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Column", "Table", "joined", "table"]
-
-
 WIDTH, MOST_BESIDE = 100, 5
 """Characters of a line of a terminal, and rows that a terminal shows beside each other."""
 

@@ -17,14 +17,6 @@ from mvest.simulation.virtual_patient import Deviations, PatientSimulation, draw
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
 
-__all__ = [
-    "EchoSettings",
-    "PatientSettings",
-    "draw_patient_values",
-    "first_that_closes",
-    "require_patient",
-]
-
 T = TypeVar("T")
 
 

@@ -25,17 +25,6 @@ from mvest.valve.mesh.structured import structured_mesh
 if TYPE_CHECKING:
     from mvest.valve.mesh.given import GivenValve
 
-__all__ = [
-    "Anatomy",
-    "ValveFolder",
-    "anatomy_of",
-    "build_mesh",
-    "folder_hash",
-    "guide_of",
-    "template_of",
-    "upright",
-]
-
 Values = Mapping[str, Any]
 Anatomy: TypeAlias = "Template | GivenValve"
 

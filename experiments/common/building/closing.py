@@ -24,8 +24,6 @@ from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.solid_mesh import embed
 
-__all__ = ["Closing", "close_valve", "draw_closing"]
-
 COLUMNS = {
     "time": "s:.2f",
     "pressure": "mmHg:.0f",
@@ -153,6 +151,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     """
     from mvest.problem.fields import CaseFields
     from mvest.reporting.case import drawing
+    from mvest.reporting.figures import ATRIUM, View
 
     try:
         arrays = read_npz(path)
@@ -175,16 +174,16 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
         )
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
-    posterior = drawing.View("seen from the posterior side", 8.0, -90.0)
+    posterior = View("seen from the posterior side", 8.0, -90.0)
     panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35])
     colours, last = drawing.leaflet_colours(valve.region), len(shapes) - 1
     for column, (k, title) in zip(panels.T, steps.items(), strict=True):
-        for view, axes in zip((drawing.ATRIUM, posterior), column, strict=True):
+        for view, axes in zip((ATRIUM, posterior), column, strict=True):
             shown = view is posterior
             drawing.draw_valve(axes, valve, shapes[k], colours, view, k, chords=shown)
         column[0].set_title(title, fontsize=10)
     drawing.paint_leak(panels[0, -1], valve, shapes[last], last)
     drawing.name_leaflets(panels[0, 0], valve, names)
     drawn = [shapes[k] for k in steps]
-    drawing.same_scale(list(panels[0]), drawn, drawing.ATRIUM)
+    drawing.same_scale(list(panels[0]), drawn, ATRIUM)
     drawing.same_scale(list(panels[1]), [*drawn, *(valve.tips[k] for k in steps)], posterior)

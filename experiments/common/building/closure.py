@@ -13,8 +13,6 @@ from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import REFERENCE, GateCase, vary
 from mvest.mechanics.settings import MechanicsSettings
 
-__all__ = ["closure_model", "mechanics_of", "mesh_store"]
-
 Values = Mapping[str, Any]
 
 

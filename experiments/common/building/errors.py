@@ -17,8 +17,6 @@ from mvest.observation.errors import (
 )
 from mvest.valve.anatomy.valve import LeafletSurface
 
-__all__ = ["Correlations", "observation_errors"]
-
 Values = Mapping[str, Any]
 
 

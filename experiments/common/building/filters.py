@@ -15,8 +15,6 @@ from mvest.mechanics.parameters import is_positive
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
-__all__ = ["as_numbers", "build_filter", "filter_of", "require_one_each"]
-
 Values = Mapping[str, Any]
 
 

@@ -17,8 +17,6 @@ from mvest.errors import ConfigurationError
 from mvest.reporting.tables import Table, table
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
-__all__ = ["anatomy_digest", "gate_cases", "gate_of", "gate_rows"]
-
 
 def gate_cases(names: Sequence[str]) -> tuple[GateCase, ...]:
     """The variations of these names.

@@ -26,8 +26,6 @@ from mvest.simulation.drawn_patient import (
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
 
-__all__ = ["PatientPlace", "make_patient"]
-
 Values = Mapping[str, Any]
 
 HIDDEN, POSITIONS = "hidden.json", "positions.npz"

@@ -14,8 +14,6 @@ from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.stored import Extrapolated, Store, StoredModel
 
-__all__ = ["MADE_BY", "build_truth", "truth_mechanics", "truth_mesh"]
-
 Values = Mapping[str, Any]
 
 

@@ -34,8 +34,6 @@ from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 
-__all__ = ["Twin", "build_twin"]
-
 Values = Mapping[str, Any]
 
 

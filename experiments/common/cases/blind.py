@@ -35,17 +35,6 @@ from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 
-__all__ = [
-    "ESTIMATE",
-    "SECRET",
-    "estimate_blindly",
-    "estimated_or_reason",
-    "main",
-    "read_estimate",
-    "seal",
-    "write_estimate",
-]
-
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
 

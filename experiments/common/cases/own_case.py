@@ -47,18 +47,6 @@ from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 from mvest.reporting.expectation import expectation_text
 
-__all__ = [
-    "case_result",
-    "case_words",
-    "expect_own",
-    "find_valve",
-    "read_configured",
-    "run_case",
-    "run_volume",
-    "settings_of",
-    "write_report",
-]
-
 Values = Mapping[str, Any]
 
 TYPICAL_SOLVES = 8

@@ -15,8 +15,6 @@ from mvest.personalisation.considered_geometry import ConsideredGeometry
 from mvest.personalisation.settings import CaseMesh, PaperSettings, PressureErrors
 from mvest.quantities import Count, Logarithm, Tolerance, Value
 
-__all__ = ["CaseInput", "ImagedInput", "PersonalSettings", "UnknownSettings", "VolumeInput"]
-
 
 def _case(value: str, _beside: Mapping[str, Any]) -> Any:
     # Where no case is read this is not either.

@@ -24,29 +24,6 @@ if TYPE_CHECKING:
     from experiments.common.study import Result
     from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = [
-    "FAILED_GATE",
-    "FIELDS",
-    "NOT_GATED",
-    "PASSED_GATE",
-    "VERSION",
-    "GitState",
-    "Mesh",
-    "Model",
-    "Number",
-    "Provenance",
-    "Record",
-    "Status",
-    "has_passed",
-    "here_and_now",
-    "model_of_values",
-    "read_record",
-    "record_from",
-    "sealed_record",
-    "stamp",
-    "write_record",
-]
-
 VERSION = 3
 """Of the layout of a record."""
 

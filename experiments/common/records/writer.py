@@ -17,8 +17,6 @@ from mvest.files import write_atomically
 from mvest.reporting.markup import markdown_text
 from mvest.reporting.tables import Table
 
-__all__ = ["cautions", "provenance_of", "words_of", "write_results", "write_tables"]
-
 LONGEST = 60
 """Rows of a table that a page shows; a longer one is named as a file."""
 

@@ -25,8 +25,6 @@ from mvest.errors import InputError
 from mvest.provenance import config_hash, require_sealed, sealed
 from mvest.reading.documents import parse_json
 
-__all__ = ["ENDS", "NOT_RUN", "End", "collect", "overheads", "read_ends"]
-
 NOT_COMMON = ("factors", "paths", "tracking", "sweep")
 """Settings that jobs do not have in common, or that belong to a machine or the runner."""
 

@@ -12,8 +12,6 @@ from typing import Any
 
 from experiments.common.records.record import Record
 
-__all__ = ["metrics", "parameters", "short_names"]
-
 Values = Mapping[str, Any]
 
 NOT_COMPARED = (

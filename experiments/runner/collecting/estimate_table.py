@@ -21,8 +21,6 @@ from mvest.problem.record import EstimateRecord
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["COLUMNS", "estimate_table", "sweep_table", "write_estimates"]
-
 TYPES = {"text": "string", "integer": "Int64", "number": "float64", "truth value": "boolean"}
 
 COLUMNS: dict[str, tuple[str, str, str]] = {

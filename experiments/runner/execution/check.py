@@ -11,8 +11,6 @@ from experiments.common.study import load_study
 from experiments.runner.tracking.store import require_no_password
 from mvest.errors import ConfigurationError
 
-__all__ = ["expected_memory_gb", "require_admissible", "require_room"]
-
 BASE_GB = 0.4
 """Of a job on the smallest mesh, its libraries included."""
 

@@ -16,8 +16,6 @@ from experiments.runner.jobs.folder import FailedRunError, result_time
 from experiments.runner.planning.plan import Plan, PlannedJob
 from mvest.errors import ConfigurationError, MvestError
 
-__all__ = ["Shard", "drain_here", "drain_inline", "drain_shard"]
-
 
 @dataclass(frozen=True, slots=True)
 class Shard:

@@ -37,8 +37,6 @@ from mvest.errors import ConfigurationError
 from mvest.processes import Program
 from mvest.provenance import THREAD_VARIABLES
 
-__all__ = ["StoppedError", "WorkerProcess", "new_worker", "run_apart"]
-
 WORKER = (sys.executable, "-m", "experiments.runner.execution.worker")
 """Command of a process that runs jobs."""
 

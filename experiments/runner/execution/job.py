@@ -40,8 +40,6 @@ from mvest.files import write_atomically
 from mvest.provenance import write_json
 from mvest.reading.text import one_line
 
-__all__ = ["FailedRunError", "compute", "run_job"]
-
 
 def run_job(request: Request) -> None:
     """Run a job in this process, unless it is done.

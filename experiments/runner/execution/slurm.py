@@ -26,8 +26,6 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import write_json
 from mvest.reading.documents import read_json
 
-__all__ = ["Submission", "record_dead", "submit", "submitted", "under_way", "wait_for"]
-
 WORDS = {
     "OUT_OF_MEMORY": "it ran out of memory (hydra.launcher.mem_gb)",
     "TIMEOUT": "it ran out of time (hydra.launcher.timeout_min)",

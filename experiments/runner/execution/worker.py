@@ -20,14 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from experiments.runner.execution.check import require_room
-from experiments.runner.execution.job import FailedRunError, compute
-from experiments.runner.jobs.folder import LOG
+from experiments.runner.execution.job import compute
+from experiments.runner.jobs.folder import LOG, FailedRunError
 from experiments.runner.jobs.interruption import raised
 from experiments.runner.jobs.limits import MEMORY_LIMIT, held_memory
 from experiments.runner.jobs.request import Request
 from mvest.errors import MvestError
-
-__all__ = ["answer", "main"]
 
 PREFERRED_VICTIM = "500"
 """Added to the badness by which Linux chooses whom to kill when memory runs out."""

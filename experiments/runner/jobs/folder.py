@@ -21,27 +21,6 @@ from mvest.errors import InputError
 from mvest.files import remove_parts
 from mvest.provenance import write_json
 
-__all__ = [
-    "CONFIG",
-    "LOG",
-    "RESULT",
-    "FailedRunError",
-    "clear",
-    "computed_record",
-    "finished_record",
-    "is_done",
-    "last_record",
-    "lock",
-    "make_way",
-    "mark_done",
-    "nothing_empty",
-    "read_result",
-    "require_writable",
-    "result_time",
-    "unwritten",
-    "write_failure",
-]
-
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
 """Files of a job: its marker, its record, its configuration, what it said, who is at work."""
 

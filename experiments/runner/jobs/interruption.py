@@ -12,8 +12,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import ParamSpec
 
-__all__ = ["Interruption", "interruptible", "raised"]
-
 P = ParamSpec("P")
 
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

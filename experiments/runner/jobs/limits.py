@@ -16,8 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["MEMORY_LIMIT", "TIME_LIMIT_S", "HeldMemory", "default_memory_gb", "held_memory"]
-
 MEMORY_LIMIT = "memory_limit_gb"
 """The setting, and what stands beside a request in what a process that runs jobs reads."""
 

@@ -13,8 +13,6 @@ from omegaconf import DictConfig
 
 from experiments.common.config import hash_of, is_hashed, plain, require_in_range
 
-__all__ = ["Request", "as_published", "publish_as"]
-
 
 @dataclass(frozen=True, slots=True)
 class Request:

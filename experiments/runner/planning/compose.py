@@ -28,8 +28,6 @@ from experiments.runner.jobs.request import Request, as_published, publish_as
 from experiments.runner.planning.plan import Attempt, Plan, PlannedJob
 from mvest.errors import ConfigurationError
 
-__all__ = ["expand", "grids", "make_plan", "plan_run"]
-
 HASH_DIGITS = 16
 """Digits of its hash by which a job's folder is named."""
 

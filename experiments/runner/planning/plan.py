@@ -24,8 +24,6 @@ from mvest.provenance import git_state, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
-__all__ = ["PLAN", "Plan", "PlannedJob"]
-
 PLAN = "plan.json"
 """File in a sweep's folder with the jobs that it consists of."""
 

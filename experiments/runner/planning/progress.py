@@ -12,8 +12,6 @@ from experiments.common.progress import duration
 from experiments.runner.jobs.folder import last_record, result_time
 from experiments.runner.planning.plan import Plan, PlannedJob
 
-__all__ = ["SweepBar"]
-
 LOOK = 0.5
 """Seconds between two looks at the folders of a sweep."""
 

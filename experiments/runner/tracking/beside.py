@@ -17,8 +17,6 @@ from experiments.runner.tracking.upload import REMEDY, is_due, track_job
 from mvest.errors import MvestError
 from mvest.processes import Program
 
-__all__ = ["logging_beside", "main"]
-
 LOGGING = "experiments.runner.tracking.beside"
 """Module that the other process runs."""
 

@@ -33,8 +33,6 @@ from mvest.processes import Program
 from mvest.quantities import within
 from mvest.reading.documents import read_mapping
 
-__all__ = ["Comparison", "allowed_hosts", "last_comparison", "main", "serving"]
-
 MAX_COMPARED = 100
 """Runs that MLflow's comparison of runs can show: it reads them one by one."""
 

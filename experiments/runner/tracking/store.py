@@ -22,16 +22,6 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
     from mlflow.tracking import MlflowClient
 
-__all__ = [
-    "Store",
-    "TrackingError",
-    "first_line",
-    "load_client",
-    "open_store",
-    "require_no_password",
-    "telling",
-]
-
 MANNERS = {
     # A server that is away is given up after seconds, not MLflow's minutes: nothing is lost.
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",

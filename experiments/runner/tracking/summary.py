@@ -11,8 +11,6 @@ from experiments.runner.tracking.store import Store, telling
 from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import write_atomically
 
-__all__ = ["IS_SWEEP", "SWEEP", "TABLE", "log_summary"]
-
 SWEEP, TABLE = "sweep.json", "jobs.parquet"
 """Files in a sweep's folder: its results, and all its jobs as a table."""
 

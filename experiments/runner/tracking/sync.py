@@ -22,8 +22,6 @@ from experiments.runner.tracking.upload import REMEDY, is_complete, is_tracked, 
 from mvest.errors import InputError, MvestError
 from mvest.reading.documents import read_mapping
 
-__all__ = ["jobs_in", "log_sweep", "main", "open_early"]
-
 MANY = 1000
 """Jobs of a sweep above which each is a run of its own only where that is asked for."""
 

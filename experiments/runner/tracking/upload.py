@@ -23,17 +23,6 @@ from mvest.errors import InputError, MvestError
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 
-__all__ = [
-    "NO_SWEEP",
-    "RECEIPT",
-    "REMEDY",
-    "is_complete",
-    "is_due",
-    "is_tracked",
-    "track_job",
-    "upload",
-]
-
 RECEIPT = "tracked.json"
 """File in a job's folder that says as which run its result was uploaded."""
 

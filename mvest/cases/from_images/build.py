@@ -29,8 +29,6 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 from mvest.valve.geometry.triangles import unit_rows
 
-__all__ = ["CaseTexts", "case_of_sequence"]
-
 UNSEEN_STD_MM = 10.0
 """Standard deviation of a vertex whose error was never measured: it is given no weight."""
 

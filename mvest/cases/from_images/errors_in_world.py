@@ -15,8 +15,6 @@ from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
-__all__ = ["samples_in_world", "valve_axes", "without_expected_error"]
-
 
 def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
     """Axes of the valve in a frame, the columns of ``(3, 3)``, in which errors are measured."""

@@ -22,8 +22,6 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import share_within
 from mvest.typing import FloatArray
 
-__all__ = ["coverage", "error_at_shape", "expected_error", "in_mirror"]
-
 PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
 """Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
 

@@ -21,8 +21,6 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing import segment_name, voxelise_leaflets, write_segmentation
 from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface
 
-__all__ = ["write_for_slicer", "write_landmarks", "write_surfaces"]
-
 
 def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -> Path:
     """Write the valve of every frame for ParaView and 3D Slicer; returns the index.

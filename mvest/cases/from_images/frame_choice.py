@@ -12,8 +12,6 @@ from mvest.cases.from_images.measures import Row, closed_frame
 from mvest.errors import InputError
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 
-__all__ = ["CaseFrames", "choose_frames"]
-
 
 @dataclass(frozen=True, slots=True)
 class CaseFrames:

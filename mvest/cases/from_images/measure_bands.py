@@ -14,8 +14,6 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 from mvest.valve.measure.clinical import annulus_and_tips
 
-__all__ = ["BANDED", "with_bands"]
-
 BANDED = (
     "ap_diameter_mm",
     "commissural_diameter_mm",

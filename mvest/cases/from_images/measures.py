@@ -23,18 +23,6 @@ from mvest.valve.measure.clinical import (
     clinical_names,
 )
 
-__all__ = [
-    "BOUNDS",
-    "OPEN_SHARE",
-    "closed_frame",
-    "contact_distance",
-    "is_open",
-    "leaflets_of",
-    "measure_meaning",
-    "measure_sequence",
-    "write_measures",
-]
-
 Row: TypeAlias = dict[str, float | None]
 
 OPEN_SHARE = 0.1

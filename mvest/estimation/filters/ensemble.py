@@ -18,8 +18,6 @@ from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
-__all__ = ["EnsembleFilter", "exact_ensemble"]
-
 KINDS = ("square_root", "perturbed")
 
 

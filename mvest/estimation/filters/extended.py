@@ -14,8 +14,6 @@ from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
-__all__ = ["ExtendedFilter"]
-
 
 @dataclass(frozen=True, slots=True)
 class ExtendedFilter:

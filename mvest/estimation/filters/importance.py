@@ -19,8 +19,6 @@ from mvest.estimation.run import FilterRun, by_filter
 from mvest.estimation.transform import Transform
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["ImportanceFilter"]
-
 K_HAT_LIMIT = 0.7
 """Shape of the weights' tail above which their mean is not to be trusted (Vehtari et al. 2024)."""
 

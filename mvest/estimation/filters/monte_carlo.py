@@ -27,8 +27,6 @@ from mvest.estimation.run import FilterRun, by_filter
 from mvest.estimation.transform import Transform
 from mvest.typing import FloatArray
 
-__all__ = ["MonteCarloFilter", "log_posterior"]
-
 FURTHEST = 4.5
 """Prior standard deviations beyond which no region reaches."""
 

@@ -14,8 +14,6 @@ from mvest.estimation.prediction import read_only
 from mvest.quantities import Count, Factor, within
 from mvest.typing import FloatArray
 
-__all__ = ["Draws", "LogDensity", "SamplerSettings", "draw", "split_r_hat"]
-
 LogDensity: TypeAlias = Callable[[FloatArray], FloatArray]
 """Logarithm of a density, up to a constant, at many points (k, p), as (k,); −inf where it is 0."""
 

@@ -22,8 +22,6 @@ from mvest.errors import InputError
 from mvest.estimation.noise import ObservationNoise
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["Misfit", "Region", "Surrogate", "affordable_degree", "fit_surrogate"]
-
 Misfit: TypeAlias = Callable[[FloatArray], FloatArray]
 """½ (y − h)ᵀ R⁻¹ (y − h) of each of many points (k, p), as (k,)."""
 

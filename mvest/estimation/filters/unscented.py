@@ -18,8 +18,6 @@ from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
-__all__ = ["UnscentedFilter", "simplex_points"]
-
 
 @dataclass(frozen=True, slots=True)
 class UnscentedFilter:

@@ -21,8 +21,6 @@ from mvest.estimation.noise import NoiseCovariance, observation_noise
 from mvest.estimation.prediction import require_finite
 from mvest.typing import FloatArray
 
-__all__ = ["Design", "together"]
-
 NOISE_RANGE = (1e-6, 1e6)
 """Times the unit of the observation, between which a needed noise is looked for."""
 

@@ -12,17 +12,6 @@ from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
 from mvest.typing import FloatArray
 
-__all__ = [
-    "Correlogram",
-    "correlogram",
-    "fitted_length",
-    "matern",
-    "measure_accuracy",
-    "share_within",
-    "unlike_share",
-    "widened",
-]
-
 BIN_MM = 1.0
 """mm, width of the bins of distances."""
 

@@ -15,8 +15,6 @@ from mvest.imaging.learning.tree_text import checked_trees
 from mvest.quantities import Count, Processes, Share
 from mvest.typing import FloatArray
 
-__all__ = ["BoostSettings", "Boosters", "train_boosters"]
-
 
 @dataclass(frozen=True, slots=True)
 class BoostSettings:

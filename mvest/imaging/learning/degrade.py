@@ -14,8 +14,6 @@ from scipy import ndimage
 
 from mvest.imaging.volume import VolumeSequence
 
-__all__ = ["degrade"]
-
 SHARE = 0.5
 """Of the volumes that are changed at all, and of each change among those."""
 

@@ -14,8 +14,6 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.truth import TrueValve
 from mvest.typing import FloatArray
 
-__all__ = ["FrameErrors", "best_threshold", "frame_errors", "surface_distances"]
-
 FINER = 4
 """Times as many points as vertices in each direction stand for a surface."""
 

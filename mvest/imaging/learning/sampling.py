@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["SamplePattern", "directions", "features"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SamplePattern:

@@ -45,22 +45,6 @@ from mvest.processes import side_by_side
 from mvest.quantities import Count
 from mvest.typing import FloatArray
 
-__all__ = [
-    "Draft",
-    "RenderedFrame",
-    "SampleCounts",
-    "Sampled",
-    "Samples",
-    "TrainingSettings",
-    "draft_of",
-    "draw_samples",
-    "render_frame",
-    "samples_of",
-    "train_model",
-    "train_stage",
-    "volume_samples",
-]
-
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
 

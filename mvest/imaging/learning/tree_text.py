@@ -12,8 +12,6 @@ from typing import Final
 
 from mvest.errors import InputError
 
-__all__ = ["checked_trees"]
-
 END: Final = "end of trees\n"
 OBJECTIVES: Final = ("regression", "binary sigmoid:1", "cross_entropy")
 FIXED: Final = {

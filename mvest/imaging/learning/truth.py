@@ -10,8 +10,6 @@ from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.typing import FloatArray
 
-__all__ = ["Misses", "TrueValve", "missed_poses", "missed_shapes"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueValve:

@@ -14,31 +14,11 @@ from matplotlib.collections import PolyCollection
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, SIDE, VIEWS, View
+from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, View
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane
 from mvest.valve.measure.coaptation import Gap, find_gap
-
-__all__ = [
-    "ATRIUM",
-    "BLOOD",
-    "LINE_PIECES",
-    "SIDE",
-    "TISSUE",
-    "UNSEEN",
-    "VIEWS",
-    "View",
-    "draw_valve",
-    "gap_corners",
-    "gap_of",
-    "leaflet_colours",
-    "name_leaflets",
-    "paint_gap",
-    "paint_leak",
-    "quartered",
-    "same_scale",
-]
 
 BLOOD = (0.70, 0.05, 0.10)
 """Of a gap."""

@@ -16,17 +16,14 @@ from mvest.errors import InputError
 from mvest.problem.fields import CaseFields, read_case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
-    ATRIUM,
-    SIDE,
     UNSEEN,
-    VIEWS,
     draw_valve,
     leaflet_colours,
     name_leaflets,
     paint_leak,
     same_scale,
 )
-from mvest.reporting.figures import COLOURS, DISTANCE_MAP
+from mvest.reporting.figures import ATRIUM, COLOURS, DISTANCE_MAP, SIDE, VIEWS
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 

@@ -19,8 +19,6 @@ from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["CaseView", "case_view", "small"]
-
 DECIMALS = 2
 """Positions are stored to 0.01 mm, a fiftieth of what is seen of a valve."""
 ELEMENT = "valve"

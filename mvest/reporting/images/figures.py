@@ -12,24 +12,9 @@ from matplotlib.figure import Figure
 from mvest.errors import InputError
 from mvest.imaging.learning.accuracy import matern
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE
-from mvest.reporting.style import (
-    COLOURS,
-    GREY,
-    MARKERS,
-    SEQUENTIAL,
-    SMALL,
-    headline,
-    log_axis,
-    panels,
-    plain_axes,
-)
+from mvest.reporting.figures import COLOURS, MARKERS
+from mvest.reporting.style import GREY, SEQUENTIAL, SMALL, headline, log_axis, panels, plain_axes
 from mvest.typing import FloatArray
-
-__all__ = [
-    "confidence_figure",
-    "errors_figure",
-    "measures_figure",
-]
 
 Row = Mapping[str, Any]
 

@@ -28,8 +28,6 @@ from mvest.reporting.images.planes import (
 from mvest.reporting.style import headline
 from mvest.typing import FloatArray
 
-__all__ = ["LEAFLETS", "chosen_frames", "montage_figure"]
-
 LEAFLETS = LEAFLET_COLOURS[:2]
 """Of the anterior and the posterior leaflet."""
 TIP, ANNULUS = "#F0E442", "white"

@@ -17,16 +17,6 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.geometry.proximity import plane_section
 
-__all__ = [
-    "COLUMNS",
-    "STEP_MM",
-    "SlicePlane",
-    "leaflet_contours",
-    "near",
-    "resample",
-    "valve_planes",
-]
-
 COLUMNS = ("commissural", "anteroposterior", "at the annulus", "at the free edge")
 """Planes of `valve_planes`, in their order: two along the valve's axis and two across."""
 

@@ -8,15 +8,7 @@ from matplotlib.collections import PolyCollection, QuadMesh
 
 from mvest.errors import InputError
 from mvest.problem.fields import read_case_fields
-from mvest.reporting.case.drawing import (
-    ATRIUM,
-    BLOOD,
-    LINE_PIECES,
-    SIDE,
-    TISSUE,
-    gap_of,
-    quartered,
-)
+from mvest.reporting.case.drawing import BLOOD, LINE_PIECES, TISSUE, gap_of, quartered
 from mvest.reporting.case.figures import (
     case_figure,
     distance_top,
@@ -27,6 +19,7 @@ from mvest.reporting.case.figures import (
     shapes_figure,
 )
 from mvest.reporting.case.view import _states, case_view, small
+from mvest.reporting.figures import ATRIUM, SIDE
 from tests.made_up_closure import made_up_case as case_of_frames
 from tests.reporting.case.made_up_case import COLUMNS, made_up_case
 

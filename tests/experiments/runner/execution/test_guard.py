@@ -15,8 +15,14 @@ import experiments.runner.execution.worker as worker_module
 from experiments.common.records.record import VERSION, Record, stamp, write_record
 from experiments.common.study import Result
 from experiments.runner.execution.guard import WorkerProcess, run_apart
-from experiments.runner.execution.job import FailedRunError
-from experiments.runner.jobs.folder import finished_record, is_done, last_record, lock, mark_done
+from experiments.runner.jobs.folder import (
+    FailedRunError,
+    finished_record,
+    is_done,
+    last_record,
+    lock,
+    mark_done,
+)
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
 from mvest.provenance import THREAD_VARIABLES, sealed, write_json
