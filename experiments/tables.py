@@ -12,7 +12,6 @@ from experiments.runner.jobs.interruption import interruptible
 from experiments.sweeps.collected import read_sweeps
 from experiments.sweeps.report import write_sweep
 from mvest.errors import MvestError
-from mvest.reporting.pictures import lighten
 
 
 @interruptible
@@ -32,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             written += write_sweep(results, sweep)
         written.append(write_report(results))
         for path in written:
-            print(lighten(path) if path.suffix == ".png" else path)
+            print(path)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -6,6 +6,7 @@ also distinguished by its marker. Nothing touches matplotlib's global state or n
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
@@ -30,9 +33,6 @@ curves show their moduli, light enough to be shaded."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
 DPI = 140
-
-PNG_LEVEL = 4
-"""Of compression: files 4 % larger than at the usual 6, in half the time."""
 
 LONGEST_TEXT, LONGEST_LINE = 160, 400
 """Characters of a line of a text in a figure, and of the line at its foot."""
@@ -127,26 +127,36 @@ def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False
     _show_texts(figure)
     line = shown_text(line, LONGEST_LINE)
     note = figure.supxlabel(line, fontsize=5, color="grey", ha="center", parse_math=False)
-    # Without dates, so that the same result gives the same file.
-    formats: dict[str, dict[str, object]] = {
-        ".png": {"metadata": {"Description": line}, "pil_kwargs": {"compress_level": PNG_LEVEL}},
-    }
-    if pdf:
-        formats[".pdf"] = {"metadata": {"Subject": line, "CreationDate": None}}
     written, layout = [], figure.get_layout_engine()
-    for suffix, options in formats.items():
-        path = base.with_name(base.name + suffix)
+    written.append(
+        write_atomically(Path(f"{base}.png"), lambda file: _save_png(figure, file, line))
+    )
+    # What is laid out need not be once more, which takes as long as drawing it.
+    figure.set_layout_engine(None)
+    if pdf:
+        # Without a date, so that the same result gives the same file.
+        about = {"Subject": line, "CreationDate": None}
         written.append(
             write_atomically(
-                path,
-                lambda file, options=options: figure.savefig(file, dpi=DPI, **options),  # type: ignore[misc]
+                Path(f"{base}.pdf"),
+                lambda file: figure.savefig(file, dpi=DPI, metadata=about),
             )
         )
-        # What is laid out need not be once more, which takes as long as drawing it.
-        figure.set_layout_engine(None)
     note.remove()
     figure.set_layout_engine(layout)
     return written
+
+
+def _save_png(figure: Figure, path: Path, line: str) -> None:
+    """Write a palette of 256 colours: a third of the bytes, the same to the eye."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI, pil_kwargs={"compress_level": 0})
+    about = PngInfo()
+    about.add_text("Description", line)
+    with Image.open(drawn) as image:
+        # Without the means, a palette of few pure colours loses the red ones.
+        light = image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE)
+        light.save(path, "PNG", pnginfo=about, optimize=True, dpi=(DPI, DPI))
 
 
 def _show_texts(figure: Figure) -> None:

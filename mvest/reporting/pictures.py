@@ -1,4 +1,4 @@
-"""Pictures: put into a page that needs no file beside it, and made light to be kept."""
+"""Pictures put into a page that needs no file beside it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from typing import Any
 
 from markupsafe import Markup
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from mvest.errors import InputError
-from mvest.files import write_atomically
 
 WIDEST_PIXELS = 1500
 """Two for each pixel of a page's column."""
@@ -52,18 +50,3 @@ def embedded(path: Path, caption: str) -> dict[str, Any]:
         "width": image.width,
         "height": image.height,
     }
-
-
-def lighten(path: Path) -> Path:
-    """Rewrite a PNG with a palette of 256 colours: a third of the bytes, the same to the eye."""
-    with Image.open(path) as image:
-        about = PngInfo()
-        for key, value in image.info.items():
-            if isinstance(value, str):
-                about.add_text(str(key), value)
-        dpi = image.info.get("dpi", (100, 100))
-        small = image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE)
-    return write_atomically(
-        path,
-        lambda file: small.save(file, "PNG", pnginfo=about, optimize=True, dpi=dpi),
-    )
