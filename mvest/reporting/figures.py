@@ -126,7 +126,9 @@ def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False
     """
     _show_texts(figure)
     line = shown_text(line, LONGEST_LINE)
-    note = figure.supxlabel(line, fontsize=5, color="grey", ha="center", parse_math=False)
+    note = figure.supxlabel(
+        line, fontsize=5, color="grey", ha="center", parse_math=False, wrap=True
+    )
     written, layout = [], figure.get_layout_engine()
     written.append(
         write_atomically(Path(f"{base}.png"), lambda file: _save_png(figure, file, line))
