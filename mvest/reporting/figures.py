@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,8 @@ curves show their moduli, light enough to be shaded."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
 DPI = 140
+CHARACTERS_AN_INCH = 23
+"""Of the line at the foot."""
 
 LONGEST_TEXT, LONGEST_LINE = 160, 400
 """Characters of a line of a text in a figure, and of the line at its foot."""
@@ -126,9 +129,8 @@ def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False
     """
     _show_texts(figure)
     line = shown_text(line, LONGEST_LINE)
-    note = figure.supxlabel(
-        line, fontsize=5, color="grey", ha="center", parse_math=False, wrap=True
-    )
+    foot = textwrap.fill(line, int(CHARACTERS_AN_INCH * figure.get_figwidth()))
+    note = figure.supxlabel(foot, fontsize=5, color="grey", ha="center", parse_math=False)
     written, layout = [], figure.get_layout_engine()
     written.append(
         write_atomically(Path(f"{base}.png"), lambda file: _save_png(figure, file, line))

@@ -80,7 +80,7 @@ def record_of(place: Path, run: str = "run") -> Record:
 def changed(place: Path) -> dict[str, int]:
     """Which writing each file of the store is of: reading one changes its time alone."""
     root = place / "outputs" / "detectors"
-    return {str(p.relative_to(root)): p.stat().st_ino for p in root.rglob("*.npz")}
+    return {str(p.relative_to(root)): p.stat().st_mtime_ns for p in root.rglob("*.npz")}
 
 
 def test_the_study_says_how_far_detectors_are_off(done: Path):
