@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -16,6 +16,7 @@ from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
 Values = Mapping[str, Any]
+OURS = "mvest.estimation."
 
 
 def build_filter(
@@ -49,15 +50,45 @@ def filter_of(method: Values) -> Filter:
     ConfigurationError
         If there is no such filter, or a setting is none of its or inadmissible.
     """
+    from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 
-    if not str(method.get("_target_", "")).startswith("mvest."):
-        raise ConfigurationError("filter.method._target_: expected a filter of mvest")
+    for target in {method.get("_target_"), *_targets(method)}:
+        _require_class(target)
     try:
         return cast(Filter, instantiate(dict(method), _convert_="all"))
-    except Exception as error:
+    except InstantiationException as error:
         # Hydra's own error, whose cause says what is wrong.
         raise ConfigurationError(f"filter.method: {one_line(error.__cause__ or error)}") from error
+
+
+def _targets(settings: Any) -> Iterator[Any]:
+    """Every ``_target_``, however deep."""
+    parts: Iterable[Any] = ()
+    if isinstance(settings, Mapping):
+        parts = settings.values()
+        if "_target_" in settings:
+            yield settings["_target_"]
+    elif isinstance(settings, Sequence) and not isinstance(settings, str):
+        parts = settings
+    for part in parts:
+        yield from _targets(part)
+
+
+def _require_class(target: Any) -> None:
+    """Refuse what is no class of `mvest.estimation`: Hydra would call anything that is named."""
+    from hydra.utils import get_class
+
+    try:
+        # Not even imported where the name is not ours.
+        ours = str(target).startswith(OURS) and get_class(target).__module__.startswith(OURS)
+    except (ImportError, ValueError):
+        ours = False
+    if not ours:
+        raise ConfigurationError(
+            f"filter.method: _target_ {target!r}, expected the full name of a filter, for example "
+            "mvest.estimation.filters.paper.PaperFilter"
+        )
 
 
 def require_one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:
