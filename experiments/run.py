@@ -8,6 +8,7 @@ stopped by Ctrl-C, SIGTERM or SIGHUP (nothing is left half-written).
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import sys
 from itertools import takewhile
@@ -16,6 +17,7 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -44,11 +46,15 @@ def main() -> int:
     wants_tracebacks = TRACEBACKS in os.environ
     ended: list[Exception] = []
 
-    def task(config: DictConfig) -> None:
+    def task(config: DictConfig) -> float:
         try:
-            run_alone(config)
+            return run_alone(config)
         except (MvestError, FailedRunError) as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            # Hydra would write lines of its own above the one that tells it here.
             ended.append(error)
+            return math.nan
 
     register()
     register_plugins()
@@ -74,8 +80,10 @@ def main() -> int:
     return 0
 
 
-def run_alone(config: DictConfig) -> None:
+def run_alone(config: DictConfig) -> float:
     """One run by itself: what it means, if that is all that is asked; otherwise run and log it.
+
+    Returns its objective; NaN where there is none.
 
     Raises
     ------
@@ -87,15 +95,19 @@ def run_alone(config: DictConfig) -> None:
     # Imports every study, for seconds: not where only help is asked for.
     from experiments.runner.execution.check import require_admissible
     from experiments.runner.execution.job import run_job
-    from experiments.runner.planning.compose import plan_run
+    from experiments.runner.jobs.folder import read_result
+    from experiments.runner.planning.compose import planned_job
+    from experiments.runner.planning.plan import Plan
+    from experiments.runner.sweep import objective_of
 
     with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
         request = Request.of(config)
         if config.dry_run:
-            plan = plan_run(request)
+            name, folder = str(request.values["name"]), request.folder.parent
+            plan = Plan(name, folder, {}, (planned_job(request),), 1)
             require_admissible(request.values)
             print(plan.summary(), plan.listing(), sep="\n")
-            return
+            return math.nan
         with logging_beside(request.values) as track:
             try:
                 run_job(request)
@@ -103,6 +115,8 @@ def run_alone(config: DictConfig) -> None:
                 track(request.folder)
                 raise
             track(request.folder)
+        record = read_result(request.folder, request.config_hash)
+        return math.nan if record is None else objective_of(record, config.objective)
 
 
 def explain(error: BaseException) -> str:

@@ -205,12 +205,13 @@ class Config:
     figures: Switch = True  # draw the run; a sweep need not draw every job
     force: Switch = False  # run again what is done
     dry_run: Switch = False  # only say what would run, and how long it would take
-    detach: Switch = False  # of a sweep: submit its jobs, or only plan them, and leave
+    detach: Switch = False  # of a sweep: only plan its jobs, for `mvest worker`
     # After this a job is stopped and recorded as failed.
     time_limit_s: Annotated[TimeLimit | None, NOT_HASHED] = None
     # Beyond this a job fails; null: its part of the machine.
     memory_limit_gb: Annotated[Gigabytes | None, NOT_HASHED] = None
-    isolate: Switch = True  # in a sweep, each job runs in a process of its own
+    # What optimising sweepers compare jobs by: a number of a run, as MLflow names it.
+    objective: Annotated[str, NOT_HASHED] = "error.mean"
     # What is varied in this job, by name.
     factors: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
     # A sweep's name, size, and under the name of each size its grid, or a list of grids of

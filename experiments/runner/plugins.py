@@ -1,11 +1,19 @@
-"""What Hydra is extended by: a sweeper that plans all jobs, and then has them run."""
+"""What Hydra is extended by: a sweeper for grids and their unions, and a launcher of many jobs.
+
+Both are Hydra's own kinds of plugins: the launcher serves any sweeper (``hydra/sweeper=basic``,
+optuna's), and the sweeper any launcher (``hydra/launcher=basic`` runs jobs in this process).
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from types import ModuleType
+from typing import Any
 
 from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
@@ -18,8 +26,8 @@ class FailedSweepError(Exception):
     """A job of a sweep has no estimate; the sweep has said so."""
 
 
-class PlannedSweeper(Sweeper):
-    """Plans all jobs of a sweep before it launches those that are not done.
+class GridSweeper(Sweeper):
+    """Gives all jobs of a grid, or of a union of grids, to the launcher at once.
 
     Parameters
     ----------
@@ -29,16 +37,19 @@ class PlannedSweeper(Sweeper):
     """
 
     def __init__(self, params: object = None) -> None:
-        self._parts: tuple[HydraContext, DictConfig] | None = None
+        self._parts: tuple[HydraContext, DictConfig, Launcher] | None = None
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Keep what Hydra has to say about the sweep; its jobs run in processes of their own."""
-        self._parts = hydra_context, config
+        """Keep what Hydra has to say about the sweep, and its launcher."""
+        launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+        self._parts = hydra_context, config, launcher
 
-    def sweep(self, arguments: list[str]) -> None:
-        """Plan, check, launch, collect and log.
+    def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
+        """Expand and launch; returns what the launcher does.
 
         Raises
         ------
@@ -47,12 +58,52 @@ class PlannedSweeper(Sweeper):
         MvestError, HydraException, OmegaConfBaseException
             If the request is wrong.
         """
-        # Imports every study, for seconds: not where only help is asked for.
-        from experiments.runner.sweep import run_sweep
+        from experiments.runner.planning.compose import expand
 
         assert self._parts is not None
-        if run_sweep(*self._parts, arguments):
+        context, config, launcher = self._parts
+        jobs = expand(config, arguments, context.config_loader)
+        returned = launcher.launch(jobs, initial_job_idx=0)
+        if any(one.status != JobStatus.COMPLETED for one in returned):
             raise FailedSweepError
+        return returned
+
+
+class JobLauncher(Launcher):
+    """Plans and checks jobs, runs those that are not done, and collects and logs all of them.
+
+    Each job runs in a process of its own; it returns its objective.
+
+    Parameters
+    ----------
+    **settings
+        Those of `experiments.runner.execution.engine.EngineSettings`, read from the configuration.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        self._sweep: Any = None
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        """Keep what Hydra has to say about the sweep."""
+        # Imports every study, for seconds: not where only help is asked for.
+        from experiments.runner.sweep import SweepRun
+
+        self._sweep = SweepRun(hydra_context.config_loader, config)
+
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> Sequence[JobReturn]:
+        """Run jobs.
+
+        Raises
+        ------
+        MvestError, HydraException, OmegaConfBaseException
+            If the request is wrong; nothing is run then.
+        """
+        returned: Sequence[JobReturn] = self._sweep.launch(job_overrides, initial_job_idx)
+        return returned
 
 
 def register_plugins() -> None:
@@ -62,6 +113,7 @@ def register_plugins() -> None:
     place = ModuleType(PLACE)
     sys.modules[PLACE] = place
     setattr(sys.modules.setdefault(package, ModuleType(package)), name, place)
-    PlannedSweeper.__module__ = PLACE
-    place.__dict__[PlannedSweeper.__name__] = PlannedSweeper
-    plugins.register(PlannedSweeper)
+    for plugin in (GridSweeper, JobLauncher):
+        plugin.__module__ = PLACE
+        place.__dict__[plugin.__name__] = plugin
+        plugins.register(plugin)

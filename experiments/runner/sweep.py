@@ -1,96 +1,143 @@
-"""From a sweep's plan to its file of results: skip what is done, run the rest, collect, log."""
+"""From the jobs of a sweep to its results: skip what is done, run the rest, collect, log."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Any
 
-from hydra.types import HydraContext
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
 from experiments.common.records.record import Record
-from experiments.common.schema import require_admissible_values
+from experiments.common.records.writer import LONGEST
+from experiments.common.schema import build, require_admissible_values
 from experiments.common.study import load_study
-from experiments.results.keep import publish, records_of
-from experiments.runner.collecting.collect import NOT_RUN, collect, read_ends
-from experiments.runner.execution import slurm
+from experiments.results.keep import publish
+from experiments.runner.collecting.collect import NOT_RUN, collect
+from experiments.runner.collecting.comparison import metrics
 from experiments.runner.execution.check import require_admissible
-from experiments.runner.execution.drain import drain_here, drain_inline
-from experiments.runner.jobs.folder import last_record, nothing_empty, require_writable
+from experiments.runner.execution.engine import Ended, EngineSettings, run_jobs
+from experiments.runner.jobs.folder import (
+    FailedRunError,
+    last_record,
+    nothing_empty,
+    require_writable,
+)
 from experiments.runner.planning.compose import make_plan
-from experiments.runner.planning.plan import Plan
+from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.planning.progress import SweepBar
-from experiments.runner.tracking.store import Store
-from experiments.runner.tracking.summary import SWEEP
-from experiments.runner.tracking.sync import log_sweep, open_early
 from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
+from experiments.sweeps.runs import by_setting
 from mvest.errors import ConfigurationError, MvestError
-from mvest.quantities import Gigabytes, Processes, within
+
+SWEEP, MULTIRUN = "sweep.json", "multirun.yaml"
+"""Files in a sweep's folder: its results, and its configuration as Hydra writes it."""
+
+GIVEN_ONCE = ("planned", "basic")
+"""Sweepers that know all their jobs beforehand; others may try a job twice."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LauncherSettings:
-    """Ranges of the settings of launchers (``conf/hydra/launcher``)."""
-
-    n_jobs: Annotated[int, within(-1024, 1024, "", "processes; -1: one for each core")]
-    jobs_per_task: Annotated[int, within(1, 1_000_000, "", "jobs of a sweep")]
-    array_parallelism: Annotated[int, within(1, 1_000_000, "", "tasks of a sweep")]
-    timeout_min: Annotated[int, within(1, 525_600, "min", "up to a year")]
-    cpus_per_task: Processes
-    mem_gb: Gigabytes
-    poll_s: Annotated[float, within(0.01, 3600, "s", "an hour is too long to notice an end")]
-
-
-LAUNCHERS = ("local", "basic", "slurm")
-"""Who can run jobs; Hydra's basic one stands for one process."""
-
-LOOK_AGAIN = 2.0
-"""Seconds between two questions to Slurm about a sweep that is collected later."""
-
-
-def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str]) -> int:
-    """Find out what a request means, refuse a wrong one before anything is written, and run it.
+class SweepRun:
+    """A sweep, whose jobs come in one batch or in several.
 
     Parameters
     ----------
-    context : HydraContext
+    loader : ConfigLoader
+        Hydra's.
     config : DictConfig
-        The sweep's own, with Hydra's part.
-    arguments : sequence of str
-        Of the command line.
-
-    Returns
-    -------
-    int
-        Exit status: 1 if a job has no estimate.
-
-    Raises
-    ------
-    MvestError, HydraException, OmegaConfBaseException
-        If the request is wrong.
+        The sweep's own configuration, with Hydra's part.
     """
-    launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
-    require_admissible_values(LauncherSettings, launcher, "hydra.launcher")
-    plan = make_plan(config, context.config_loader, arguments)
-    for job in plan.jobs:
-        _check(job.values, job.overrides)
-    if config.dry_run:
-        _tell(plan)
-        return 0
-    if config.check:
-        _run_checks(plan)
-        return 0
-    with nothing_empty(plan.folder, Path(config.paths.outputs)):
-        require_writable(plan.folder)
-        plan = plan.write()
-    print(plan.summary())
-    return run_plan(config, plan)
+
+    def __init__(self, loader: ConfigLoader, config: DictConfig) -> None:
+        self._loader, self._config = loader, config
+        self._jobs: dict[str, PlannedJob] = {}
+        self._ended: dict[str, Ended] = {}
+
+    def launch(self, overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
+        """Find out what jobs mean, refuse a wrong one before anything is written, and run them.
+
+        Parameters
+        ----------
+        overrides : sequence of sequence of str
+            Those of each job.
+        first : int
+            Number of the first of them in the sweep.
+
+        Returns
+        -------
+        list of JobReturn
+            One for each job, with its objective; none where jobs were only planned or checked.
+
+        Raises
+        ------
+        MvestError, HydraException, OmegaConfBaseException
+            If the request is wrong.
+        """
+        config = self._config
+        launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
+        launcher.pop("_target_")
+        require_admissible_values(EngineSettings, launcher, "hydra.launcher")
+        settings = build(EngineSettings, launcher)
+        batch = make_plan(config, self._loader, overrides, first)
+        if str(config.hydra.runtime.choices["hydra/sweeper"]) in GIVEN_ONCE:
+            batch.require_different()
+        for job in batch.jobs:
+            _check(job)
+        if config.dry_run:
+            print(batch.summary(), batch.listing(), sep="\n")
+            return []
+        if config.check:
+            _run_checks(batch)
+            return []
+        self._jobs = {job.request.config_hash: job for job in batch.jobs} | self._jobs
+        plan = replace(batch, jobs=tuple(self._jobs.values()))
+        with nothing_empty(plan.folder, Path(config.paths.outputs)):
+            require_writable(plan.folder)
+            plan = plan.write()
+            OmegaConf.save(config, plan.folder / MULTIRUN)
+        print(batch.summary())
+        if config.detach and batch.to_run:
+            print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
+            print(f"`mvest collect {plan.folder}` writes what became of them")
+            return []
+        self._run(plan, batch, settings)
+        found = {job.hash: job.record for job in finish(plan, self._ended).jobs}
+        return [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+
+    def _run(self, plan: Plan, batch: Plan, settings: EngineSettings) -> None:
+        """Run the jobs of a batch that are not done."""
+        left = {job.request.config_hash: job for job in batch.to_run}
+        left = {key: job for key, job in left.items() if key not in self._ended}
+        if not left:
+            return
+        announce_compilation("the first jobs")
+        jobs = list(left.values())
+        ends = run_jobs(
+            [job.request for job in jobs], settings, min(plan.workers, len(jobs)), plan.written_ns
+        )
+        try:
+            with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
+                for k, ended in ends:
+                    self._ended[jobs[k].request.config_hash] = ended
+                    bar.ended(jobs[k], ended.record)
+        except KeyboardInterrupt:
+            ends.close()
+            collected(plan, self._ended)
+            raise
+        except OSError as error:
+            # The jobs that ended are on disk.
+            print(
+                f"error: the sweep cannot go on ({error}); run the same command again to go on",
+                file=sys.stderr,
+            )
 
 
 def collect_sweep(folder: Path) -> int:
@@ -106,128 +153,61 @@ def collect_sweep(folder: Path) -> int:
     MvestError
         If nothing is planned in the folder, or the results cannot be written.
     """
-    plan = Plan.read(folder)
-    arrays = slurm.submitted(plan.folder)
-    to_come = slurm.record_dead(plan, arrays, LOOK_AGAIN) if arrays else 0
-    if to_come:
-        print(f"{plan.name}: {to_come} jobs wait or run in Slurm")
-    return _collect(plan, to_come)
+    found = finish(Plan.read(folder), {})
+    return 0 if all(record.converged for record in found.records) else 1
 
 
-def run_plan(config: DictConfig, plan: Plan) -> int:
-    """Run the jobs that are not done, and write and log what became of all of them.
-
-    Returns
-    -------
-    int
-        Exit status: 1 if a job has no estimate.
+def finish(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
+    """Write, log, show and publish what became of a sweep.
 
     Raises
     ------
     MvestError
         If the results cannot be written.
-    KeyboardInterrupt
-        If the sweep was interrupted; what was done by then is collected.
     """
-    settings: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
-    launcher = _launcher(config)
-    if config.detach and plan.to_run:
-        if launcher == "slurm":
-            slurm.submit(plan, settings)
-        else:
-            print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
-        print(f"`mvest collect {plan.folder}` writes what became of them")
-        return 0
-    # Before any job runs: a wrong address is seen now.
-    store = open_early(plan.common, plan) if plan.common["tracking"]["enabled"] else None
-    if plan.to_run:
-        announce_compilation("the first jobs")
-        try:
-            arrays = slurm.submit(plan, settings) if launcher == "slurm" else []
-            with SweepBar(plan):
-                if arrays:
-                    slurm.wait_for(arrays, settings["poll_s"])
-                    slurm.record_dead(plan, arrays, settings["poll_s"])
-                elif config.isolate:
-                    drain_here(plan)
-                else:
-                    drain_inline(plan)
-        except KeyboardInterrupt:
-            _write(plan)
-            raise
-        except OSError as error:
-            # The jobs that ended are on disk.
-            print(
-                f"error: the sweep cannot go on ({error}); run the same command again to go on",
-                file=sys.stderr,
-            )
-    return _collect(plan, 0, store)
-
-
-def _launcher(config: DictConfig) -> str:
-    """Who runs the jobs."""
-    chosen = str(config.hydra.runtime.choices["hydra/launcher"])
-    if chosen not in LAUNCHERS:
-        raise ConfigurationError(
-            f"hydra/launcher = {chosen!r}, expected local or slurm; any other scheduler may run "
-            "`mvest worker` on a sweep that detach=true has planned"
-        )
-    return chosen
-
-
-def _collect(plan: Plan, to_come: int, store: Store | None = None) -> int:
-    """Write, log and publish what became of a sweep; the exit status."""
-    found = _write(plan)
+    found = collected(plan, ended)
+    table = by_setting(found)
+    if len(table) <= LONGEST:
+        print(table.text())
+    for path in write_sweep(plan.folder, found):
+        if path.suffix in (".md", ".png"):
+            print(f"Written to {path}")
     if plan.common["tracking"]["enabled"]:
-        log_sweep(plan.common, plan, store)
-    restored = _restore(plan)
-    if restored:
-        print(f"{plan.name}: results take over {restored} runs of earlier attempts")
-    missing = any(record.reason == NOT_RUN for record in found.records)
-    if not missing and not to_come:
+        # Imports MLflow, for seconds.
+        from experiments.runner.tracking.sync import log_sweep
+
+        log_sweep(plan.common, plan, None)
+    _publish_runs(plan)
+    if all(record.reason != NOT_RUN for record in found.records):
         _publish(plan, found)
-    return 0 if all(record.converged for record in found.records) else 1
+    return found
 
 
-def _restore(plan: Plan) -> int:
-    """Let the results take over what jobs ended with where they have other records, or none.
-
-    A job publishes its own record as it ends. What was done before is not run again, and the
-    results may have been put back to another state since. Returns how many were taken over.
-    """
-    groups: dict[tuple[Path, str, str], dict[str, tuple[Record, Path]]] = {}
-    for job in plan.jobs:
-        record = last_record(job.folder, job.config_hash) if job.publish_as else None
-        if record is None or not (record.converged or load_study(record.study).keeps_failures):
-            continue
-        results = Path(job.values["paths"]["results"])
-        runs = groups.setdefault((results, record.study, record.table), {})
-        runs[str(job.publish_as)] = record, job.folder
-    count = 0
-    for (results, study, table), runs in groups.items():
-        kept = records_of(results, table)
-        hashes = {
-            name: record.provenance.config_hash
-            for name, record in (kept.records.items() if kept is not None else ())
-        }
-        new = {
-            name: run
-            for name, run in runs.items()
-            if hashes.get(name) != run[0].provenance.config_hash
-        }
-        if new:
-            publish(load_study(study), results, new)
-        count += len(new)
-    return count
-
-
-def _write(plan: Plan) -> Sweep:
+def collected(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
+    """Write ``sweep.json`` and say in a line how the sweep ended."""
     path = plan.folder / SWEEP
-    found = collect(plan, read_ends(plan.folder))
+    found = collect(plan, ended)
     write_sweep_file(path, found)
     print(_outcome(plan, found))
     print(f"Written to {path}")
     return found
+
+
+def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:
+    """What Hydra is told of a job."""
+    returned = JobReturn(overrides=job.request.overrides, working_dir=str(job.folder))
+    returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
+    returned.return_value = (
+        objective_of(record, objective)
+        if record.converged
+        else FailedRunError(record.reason, job.folder)
+    )
+    return returned
+
+
+def objective_of(record: Record, name: str) -> float:
+    """A number of a record, by the name that MLflow shows; NaN where it has none."""
+    return next((value for key, value, _ in metrics(record) if key == name), math.nan)
 
 
 def _outcome(plan: Plan, found: Sweep) -> str:
@@ -248,6 +228,20 @@ def _outcome(plan: Plan, found: Sweep) -> str:
     return text
 
 
+def _publish_runs(plan: Plan) -> None:
+    """Let the results take over the runs of a sweep that have records of their own there."""
+    groups: dict[tuple[Path, str, str], dict[str, tuple[Record, Path]]] = {}
+    for job in plan.jobs:
+        name = job.request.publish_as
+        record = last_record(job.folder, job.request.config_hash) if name else None
+        if record is not None and (record.converged or load_study(record.study).keeps_failures):
+            group = Path(job.values["paths"]["results"]), record.study, record.table
+            groups.setdefault(group, {})[str(name)] = record, job.folder
+    for (results, study, _), runs in groups.items():
+        publish(load_study(study), results, runs)
+        print(f"Results in {results}")
+
+
 def _publish(plan: Plan, found: Sweep) -> None:
     """Let the results take over a sweep that was run as it is configured."""
     if plan.publish is None:
@@ -263,24 +257,19 @@ def _publish(plan: Plan, found: Sweep) -> None:
     print(f"Results in {results}")
 
 
-def _check(values: Mapping[str, Any], overrides: Sequence[str]) -> None:
+def _check(job: PlannedJob) -> None:
     """Refuse a job that could not run, saying which one it is."""
     try:
-        require_admissible(values)
+        require_admissible(job.values)
     except MvestError as error:
-        raise ConfigurationError(f"{error} (job {' '.join(overrides)})") from error
-
-
-def _tell(plan: Plan) -> None:
-    """Say what would run."""
-    print(plan.summary())
-    print(plan.listing())
+        raise ConfigurationError(f"{error} (job {' '.join(job.request.overrides)})") from error
 
 
 def _run_checks(plan: Plan) -> None:
     """Say what the data of each job will tell."""
-    checks = load_study(plan.jobs[0].values["study"]).checks()
+    study = plan.common["study"]
+    checks = load_study(study).checks()
     for job in plan.jobs:
-        if not checks or job.values["study"] != plan.jobs[0].values["study"]:
+        if not checks or job.values["study"] != study:
             raise ConfigurationError(f"check=true has nothing to say of the job {job.label}")
         print(job.label, *(check(job.values, job.folder) for check in checks), "", sep="\n")

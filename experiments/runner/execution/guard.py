@@ -63,6 +63,11 @@ class WorkerProcess:
         self._stopped = False
         atexit.register(self.close)
 
+    @property
+    def runs(self) -> bool:
+        """Whether the process is there, with all that it has imported."""
+        return self._program is not None
+
     def run(
         self,
         request: Request,

@@ -28,6 +28,8 @@ class Request:
         Output folder of the job.
     publish_as : str or None
         Name of its record in the results; None where they are not to be touched.
+    overrides : tuple of str
+        Those that it was composed with.
 
     Raises
     ------
@@ -39,6 +41,7 @@ class Request:
     config_hash: str
     folder: Path
     publish_as: str | None = None
+    overrides: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         require_in_range(self.values)
@@ -53,12 +56,14 @@ class Request:
             hash_of(values),
             Path(hydra.runtime.output_dir),
             publish_as(values, hydra.overrides.task, None),
+            tuple(hydra.overrides.task),
         )
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Request:
         """The request that :meth:`to_json` wrote."""
-        return cls(**{**data, "folder": Path(data["folder"])})
+        given = {"folder": Path(data["folder"]), "overrides": tuple(data["overrides"])}
+        return cls(**{**data, **given})
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
@@ -67,6 +72,7 @@ class Request:
             "config_hash": self.config_hash,
             "folder": str(self.folder),
             "publish_as": self.publish_as,
+            "overrides": self.overrides,
         }
 
 

@@ -1,4 +1,4 @@
-"""The jobs of a sweep, composed from its grids and the command line.
+"""The jobs of a sweep, composed from the overrides of each.
 
 A grid is a mapping from settings to choices in Hydra's sweep syntax, and stands for the product of
 its choices. Several grids stand for their union. What is said on the command line holds for every
@@ -11,15 +11,15 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from functools import cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from experiments.common.config import hash_of, plain
 from experiments.runner.jobs.folder import last_record
@@ -31,98 +31,114 @@ from mvest.errors import ConfigurationError
 HASH_DIGITS = 16
 """Digits of its hash by which a job's folder is named."""
 
+SUBDIR = "hydra.sweep.subdir"
+"""The setting by which a user names the folders of jobs otherwise."""
 
-def make_plan(config: DictConfig, loader: ConfigLoader, arguments: Sequence[str]) -> Plan:
-    """Compose every job of a sweep, in Hydra's order.
+
+def expand(config: DictConfig, arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
+    """The overrides of every job of a sweep, in Hydra's order.
+
+    Parameters
+    ----------
+    config : DictConfig
+        The sweep's own configuration, with Hydra's part.
+    arguments : sequence of str
+        Of the command line.
+    loader : ConfigLoader
+
+    Raises
+    ------
+    ConfigurationError
+        If the sweep has no such size, no grid, or no job.
+    HydraException
+        If a line is none of Hydra's, or varies a setting continuously.
+    """
+    parser = OverridesParser.create(config_loader=loader)
+    found: list[list[str]] = []
+    for grid in _grids(config):
+        lines = [*(f"{key}={value}" for key, value in grid.items()), *arguments]
+        overrides = parser.parse_overrides(lines)
+        for one in overrides:
+            if one.is_discrete_sweep() and not list(one.sweep_string_iterator()):
+                raise ConfigurationError(f"{one.input_line}: nothing to choose from, so no job")
+        found += BasicSweeper.split_arguments(overrides, None)[0]
+    return found
+
+
+def make_plan(
+    config: DictConfig, loader: ConfigLoader, jobs: Sequence[Sequence[str]], first: int = 0
+) -> Plan:
+    """Compose jobs.
 
     Parameters
     ----------
     config : DictConfig
         The sweep's own configuration, with Hydra's part.
     loader : ConfigLoader
-    arguments : sequence of str
-        Of the command line.
+    jobs : sequence of sequence of str
+        The overrides of each.
+    first : int
+        Number of the first of them in the sweep.
 
     Raises
     ------
-    ConfigurationError
-        If the sweep has no such size, or two jobs are one and the same.
     HydraException, OmegaConfBaseException
         If a job cannot be composed.
     """
     swept = config.hydra.sweeper.get("params") or {}
-    compose = _Composer(config, loader)
-    jobs: list[PlannedJob] = []
-    first: dict[str, Any] = {}
-    # Null takes the limit away; the default holds where nothing is said.
-    limited = any(line.partition("=")[0] == "time_limit_s" for line in arguments)
-    for overrides in expand(grids(config), arguments, loader):
+    named = any(line.partition("=")[0] == SUBDIR for line in config.hydra.overrides.hydra)
+    compose = _Composer(config, loader, reuse=not named)
+    varied = _varied(config, jobs, swept)
+    planned: list[PlannedJob] = []
+    common: dict[str, Any] = {}
+    for number, overrides in enumerate(jobs, first):
         composed = compose(overrides)
         values = plain(composed)
-        if not limited and values["time_limit_s"] is None:
+        # Null takes the limit away; the default holds where nothing is said.
+        if values["time_limit_s"] is None and not any(
+            line.partition("=")[0] == "time_limit_s" for line in overrides
+        ):
             values["time_limit_s"] = TIME_LIMIT_S
+        typed = {key: value for key, value in compose.values.items() if key in varied}
+        values["factors"] = {**typed, **values["factors"]}
         config_hash = hash_of(values)
+        subdir = config_hash[:HASH_DIGITS]
+        if named:
+            with open_dict(composed):
+                composed.hydra.job.id = composed.hydra.job.num = number
+            subdir = str(composed.hydra.sweep.subdir)
         # Ten thousand configurations fit into memory where they share what is alike in them.
-        first = first or values
+        common = common or values
         values = {
-            key: first[key] if key in first and _same(first[key], value) else value
+            key: common[key] if key in common and _same(common[key], value) else value
             for key, value in values.items()
         }
-        folder = Path(str(composed.hydra.sweep.dir)) / config_hash[:HASH_DIGITS]
+        folder = Path(str(composed.hydra.sweep.dir)) / subdir
         published = publish_as(values, overrides, swept)
-        jobs.append(_planned(Request(values, config_hash, folder, published), overrides))
-    _require_different(jobs)
-    sweep: dict[str, Any] = OmegaConf.to_container(config.sweep, resolve=True)  # type: ignore[assignment]
+        planned.append(
+            planned_job(Request(values, config_hash, folder, published, tuple(overrides)))
+        )
+    sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
         name=str(config.name),
         folder=Path(str(config.hydra.sweep.dir)),
         sweep=sweep,
-        jobs=tuple(jobs),
+        jobs=tuple(planned),
         workers=_workers(config),
         publish=_as_configured(config) if config.publish and sweep else None,
     )
 
 
-def plan_run(request: Request) -> Plan:
-    """The plan of a run by itself."""
-    job = _planned(request, HydraConfig.get().overrides.task)
-    return Plan(str(request.values["name"]), request.folder.parent, {}, (job,), 1)
+def planned_job(request: Request) -> PlannedJob:
+    """A job with what its folder says of earlier attempts."""
+    record = last_record(request.folder, request.config_hash)
+    # Of ten thousand records no more than is asked of them again.
+    attempt = None if record is None else Attempt(record.reason, record.provenance.git.sha)
+    return PlannedJob(request, attempt, record is not None and record.converged)
 
 
-def expand(
-    grids: Sequence[Mapping[str, Any]], arguments: Sequence[str], loader: ConfigLoader
-) -> list[list[str]]:
-    """The overrides of every job.
-
-    Parameters
-    ----------
-    grids : sequence of mapping
-        Setting -> choices.
-    arguments : sequence of str
-        Of the command line.
-    loader : ConfigLoader
-    """
-    parser = OverridesParser.create(config_loader=loader)
-    found: list[list[str]] = []
-    for grid in grids:
-        lines = [f"{key}={value}" for key, value in grid.items()]
-        # What comes later takes the place of what was said before of the same setting.
-        choices = {
-            override.get_key_element(): _choices(override)
-            for override in parser.parse_overrides([*lines, *arguments])
-        }
-        found += [list(job) for job in product(*choices.values())]
-    return found
-
-
-def grids(config: DictConfig) -> list[dict[str, Any]]:
-    """The grids that a sweep's size, or the sweeper's own parameters, stand for.
-
-    Raises
-    ------
-    ConfigurationError
-        If the sweep has no such size, or what it has there is no grid.
-    """
+def _grids(config: DictConfig) -> list[dict[str, Any]]:
+    """The grids that a sweep's size, or the sweeper's own parameters, stand for."""
     found = config.hydra.sweeper.get("params")
     if config.sweep:
         sizes = [str(key) for key, value in config.sweep.items() if OmegaConf.is_config(value)]
@@ -130,26 +146,11 @@ def grids(config: DictConfig) -> list[dict[str, Any]]:
         if size not in sizes:
             raise ConfigurationError(f"sweep.size = {size!r}, expected one of {', '.join(sizes)}")
         found = config.sweep[size]
-    if found is None:
-        return [{}]
-    plain_grids: Any = OmegaConf.to_container(found, resolve=True)
-    listed = plain_grids if isinstance(plain_grids, list) else [plain_grids]
+    grids: Any = [{}] if found is None else OmegaConf.to_container(found, resolve=True)
+    listed = grids if isinstance(grids, list) else [grids]
     if not listed or not all(isinstance(grid, dict) for grid in listed):
         raise ConfigurationError("hydra.sweeper.params: expected a grid or a list of grids")
     return listed
-
-
-def _choices(override: Override) -> list[str]:
-    """What a line of Hydra's sweep syntax stands for, one override each."""
-    key = override.get_key_element()
-    if not override.is_sweep_override():
-        return [f"{key}={override.get_value_element_as_str()}"]
-    if not override.is_discrete_sweep():
-        kind = override.value_type.name if override.value_type else "unknown"
-        raise ConfigurationError(
-            f"{override.input_line}: a plan does not support sweep type {kind}"
-        )
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
 
 
 class _Composer:
@@ -160,19 +161,21 @@ class _Composer:
     set the same ones.
     """
 
-    def __init__(self, config: DictConfig, loader: ConfigLoader) -> None:
-        self._config, self._loader = config, loader
+    def __init__(self, config: DictConfig, loader: ConfigLoader, reuse: bool) -> None:
+        self._config, self._loader, self._reuse = config, loader, reuse
         parser = OverridesParser.create(config_loader=loader)
         self._parse = cache(lambda line: parser.parse_overrides([line])[0])
         self._merged: dict[tuple[str, ...], DictConfig] = {}
+        self.values: dict[str, Any] = {}
         self._is_group = cache(lambda key: bool(loader.get_group_options(key)))
 
     def __call__(self, overrides: Sequence[str]) -> DictConfig:
         """A job's configuration, which the next one may overwrite."""
         parsed = [self._parse(line) for line in overrides]
+        self.values = {one.get_key_element(): _factor(one) for one in parsed}
         values = [override for override in parsed if self._sets_value(override)]
         kind = tuple(str(one.key_or_group if one in values else one.input_line) for one in parsed)
-        composed = self._merged.get(kind)
+        composed = self._merged.get(kind) if self._reuse else None
         if composed is None:
             composed = self._loader.load_sweep_config(self._config, list(overrides))
             HydraConfig.instance().set_config(composed)
@@ -192,6 +195,26 @@ class _Composer:
         )
 
 
+def _varied(
+    config: DictConfig, jobs: Sequence[Sequence[str]], swept: Mapping[str, Any]
+) -> set[str]:
+    """Settings by which jobs differ, and of which their factors say nothing.
+
+    What a sweep's own grid varies has its factors in the configuration.
+    """
+    own = {key for grid in _grids(config) for key in grid} if config.sweep else set()
+    first = set(jobs[0]) if jobs else set()
+    lines = {line for overrides in jobs for line in first.symmetric_difference(overrides)}
+    found = {line.lstrip("+~").partition("=")[0] for line in lines}
+    return (found | set(swept)) - own
+
+
+def _factor(override: Override) -> Any:
+    """The value of an override as a factor: a number, or the text that was typed."""
+    value = override.value()
+    return value if isinstance(value, int | float) else override.get_value_element_as_str()
+
+
 def _same(one: Any, other: Any) -> bool:
     """Whether they are written alike; 1 and 1.0 are not."""
     return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
@@ -205,33 +228,7 @@ def _as_configured(config: DictConfig) -> bool:
     return sized and as_published(task, None, config.study)
 
 
-def _planned(request: Request, overrides: Sequence[str]) -> PlannedJob:
-    record = last_record(request.folder, request.config_hash)
-    return PlannedJob(
-        request.config_hash,
-        request.folder,
-        tuple(overrides),
-        request.values,
-        # Of ten thousand records no more than is asked of them again.
-        None if record is None else Attempt(record.reason, record.provenance.git.sha),
-        record is not None and record.converged,
-        request.publish_as,
-    )
-
-
-def _require_different(jobs: Sequence[PlannedJob]) -> None:
-    first: dict[Path, PlannedJob] = {}
-    for job in jobs:
-        other = first.setdefault(job.folder.resolve(), job)
-        if other is not job:
-            raise ConfigurationError(
-                f"two jobs are one and the same: {' '.join(other.overrides)} and "
-                f"{' '.join(job.overrides)}"
-            )
-
-
 def _workers(config: DictConfig) -> int:
-    jobs = config.hydra.launcher.get("n_jobs") or config.hydra.launcher.get("array_parallelism")
-    if jobs is None:
-        return 1
-    return max(1, int(jobs) if int(jobs) > 0 else (os.cpu_count() or 1) + 1 + int(jobs))
+    """Jobs that run at a time, as far as it is known."""
+    jobs = int(config.hydra.launcher.get("n_jobs") or 1)
+    return max(1, jobs if jobs > 0 else (os.cpu_count() or 1) + 1 + jobs)

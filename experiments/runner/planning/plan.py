@@ -1,7 +1,7 @@
 """What a sweep will run: its jobs, which of them are done, and how long the others will take.
 
-The plan on disk is the one queue of a sweep. Whoever works on it, processes of this machine, tasks
-of Slurm or shards under any other scheduler, differs only by the part of its list that it takes.
+``plan.json`` in the sweep's folder is all that who works on it needs: shards under any scheduler
+(`Plan.read`), MLflow, and the same command when it goes on.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+from experiments.common.progress import duration
 from experiments.common.records.record import model_of_values, read_record
 from experiments.runner.jobs.folder import RESULT
 from experiments.runner.jobs.request import Request
-from mvest.errors import InputError
+from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import git_state, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
@@ -44,40 +45,40 @@ class PlannedJob:
 
     Attributes
     ----------
-    config_hash : str
-    folder : Path
-    overrides : tuple of str
-    values : dict
-        The resolved configuration.
+    request : Request
     attempt : Attempt or None
         An earlier one.
     done : bool
-    publish_as : str or None
-        Name of its own record in the results; None where they are not to be touched.
     """
 
-    config_hash: str
-    folder: Path
-    overrides: tuple[str, ...]
-    values: dict[str, Any]
-    attempt: Attempt | None
-    done: bool
-    publish_as: str | None = None
+    request: Request
+    attempt: Attempt | None = None
+    done: bool = False
 
     @property
-    def request(self) -> Request:
-        """What a worker is asked for."""
-        return Request(self.values, self.config_hash, self.folder, self.publish_as)
+    def values(self) -> dict[str, Any]:
+        """The resolved configuration."""
+        return self.request.values
+
+    @property
+    def folder(self) -> Path:
+        """Where its record is."""
+        return self.request.folder
+
+    @property
+    def to_run(self) -> bool:
+        """Whether it is missing, has failed, or is to be run again."""
+        return bool(self.values["force"]) or not self.done
 
     @property
     def short_hash(self) -> str:
         """What files call it."""
-        return self.config_hash[:16]
+        return self.request.config_hash[:16]
 
     @property
     def label(self) -> str:
         """What sets the job apart, for a line of text."""
-        return ", ".join(_texts(self.values["factors"])) or " ".join(self.overrides)
+        return ", ".join(_texts(self.values["factors"])) or " ".join(self.request.overrides)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +118,26 @@ class Plan:
     @property
     def to_run(self) -> list[PlannedJob]:
         """Jobs that are missing, have failed, or are to be run again."""
-        return [job for job in self.jobs if job.values["force"] or not job.done]
+        return [job for job in self.jobs if job.to_run]
+
+    def require_different(self) -> None:
+        """Refuse a plan with the same job twice, or with two jobs in one folder.
+
+        Raises
+        ------
+        ConfigurationError
+            The message names both.
+        """
+        first: dict[Path, PlannedJob] = {}
+        for job in self.jobs:
+            other = first.setdefault(job.folder.resolve(), job)
+            if other is not job:
+                same = other.request.config_hash == job.request.config_hash
+                what = "are one and the same" if same else f"have one folder, {job.folder}"
+                raise ConfigurationError(
+                    f"two jobs {what}: {' '.join(other.request.overrides)} and "
+                    f"{' '.join(job.request.overrides)}"
+                )
 
     def write(self) -> Plan:
         """Write ``plan.json`` into the sweep's folder; returns the plan as it was written.
@@ -128,16 +148,12 @@ class Plan:
         created = time.gmtime()
         first = self.jobs[0].values
         jobs = [
-            {
+            job.request.to_json()
+            | {
                 "hash": job.short_hash,
                 "folder": os.path.relpath(job.folder, self.folder),
                 "name": name,
-                "overrides": list(job.overrides),
                 "factors": job.values["factors"],
-                "row": job.values["row"],
-                "repeats": job.values.get("repeats", 1),
-                "config_hash": job.config_hash,
-                "publish_as": job.publish_as,
                 "values": {k: v for k, v in job.values.items() if v is not first.get(k, job)},
                 "without": [key for key in first if key not in job.values],
             }
@@ -193,13 +209,13 @@ class Plan:
             first = data["values"]
             jobs = tuple(
                 PlannedJob(
-                    job["config_hash"],
-                    place.parent / job["folder"],
-                    tuple(job["overrides"]),
-                    {k: v for k, v in first.items() if k not in job["without"]} | job["values"],
-                    None,
-                    False,
-                    job["publish_as"],
+                    Request(
+                        {k: v for k, v in first.items() if k not in job["without"]} | job["values"],
+                        job["config_hash"],
+                        place.parent / job["folder"],
+                        job["publish_as"],
+                        tuple(job["overrides"]),
+                    )
                 )
                 for job in data["jobs"]
             )
@@ -217,12 +233,13 @@ class Plan:
         factors = [_texts(job.values["factors"]) for job in self.jobs]
         shared = set(factors[0]).intersection(*factors)
         found = [", ".join(text for text in texts if text not in shared) for texts in factors]
+        lines = [job.request.overrides for job in self.jobs]
         common: dict[str, set[str]] = {}
-        for name, job in zip(found, self.jobs, strict=True):
-            common[name] = common.get(name, set(job.overrides)).intersection(job.overrides)
+        for name, typed in zip(found, lines, strict=True):
+            common[name] = common.get(name, set(typed)).intersection(typed)
         names = []
         for name, job in zip(found, self.jobs, strict=True):
-            own = [line for line in job.overrides if line not in common[name]]
+            own = [line for line in job.request.overrides if line not in common[name]]
             names.append(", ".join(filter(None, [name, *own])) or str(job.values["row"]))
         return names
 
@@ -236,9 +253,8 @@ class Plan:
 
     def listing(self) -> str:
         """Every job with its state, one line each."""
-        run_again = {job.config_hash for job in self.to_run}
         return "\n".join(
-            f"  {'run ' if job.config_hash in run_again else 'done'}  {job.short_hash}  "
+            f"  {'run ' if job.to_run else 'done'}  {job.short_hash}  "
             f"{job.label}"
             + (f"  [failed before: {job.attempt.reason}]" if job.attempt and not job.done else "")
             for job in self.jobs
@@ -257,7 +273,7 @@ class Plan:
         ]
         if not times:
             return "time unknown: no job of this kind has finished yet"
-        total = _duration(fmean(times) * len(left) / min(self.workers, len(left)))
+        total = duration(fmean(times) * len(left) / min(self.workers, len(left)))
         rest = f" (from {len(times)} of a known kind)" if len(times) < len(left) else ""
         return f"about {total}, {self.workers} at a time{rest}"
 
@@ -289,11 +305,3 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
 
 def _texts(factors: Mapping[str, Any]) -> list[str]:
     return [f"{name}={value}" for name, value in factors.items()]
-
-
-def _duration(seconds: float) -> str:
-    """Seconds, minutes or hours, whichever reads best."""
-    for unit, size in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2.0 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"

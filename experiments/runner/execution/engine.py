@@ -1,0 +1,319 @@
+"""Where the jobs of a sweep run: threads of this process, or the workers of a dask cluster.
+
+Both call `execute` for each job, which runs it in a process of its own: a crash, too much time or
+memory cost that job alone. What dask is asked for is the rest: to place jobs, to wait, to add and
+remove workers, and to run the job of a lost worker again on another one.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import experiments
+from experiments.common.records.record import Record, stamp
+from experiments.common.study import Result
+from experiments.runner.execution.guard import WorkerProcess, new_worker, run_apart
+from experiments.runner.jobs.folder import require_writable, write_failure
+from experiments.runner.jobs.request import Request
+from experiments.sweeps.collected import head_of
+from mvest.errors import ConfigurationError, MvestError
+from mvest.quantities import within
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
+"""Dask's cluster of this machine, and where it listens."""
+
+DASK = {
+    # Jobs take minutes: none waits at a worker that is busy.
+    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.comm.timeouts.connect": "60s",
+    # The memory of a job is held where the job runs.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+}
+"""Settings of dask for jobs in processes of their own."""
+
+PACKAGE = str(Path(experiments.__file__).resolve().parents[1])
+"""Where workers elsewhere find this package."""
+
+AT_ONCE = 500
+"""Jobs that are sent to dask's scheduler in one message."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineSettings:
+    """Who runs the jobs of a sweep (``conf/hydra/launcher``).
+
+    Attributes
+    ----------
+    n_jobs : int
+        Jobs at a time on this machine; -1: one for each core.
+    address, scheduler_file : str or None
+        Of a dask scheduler that runs already: ``tcp://…`` or ``tls://…``, or the file that
+        ``dask scheduler --scheduler-file`` writes.
+    tls : mapping
+        ``ca_file``, ``cert`` and ``key`` of a scheduler with a ``tls://`` address.
+    cluster : str or None
+        Class of dask_jobqueue (``SLURMCluster``, ``PBSCluster``, …) or ``LocalCluster``.
+    options : mapping
+        Arguments of that class.
+    jobs : int
+        Workers of the cluster.
+    adapt : bool
+        Whether workers come and go with the jobs that are left, ``jobs`` at most.
+    """
+
+    n_jobs: Annotated[int, within(-1024, 1024, "", "jobs; -1: one for each core")] = -1
+    address: str | None = None
+    scheduler_file: str | None = None
+    tls: dict[str, str] = field(default_factory=dict)
+    cluster: str | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    jobs: Annotated[int, within(1, 100_000, "", "workers")] = 1
+    adapt: bool = False
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether dask runs the jobs."""
+        return any((self.address, self.scheduler_file, self.cluster))
+
+
+class Ended(NamedTuple):
+    """How a job ended: the head of its record, and seconds spent neither simulating nor estimating.
+
+    The seconds are None for a job that was done before, or began with the start of its process.
+    """
+
+    record: Record
+    overhead: float | None = None
+
+
+def run_jobs(
+    requests: Sequence[Request], settings: EngineSettings, at_a_time: int, asked_ns: int | None
+) -> Generator[tuple[int, Ended]]:
+    """Run jobs; yields the position of each and how it ended, as they end.
+
+    Closing the iterator early, as an interrupt does, ends the jobs that run; nothing is recorded
+    of them.
+
+    Parameters
+    ----------
+    requests : sequence of Request
+    settings : EngineSettings
+    at_a_time : int
+        Jobs that run on one machine beside each other and share its memory.
+    asked_ns : int or None
+        As in `run_apart`.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such cluster, or it cannot be reached.
+    OSError
+        If dask's scheduler is lost.
+    """
+    if settings.elsewhere:
+        yield from _on_dask(requests, settings, asked_ns)
+        return
+    pool = ThreadPoolExecutor(min(at_a_time, len(requests)))
+    futures = {
+        pool.submit(execute, request, asked_ns, at_a_time): k for k, request in enumerate(requests)
+    }
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BaseException:
+        stop_jobs()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_idle: list[WorkerProcess] = []
+_busy: set[WorkerProcess] = set()
+
+
+def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -> Ended:
+    """Run a job, unless it is done, in a process that this one keeps for its jobs.
+
+    Whatever becomes of the job is in what is returned.
+    """
+    try:
+        worker = _idle.pop()
+    except IndexError:
+        worker = new_worker()
+    _busy.add(worker)
+    began, starts = time.monotonic(), not worker.runs
+    try:
+        record = run_apart(request, worker, asked_ns, at_a_time)
+    except (MvestError, OSError) as error:
+        # Not even a record of the failure could be written.
+        result = Result(status="failed", reason=str(error))
+        record = stamp(request.values, request.config_hash, result, time.time())
+    finally:
+        _busy.remove(worker)
+    _idle.append(worker)
+    spent = time.monotonic() - began
+    measured = record.converged and not starts and record.seconds_total <= spent
+    return Ended(head_of(record), spent - computing(record) if measured else None)
+
+
+def stop_jobs() -> None:
+    """End the jobs that run in processes of this one; nothing is recorded of them."""
+    for worker in list(_busy):
+        worker.stop()
+
+
+def computing(record: Record) -> float:
+    """Seconds of a job that were spent simulating or estimating."""
+    told = record.numbers.get("seconds_computing")
+    spent = [told, *(one.seconds for one in record.estimates[:1])]
+    found = [one for one in spent if isinstance(one, int | float) and one]
+    return float(found[0]) if found else record.seconds_total
+
+
+def _on_dask(
+    requests: Sequence[Request], settings: EngineSettings, asked_ns: int | None
+) -> Generator[tuple[int, Ended]]:
+    try:
+        import dask
+        from distributed import as_completed
+    except ImportError as error:
+        raise ConfigurationError(
+            f"launcher=cluster needs dask ({error}): pip install 'mvest[cluster]'"
+        ) from error
+    with dask.config.set(DASK), _client(settings) as client:
+        # One call and keys of one group: only then do jobs wait at the scheduler, and not at a
+        # worker that may be lost.
+        futures = client.map(
+            _execute_there,
+            requests,
+            directory=str(Path.cwd()),
+            asked_ns=asked_ns,
+            at_a_time=settings.jobs if settings.cluster == LOCAL else 1,
+            key=[("job", k) for k in range(len(requests))],
+            pure=False,
+            batch_size=AT_ONCE,
+        )
+        places = {future.key: k for k, future in enumerate(futures)}
+        for future, ended in as_completed(futures, with_results=True, raise_errors=False):
+            k = places[future.key]
+            if future.status != "finished":
+                ended = Ended(head_of(_lost(requests[k], future.exception())))
+            future.release()
+            yield k, ended
+
+
+def _execute_there(
+    request: Request, *, directory: str, asked_ns: int | None, at_a_time: int
+) -> Ended:
+    """Run a job in a worker of dask, from the folder in which its relative paths mean something."""
+    os.chdir(directory)
+    return execute(request, asked_ns, at_a_time)
+
+
+def _lost(request: Request, error: BaseException) -> Record:
+    """The record of a job whose workers were lost again and again."""
+    reason = f"dask gave the job up: {type(error).__name__}: {error}"
+    require_writable(request.folder)
+    return write_failure(request, reason, time.time())
+
+
+@contextmanager
+def _client(settings: EngineSettings) -> Iterator[Client]:
+    """A client of the scheduler that is named, or of a cluster that ends with it.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none.
+    """
+    from distributed import Client, Security
+
+    with ExitStack() as stack:
+        try:
+            where: Any = settings.address
+            secure = None
+            if settings.tls:
+                secure = Security(
+                    require_encryption=True,
+                    tls_ca_file=settings.tls["ca_file"],
+                    tls_client_cert=settings.tls["cert"],
+                    tls_client_key=settings.tls["key"],
+                )
+            if settings.cluster is not None:
+                where = stack.enter_context(_cluster(settings.cluster, settings.options))
+                if settings.adapt:
+                    where.adapt(minimum=0, maximum=settings.jobs)
+                else:
+                    where.scale(settings.jobs)
+            client = stack.enter_context(
+                Client(where, scheduler_file=settings.scheduler_file, security=secure)
+            )
+        except (OSError, RuntimeError, ValueError, TypeError, KeyError, ImportError) as error:
+            name = settings.cluster or settings.address or settings.scheduler_file
+            raise ConfigurationError(f"hydra.launcher: no cluster {name}: {error}") from error
+        try:
+            yield client
+        except BaseException:
+            if settings.cluster is not None:
+                # Its workers would wait for their jobs.
+                client.run(stop_jobs)
+            raise
+
+
+def _cluster(name: str, options: Mapping[str, Any]) -> Any:
+    """A cluster whose connections are encrypted, or stay on this machine."""
+    if name == LOCAL:
+        from distributed import LocalCluster
+
+        return LocalCluster(
+            **{
+                "n_workers": 0,
+                "threads_per_worker": 1,
+                "host": LOOPBACK,
+                "dashboard_address": f"{LOOPBACK}:0",
+                "worker_dashboard_address": f"{LOOPBACK}:0",
+                "memory_limit": None,
+                **options,
+            }
+        )
+    import dask_jobqueue
+
+    kinds = {kind: made for kind, made in vars(dask_jobqueue).items() if kind.endswith("Cluster")}
+    if name not in kinds:
+        raise ConfigurationError(
+            f"hydra.launcher.cluster = {name}, expected {LOCAL}, {', '.join(sorted(kinds))}"
+        )
+    return kinds[name](
+        **{
+            "cores": 1,
+            "processes": 1,
+            "memory": "4GB",
+            "python": f"{shlex.quote(sys.executable)} -P",
+            "nanny": False,
+            # Certificates for this one cluster, in a folder that its nodes share.
+            "security": True,
+            "protocol": "tls://",
+            "scheduler_options": {"dashboard_address": f"{LOOPBACK}:0"},
+            "worker_extra_args": ["--no-dashboard"],
+            **options,
+            "job_script_prologue": [
+                f"export PYTHONPATH={shlex.quote(PACKAGE)}",
+                *options.get("job_script_prologue", ()),
+            ],
+        }
+    )
