@@ -23,7 +23,7 @@ from experiments.results.keep import publish
 from experiments.runner.collecting.collect import NOT_RUN, collect
 from experiments.runner.collecting.comparison import metrics
 from experiments.runner.execution.check import require_admissible
-from experiments.runner.execution.engine import Ended, EngineSettings, run_jobs
+from experiments.runner.execution.engine import Ended, EngineSettings, require_engine, run_jobs
 from experiments.runner.jobs.folder import (
     FailedRunError,
     last_record,
@@ -40,6 +40,9 @@ from mvest.errors import ConfigurationError, MvestError
 
 SWEEP, MULTIRUN = "sweep.json", "multirun.yaml"
 """Files in a sweep's folder: its results, and its configuration as Hydra writes it."""
+
+SHOWN = ("setting", "parameter", "runs", "failed", "estimate", "median error", "largest error")
+"""Columns of the table by settings that a terminal has room for."""
 
 GIVEN_ONCE = ("planned", "basic")
 """Sweepers that know all their jobs beforehand; others may try a job twice."""
@@ -86,6 +89,7 @@ class SweepRun:
         launcher.pop("_target_")
         require_admissible_values(EngineSettings, launcher, "hydra.launcher")
         settings = build(EngineSettings, launcher)
+        require_engine(settings)
         batch = make_plan(config, self._loader, overrides, first)
         if str(config.hydra.runtime.choices["hydra/sweeper"]) in GIVEN_ONCE:
             batch.require_different()
@@ -97,7 +101,7 @@ class SweepRun:
         if config.check:
             _run_checks(batch)
             return []
-        self._jobs = {job.request.config_hash: job for job in batch.jobs} | self._jobs
+        self._jobs |= {job.request.config_hash: job for job in batch.jobs}
         plan = replace(batch, jobs=tuple(self._jobs.values()))
         with nothing_empty(plan.folder, Path(config.paths.outputs)):
             require_writable(plan.folder)
@@ -166,9 +170,7 @@ def finish(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
         If the results cannot be written.
     """
     found = collected(plan, ended)
-    table = by_setting(found)
-    if len(table) <= LONGEST:
-        print(table.text())
+    print(_answer(found))
     for path in write_sweep(plan.folder, found):
         if path.suffix in (".md", ".png"):
             print(f"Written to {path}")
@@ -191,6 +193,19 @@ def collected(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
     print(_outcome(plan, found))
     print(f"Written to {path}")
     return found
+
+
+def _answer(found: Sweep) -> str:
+    """The table of a sweep for a terminal: what was estimated in each setting, and how well."""
+    # Imports for a second.
+    from pandas import DataFrame
+
+    table = by_setting(found)
+    if len(table) > LONGEST:
+        return f"{len(table)} settings and parameters: too many for a terminal"
+    shown = {name: table.values[name] for name in SHOWN}
+    rows = replace(table, values={**shown, "SD over runs": table.values["SD over runs"]}).readable()
+    return str(DataFrame(rows).to_string(index=False))
 
 
 def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:

@@ -209,7 +209,8 @@ def by_setting(sweep: Sweep) -> Table:
     """
     runs = runs_of(sweep).frame
     units = {column: unit for name, (column, unit) in factors_of(sweep).items() if name != SEED}
-    names = list(units) or ["job"]
+    # Jobs that differ in their seeds are repetitions of one setting.
+    names = list(units) or ([] if sweep.factors else ["job"])
     single = runs.groupby([*names, "parameter"], sort=False, dropna=False).size().max() == 1
     if single and len(runs) > MOST_SETTINGS * len(sweep.parameters):
         names = [name for name in names if not is_number(list(runs[name].dropna()))]

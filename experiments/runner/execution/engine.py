@@ -142,7 +142,9 @@ def run_jobs(
         pool.shutdown(cancel_futures=True)
 
 
-_idle: list[WorkerProcess] = []
+_idle: dict[str, list[WorkerProcess]] = {}
+"""Folder in which a process works -> those that have no job."""
+
 _busy: set[WorkerProcess] = set()
 
 
@@ -151,8 +153,9 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
 
     Whatever becomes of the job is in what is returned.
     """
+    idle = _idle.setdefault(str(Path.cwd()), [])
     try:
-        worker = _idle.pop()
+        worker = idle.pop()
     except IndexError:
         worker = new_worker()
     _busy.add(worker)
@@ -165,7 +168,7 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
         record = stamp(request.values, request.config_hash, result, time.time())
     finally:
         _busy.remove(worker)
-    _idle.append(worker)
+    idle.append(worker)
     spent = time.monotonic() - began
     measured = record.converged and not starts and record.seconds_total <= spent
     return Ended(head_of(record), spent - computing(record) if measured else None)
@@ -188,13 +191,9 @@ def computing(record: Record) -> float:
 def _on_dask(
     requests: Sequence[Request], settings: EngineSettings, asked_ns: int | None
 ) -> Generator[tuple[int, Ended]]:
-    try:
-        import dask
-        from distributed import as_completed
-    except ImportError as error:
-        raise ConfigurationError(
-            f"launcher=cluster needs dask ({error}): pip install 'mvest[cluster]'"
-        ) from error
+    import dask
+    from distributed import as_completed
+
     with dask.config.set(DASK), _client(settings) as client:
         # One call and keys of one group: only then do jobs wait at the scheduler, and not at a
         # worker that may be lost.
@@ -275,45 +274,63 @@ def _client(settings: EngineSettings) -> Iterator[Client]:
             raise
 
 
+def require_engine(settings: EngineSettings) -> None:
+    """Refuse a cluster of which nobody knows, or for which nothing is installed.
+
+    Raises
+    ------
+    ConfigurationError
+        One line.
+    """
+    if settings.elsewhere:
+        try:
+            import distributed  # noqa: F401
+
+            kinds = _kinds() if settings.cluster not in (None, LOCAL) else {}
+        except ImportError as error:
+            raise ConfigurationError(
+                f"hydra.launcher: a cluster needs dask ({error}): pip install 'mvest[cluster]'"
+            ) from error
+        if kinds and settings.cluster not in kinds:
+            raise ConfigurationError(
+                f"hydra.launcher.cluster = {settings.cluster}, expected {LOCAL}, "
+                f"{', '.join(sorted(kinds))}"
+            )
+
+
+def _kinds() -> dict[str, Any]:
+    """Name -> class of each cluster that dask_jobqueue knows."""
+    import dask_jobqueue
+
+    return {name: kind for name, kind in vars(dask_jobqueue).items() if name.endswith("Cluster")}
+
+
 def _cluster(name: str, options: Mapping[str, Any]) -> Any:
     """A cluster whose connections are encrypted, or stay on this machine."""
     if name == LOCAL:
         from distributed import LocalCluster
 
-        return LocalCluster(
-            **{
-                "n_workers": 0,
-                "threads_per_worker": 1,
-                "host": LOOPBACK,
-                "dashboard_address": f"{LOOPBACK}:0",
-                "worker_dashboard_address": f"{LOOPBACK}:0",
-                "memory_limit": None,
-                **options,
-            }
-        )
-    import dask_jobqueue
-
-    kinds = {kind: made for kind, made in vars(dask_jobqueue).items() if kind.endswith("Cluster")}
-    if name not in kinds:
-        raise ConfigurationError(
-            f"hydra.launcher.cluster = {name}, expected {LOCAL}, {', '.join(sorted(kinds))}"
-        )
-    return kinds[name](
-        **{
-            "cores": 1,
-            "processes": 1,
-            "memory": "4GB",
-            "python": f"{shlex.quote(sys.executable)} -P",
-            "nanny": False,
-            # Certificates for this one cluster, in a folder that its nodes share.
-            "security": True,
-            "protocol": "tls://",
-            "scheduler_options": {"dashboard_address": f"{LOOPBACK}:0"},
-            "worker_extra_args": ["--no-dashboard"],
-            **options,
-            "job_script_prologue": [
-                f"export PYTHONPATH={shlex.quote(PACKAGE)}",
-                *options.get("job_script_prologue", ()),
-            ],
+        own = {
+            "n_workers": 0,
+            "threads_per_worker": 1,
+            "host": LOOPBACK,
+            "dashboard_address": f"{LOOPBACK}:0",
+            "worker_dashboard_address": f"{LOOPBACK}:0",
+            "memory_limit": None,
         }
-    )
+        return LocalCluster(**{**own, **options})
+    own = {
+        "cores": 1,
+        "processes": 1,
+        "memory": "4GB",
+        "python": f"{shlex.quote(sys.executable)} -P",
+        "nanny": False,
+        # Certificates for this one cluster, in a folder that its nodes share.
+        "security": True,
+        "protocol": "tls://",
+        "scheduler_options": {"dashboard_address": f"{LOOPBACK}:0"},
+        "worker_extra_args": ["--no-dashboard"],
+    }
+    prologue = [f"export PYTHONPATH={shlex.quote(PACKAGE)}"]
+    prologue += options.get("job_script_prologue", ())
+    return _kinds()[name](**{**own, **options, "job_script_prologue": prologue})

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ def make_plan(
     swept = config.hydra.sweeper.get("params") or {}
     named = any(line.partition("=")[0] == SUBDIR for line in config.hydra.overrides.hydra)
     compose = _Composer(config, loader, reuse=not named)
-    varied = _varied(config, jobs, swept)
+    varied = _varied(config, jobs, loader)
     planned: list[PlannedJob] = []
     common: dict[str, Any] = {}
     for number, overrides in enumerate(jobs, first):
@@ -195,18 +195,19 @@ class _Composer:
         )
 
 
-def _varied(
-    config: DictConfig, jobs: Sequence[Sequence[str]], swept: Mapping[str, Any]
-) -> set[str]:
-    """Settings by which jobs differ, and of which their factors say nothing.
+def _varied(config: DictConfig, jobs: Sequence[Sequence[str]], loader: ConfigLoader) -> set[str]:
+    """Settings that are varied, and of which the factors of the configuration say nothing.
 
-    What a sweep's own grid varies has its factors in the configuration.
+    Those of a sweep's own grid are the factors that its configuration names.
     """
-    own = {key for grid in _grids(config) for key in grid} if config.sweep else set()
+    parser = OverridesParser.create(config_loader=loader)
+    swept = parser.parse_overrides(list(config.hydra.overrides.task))
     first = set(jobs[0]) if jobs else set()
     lines = {line for overrides in jobs for line in first.symmetric_difference(overrides)}
     found = {line.lstrip("+~").partition("=")[0] for line in lines}
-    return (found | set(swept)) - own
+    found |= {one.get_key_element() for one in swept if one.is_sweep_override()}
+    own = {key for grid in _grids(config) for key in grid} if config.sweep else set()
+    return found - own
 
 
 def _factor(override: Override) -> Any:
@@ -230,5 +231,8 @@ def _as_configured(config: DictConfig) -> bool:
 
 def _workers(config: DictConfig) -> int:
     """Jobs that run at a time, as far as it is known."""
-    jobs = int(config.hydra.launcher.get("n_jobs") or 1)
+    launcher = config.hydra.launcher
+    if any(launcher.get(name) for name in ("address", "scheduler_file", "cluster")):
+        return int(launcher.jobs)
+    jobs = int(launcher.get("n_jobs") or 1)
     return max(1, jobs if jobs > 0 else (os.cpu_count() or 1) + 1 + jobs)

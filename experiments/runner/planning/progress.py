@@ -65,13 +65,15 @@ class SweepBar(AbstractContextManager["SweepBar"]):
             print(f"{self._name}: {self.state()}", file=sys.stderr)
 
     def state(self) -> str:
-        """How many jobs have ended, and how long the others will take.
-
-        They take as long as those that have ended, one by one at each worker; those that run now
-        are half done.
-        """
+        """How many jobs have ended, and how long the others will take."""
         counts = f"{self._done} done, {self._failed} failed, {self._skipped} skipped"
+        return f"{counts}, about {duration(self.left())} left"
+
+    def left(self) -> float:
+        """Seconds until the last job ends.
+
+        The others take as long as those that have ended, one by one at each worker. The jobs that
+        run now are partly done, and at the end workers wait for the last job: half a job each.
+        """
         left = self._total - len(self._seconds)
-        under_way = min(self._workers, left)
-        jobs = (left - 0.5 * (under_way - 1)) / max(1, under_way)
-        return f"{counts}, about {duration(jobs * fmean(self._seconds))} left"
+        return left / max(1, min(self._workers, left)) * fmean(self._seconds)

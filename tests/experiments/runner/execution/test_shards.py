@@ -11,13 +11,10 @@ import pytest
 
 from experiments import cli
 from experiments.run import main
-from experiments.runner.collecting import collect
 from experiments.runner.execution import guard
-from experiments.runner.execution.drain import Shard
 from experiments.runner.planning.plan import Plan
 from experiments.sweeps.collected import read_sweep
-from mvest.errors import ConfigurationError, InputError
-from tests.experiments.studies.made_up import made_up, made_up_estimate
+from mvest.errors import InputError
 from tests.places import ROOT
 
 FAKE = str(Path(__file__).parents[1] / "fake_worker.py")
@@ -109,17 +106,13 @@ def is_in(process: Path, folder: Path) -> bool:
 
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "2", "2/0", "a/b", "-1/4"])
-def test_what_is_no_shard_is_refused(text):
-    with pytest.raises(ConfigurationError, match="shard"):
-        Shard.parse(text)
-
-
-@pytest.mark.parametrize("count", [1, 3, 5, 12, 20])
-def test_shards_share_a_list_out(count):
-    jobs = tuple(range(12))
-    parts = [Shard(index, count).of(jobs) for index in range(1, count + 1)]
-    assert sorted(job for part in parts for job in part) == list(jobs)
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+def test_what_is_no_shard_is_refused(planned, capsys, text):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["worker", str(FOLDER), f"--shard={text}"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        f"error: shard {text}, expected I/N with I from 1 to N, for example 2/8\n"
+    )
 
 
 def test_a_plan_is_read_as_it_was_written(planned, monkeypatch, tmp_path):
@@ -127,12 +120,13 @@ def test_a_plan_is_read_as_it_was_written(planned, monkeypatch, tmp_path):
     assert [job.values["seed"] for job in read.jobs] == list(range(12))
     for job in read.jobs:
         # What names it follows from its configuration, so all of that came through.
-        assert guard.Request(job.values, job.config_hash, job.folder) == job.request
-        assert job.config_hash[:16] == job.folder.name
+        assert job.request.config_hash[:16] == job.folder.name
+        assert f"seed={job.values['seed']}" in job.request.overrides
         assert cli.Path.cwd() == tmp_path
     from experiments.common.config import hash_of
 
-    assert [hash_of(job.values) for job in read.jobs] == [job.config_hash for job in read.jobs]
+    hashes = [job.request.config_hash for job in read.jobs]
+    assert [hash_of(job.values) for job in read.jobs] == hashes
     # From wherever it is read, a job finds its files.
     monkeypatch.chdir("/")
     assert Plan.read(tmp_path / FOLDER).jobs[0].folder == read.jobs[0].folder
@@ -152,15 +146,10 @@ def test_two_shards_at_once_do_every_job_once(planned, capsys):
     found = read_sweep(FOLDER / "sweep.json")
     assert [job.record.estimates[0].seed for job in found.jobs] == list(range(12))
     assert [one.estimate for one in found.jobs[7].record.estimates[0].unknowns] == [6.7, 2.0]
-    # Nothing is left for anyone, and what was appended agrees with the records.
+    # Nothing is left for anyone.
     again = mvest("worker", str(FOLDER), "--shard", "1/1")
     again.communicate(timeout=120)
     assert runs() == list(range(12))
-    for path in (FOLDER / collect.ENDS).iterdir():
-        path.unlink()
-    assert cli.main(["collect", str(FOLDER)]) == 0
-    from_records = read_sweep(FOLDER / "sweep.json")
-    assert from_records.records == found.records
 
 
 def test_the_same_shard_started_twice_does_no_job_twice(planned):
@@ -177,10 +166,6 @@ def test_a_killed_shard_loses_the_job_in_flight_and_a_second_one_finishes(planne
     until(lambda: 6 in runs())
     os.kill(shard.pid, signal.SIGKILL)
     shard.communicate()
-    # Half of a line, as if the disk had been slower than the signal.
-    (ends,) = (FOLDER / collect.ENDS).iterdir()
-    with ends.open("a") as file:
-        file.write('\n{"hash": "abc", "sta')
     done = {path: path.stat().st_mtime_ns for path in FOLDER.glob("*/done")}
     assert len(done) == 3, "seeds 0, 2 and 4 are kept"
     assert cli.main(["collect", str(FOLDER)]) == 1
@@ -223,7 +208,6 @@ def test_jobs_that_are_forced_run_again_once(planned, monkeypatch):
     ("arguments", "words"),
     [
         (("worker", "nowhere"), "no sweep is planned in nowhere"),
-        (("worker", str(FOLDER), "--shard", "3/2"), "shard 3/2"),
         (("collect", "nowhere"), "no sweep is planned in nowhere"),
     ],
 )
@@ -233,13 +217,3 @@ def test_a_wrong_share_is_one_clear_line(planned, capsys, arguments, words):
     assert err.startswith("error: ")
     assert words in err
     assert len(err.splitlines()) == 1
-
-
-def test_an_end_that_was_changed_is_left_aside(tmp_path):
-    end = collect.End(hash="abc", record=made_up(estimates=(made_up_estimate((6.0, 2.0)),)))
-    place = tmp_path / collect.ENDS / "one.jsonl"
-    place.parent.mkdir()
-    place.write_text(f"\n{end.line()}\n")
-    assert collect.read_ends(tmp_path) == {"abc": end}
-    place.write_text(f"\n{end.line().replace('6.0', '5.9')}\n")
-    assert collect.read_ends(tmp_path) == {}

@@ -16,7 +16,7 @@ from experiments.common.config import hash_of, register, require_in_range
 from experiments.common.schema import build
 from experiments.common.study import Job, Result
 from experiments.runner.jobs.limits import TIME_LIMIT_S
-from experiments.runner.planning.compose import expand, grids, make_plan
+from experiments.runner.planning.compose import expand, make_plan
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
@@ -45,7 +45,7 @@ DEBUG = (
 def jobs(name: str, size: str) -> list[list[str]]:
     config = compose("config", [f"sweep={name}", f"sweep.size={size}"], return_hydra_config=True)
     assert config.hydra.mode.name == "MULTIRUN"
-    return expand(grids(config), [], GlobalHydra.instance().config_loader())
+    return expand(config, [], GlobalHydra.instance().config_loader())
 
 
 def composed(*overrides: str) -> tuple[str, dict]:
@@ -93,14 +93,17 @@ def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, 
     loader = GlobalHydra.instance().config_loader()
     # Groups, values within what a group chose, and values on the command line.
     said = [f"sweep={name}", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
-    plan = make_plan(config, loader, said)
-    assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
+    plan = make_plan(config, loader, expand(config, said, loader))
+    assert len({job.request.config_hash for job in plan.jobs}) == len(plan.jobs)
     for job in plan.jobs[::step]:
-        config_hash, values = composed(*job.overrides)
+        config_hash, values = composed(*job.request.overrides)
         # Which a job by itself does not have.
         values["time_limit_s"] = TIME_LIMIT_S
+        # What is varied on the command line is named besides.
+        assert values["factors"].items() <= job.values["factors"].items()
+        values["factors"] = job.values["factors"]
         assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
-        assert job.config_hash == config_hash
+        assert job.request.config_hash == config_hash
         assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
 
 
@@ -208,7 +211,7 @@ def test_a_wrong_setting_is_refused_before_anything_runs(configuration, override
 def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> None:
     worlds = sorted(path.stem for path in (CONF / "world").glob("*.yaml"))
     config = compose("config", ["sweep=calibration"], return_hydra_config=True)
-    planned = expand(grids(config), [], GlobalHydra.instance().config_loader())
+    planned = expand(config, [], GlobalHydra.instance().config_loader())
     assert len(planned) == 20 * len(worlds)
     # A seed is a valve in all worlds, so that a sweep that is not at its end has all of them.
     assert {line.partition("=")[2] for job in planned[: len(worlds)] for line in job

@@ -1,0 +1,155 @@
+"""Jobs on a dask cluster of this machine: workers are killed, the client is, and no job is lost."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.sweeps.collected import read_sweep
+from tests.experiments.runner.execution.test_shards import FAKE, WORKER, is_in, runs, until
+from tests.places import ROOT
+
+pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
+
+FOLDER = Path("outputs/debug")
+CLUSTER = ("hydra.launcher.cluster=LocalCluster", "hydra.launcher.jobs=2")
+
+INSTEAD = """
+import sys
+from experiments.runner.execution import guard
+guard.WORKER = (sys.executable, {fake!r})
+"""
+"""What dask's workers load, so that their jobs take no time."""
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """Start a sweep of eight jobs on a cluster in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    instead = tmp_path / "instead.py"
+    instead.write_text(INSTEAD.format(fake=FAKE))
+
+    def start(*more: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [
+                *(sys.executable, "-c", WORKER, FAKE, "run", "-m", "experiment=debug"),
+                *("seed=range(0,8)", "tracking.enabled=false", *(more or CLUSTER)),
+            ],
+            env=os.environ
+            | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__PRELOAD": f'["{instead}"]'},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    yield start
+    until(lambda: not left(tmp_path))
+
+
+def left(folder: Path) -> list[Path]:
+    """Processes that work in a folder."""
+    return [place for place in Path("/proc").glob("[0-9]*") if is_in(place, folder)]
+
+
+def parents(pid: int) -> list[int]:
+    """A process's parent, the parent of that, and so on."""
+    found = []
+    while pid > 1:
+        pid = int(Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1].split()[1])
+        found.append(pid)
+    return found
+
+
+def test_jobs_that_die_on_a_cluster_cost_their_own_rows(sweep):
+    Path("kill-2").touch()
+    Path("raise-5").touch()
+    running = sweep()
+    out, _ = running.communicate(timeout=300)
+    assert running.returncode == 1, out
+    found = read_sweep(FOLDER / "sweep.json").records
+    reasons = {record.factors["seed"]: record.reason for record in found if not record.converged}
+    assert reasons.keys() == {2, 5}
+    assert reasons[2].startswith("killed by signal 9")
+    assert reasons[5] == "RuntimeError: it broke"
+    assert runs() == list(range(8))
+
+    # The same command runs what failed, here; nothing is done twice.
+    again = sweep("hydra.launcher.n_jobs=1")
+    out, _ = again.communicate(timeout=300)
+    assert again.returncode == 0, out
+    assert "8 of 8 jobs done (6 before)" in out
+    assert runs() == sorted([*range(8), 2, 5])
+
+
+def test_the_job_of_a_killed_worker_is_run_again_by_itself(sweep, tmp_path):
+    Path("wait-3").touch()
+    running = sweep()
+    until(lambda: 3 in runs())
+    job = next(pid for pid in map(_pid, left(tmp_path)) if _log(pid, FOLDER))
+    worker = next(pid for pid in parents(job) if pid in _dask_workers(tmp_path, running.pid))
+    os.kill(worker, signal.SIGKILL)
+    until(lambda: runs().count(3) == 2)
+    Path("wait-3").unlink()
+    out, _ = running.communicate(timeout=300)
+    assert running.returncode == 0, out
+    assert "8 of 8 jobs done" in out
+    assert sorted(set(runs())) == list(range(8))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_nothing_runs_on_when_the_command_is_ended(sweep, tmp_path, number):
+    Path("wait-3").touch()
+    running = sweep()
+    until(lambda: 3 in runs())
+    os.kill(running.pid, number)
+    out, _ = running.communicate(timeout=60)
+    assert running.returncode == (130 if number == signal.SIGINT else -9), out
+    until(lambda: not left(tmp_path))
+    begun = runs()
+    time.sleep(1.0)
+    assert runs() == begun
+
+
+def test_a_cluster_of_this_machine_listens_on_this_machine_only(sweep, tmp_path):
+    Path("wait-3").touch()
+    running = sweep()
+    until(lambda: 3 in runs())
+    pids = {running.pid, *map(_pid, left(tmp_path))}
+    listed = subprocess.run(["ss", "-ltnpH"], capture_output=True, text=True, check=True).stdout
+    own = [
+        line.split()[3]
+        for line in listed.splitlines()
+        if pids & {int(pid) for pid in re.findall(r"pid=([0-9]+)", line)}
+    ]
+    Path("wait-3").unlink()
+    out, _ = running.communicate(timeout=300)
+    assert running.returncode == 0, out
+    assert own
+    assert all(address.startswith(("127.0.0.1:", "[::1]:")) for address in own), own
+
+
+def _pid(place: Path) -> int:
+    return int(place.name)
+
+
+def _log(pid: int, folder: Path) -> bool:
+    """Whether a process is amid a job: its output goes to the job's log."""
+    try:
+        return Path(f"/proc/{pid}/fd/1").readlink().name == "log.txt"
+    except OSError:
+        return False
+
+
+def _dask_workers(folder: Path, client: int) -> set[int]:
+    """Processes of dask's workers: children of the client that jobs hang below."""
+    return {
+        pid
+        for pid in map(_pid, left(folder))
+        if client in parents(pid)[:1] and b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    }
