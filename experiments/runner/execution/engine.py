@@ -7,6 +7,7 @@ remove workers, and to run the job of a lost worker again on another one.
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 import sys
@@ -14,9 +15,10 @@ import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from uuid import uuid4
 
 import experiments
 from experiments.common.records.record import Record, stamp
@@ -55,33 +57,14 @@ AT_ONCE = 500
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineSettings:
-    """Who runs the jobs of a sweep (``conf/hydra/launcher``).
-
-    Attributes
-    ----------
-    n_jobs : int
-        Jobs at a time on this machine; -1: one for each core.
-    address, scheduler_file : str or None
-        Of a dask scheduler that runs already: ``tcp://…`` or ``tls://…``, or the file that
-        ``dask scheduler --scheduler-file`` writes.
-    tls : mapping
-        ``ca_file``, ``cert`` and ``key`` of a scheduler with a ``tls://`` address.
-    cluster : str or None
-        Class of dask_jobqueue (``SLURMCluster``, ``PBSCluster``, …) or ``LocalCluster``.
-    options : mapping
-        Arguments of that class.
-    jobs : int
-        Workers of the cluster.
-    adapt : bool
-        Whether workers come and go with the jobs that are left, ``jobs`` at most.
-    """
+    """Who runs the jobs of a sweep; ``conf/hydra/launcher/jobs.yaml`` says what each means."""
 
     n_jobs: Annotated[int, within(-1024, 1024, "", "jobs; -1: one for each core")] = -1
     address: str | None = None
     scheduler_file: str | None = None
-    tls: dict[str, str] = field(default_factory=dict)
+    tls: dict[str, str] | None = None
     cluster: str | None = None
-    options: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] | None = None
     jobs: Annotated[int, within(1, 100_000, "", "workers")] = 1
     adapt: bool = False
 
@@ -194,23 +177,32 @@ def _on_dask(
     import dask
     from distributed import as_completed
 
-    with dask.config.set(DASK), _client(settings) as client:
+    for name in [
+        name for name in logging.root.manager.loggerDict if name.startswith("distributed")
+    ]:
+        # What it has to say that matters is said here, in a line.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    own = requests[0].folder.resolve().parent / "dask"
+    with dask.config.set(DASK), _client(settings, own) as client:
         # One call and keys of one group: only then do jobs wait at the scheduler, and not at a
-        # worker that may be lost.
+        # worker that may be lost. Other sweeps at the same scheduler have other keys.
+        group = f"job-{uuid4().hex}"
         futures = client.map(
             _execute_there,
             requests,
             directory=str(Path.cwd()),
             asked_ns=asked_ns,
             at_a_time=settings.jobs if settings.cluster == LOCAL else 1,
-            key=[("job", k) for k in range(len(requests))],
+            key=[(group, k) for k in range(len(requests))],
             pure=False,
             batch_size=AT_ONCE,
         )
         places = {future.key: k for k, future in enumerate(futures)}
         for future, ended in as_completed(futures, with_results=True, raise_errors=False):
             k = places[future.key]
-            if future.status != "finished":
+            if future.status in ("cancelled", "lost"):
+                raise OSError("dask's scheduler is gone")
+            if future.status == "error":
                 ended = Ended(head_of(_lost(requests[k], future.exception())))
             future.release()
             yield k, ended
@@ -232,8 +224,10 @@ def _lost(request: Request, error: BaseException) -> Record:
 
 
 @contextmanager
-def _client(settings: EngineSettings) -> Iterator[Client]:
+def _client(settings: EngineSettings, folder: Path) -> Iterator[Client]:
     """A client of the scheduler that is named, or of a cluster that ends with it.
+
+    The cluster's logs and certificates are in ``folder``.
 
     Raises
     ------
@@ -254,7 +248,9 @@ def _client(settings: EngineSettings) -> Iterator[Client]:
                     tls_client_key=settings.tls["key"],
                 )
             if settings.cluster is not None:
-                where = stack.enter_context(_cluster(settings.cluster, settings.options))
+                where = stack.enter_context(
+                    _cluster(settings.cluster, settings.options or {}, folder)
+                )
                 if settings.adapt:
                     where.adapt(minimum=0, maximum=settings.jobs)
                 else:
@@ -305,7 +301,7 @@ def _kinds() -> dict[str, Any]:
     return {name: kind for name, kind in vars(dask_jobqueue).items() if name.endswith("Cluster")}
 
 
-def _cluster(name: str, options: Mapping[str, Any]) -> Any:
+def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
     """A cluster whose connections are encrypted, or stay on this machine."""
     if name == LOCAL:
         from distributed import LocalCluster
@@ -327,10 +323,13 @@ def _cluster(name: str, options: Mapping[str, Any]) -> Any:
         "nanny": False,
         # Certificates for this one cluster, in a folder that its nodes share.
         "security": True,
+        "shared_temp_directory": str(folder),
+        "log_directory": str(folder),
         "protocol": "tls://",
         "scheduler_options": {"dashboard_address": f"{LOOPBACK}:0"},
-        "worker_extra_args": ["--no-dashboard"],
+        "worker_extra_args": ["--no-dashboard", "--dashboard-address", f"{LOOPBACK}:0"],
     }
+    folder.mkdir(mode=0o700, exist_ok=True)
     prologue = [f"export PYTHONPATH={shlex.quote(PACKAGE)}"]
     prologue += options.get("job_script_prologue", ())
     return _kinds()[name](**{**own, **options, "job_script_prologue": prologue})

@@ -132,9 +132,11 @@ def make_plan(
 def planned_job(request: Request) -> PlannedJob:
     """A job with what its folder says of earlier attempts."""
     record = last_record(request.folder, request.config_hash)
+    if record is None:
+        return PlannedJob(request)
     # Of ten thousand records no more than is asked of them again.
-    attempt = None if record is None else Attempt(record.reason, record.provenance.git.sha)
-    return PlannedJob(request, attempt, record is not None and record.converged)
+    attempt = Attempt(record.reason, record.provenance.git.sha, record.seconds_total)
+    return PlannedJob(request, attempt, record.converged)
 
 
 def _grids(config: DictConfig) -> list[dict[str, Any]]:

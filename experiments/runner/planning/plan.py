@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 import uuid
@@ -17,8 +16,6 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 from experiments.common.progress import duration
-from experiments.common.records.record import model_of_values, read_record
-from experiments.runner.jobs.folder import RESULT
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import git_state, write_json
@@ -28,15 +25,13 @@ from mvest.reading.text import one_line
 PLAN = "plan.json"
 """File in a sweep's folder with the jobs that it consists of."""
 
-MAX_READ = 500
-"""Results that are read to estimate a time."""
-
 
 class Attempt(NamedTuple):
-    """What an earlier attempt at a job ended with, and the commit that it was computed by."""
+    """What an earlier attempt at a job ended with, the commit that computed it, and its seconds."""
 
     reason: str
     commit: str | None
+    seconds: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,21 +256,13 @@ class Plan:
         )
 
     def estimate(self) -> str:
-        """How long the jobs that are left will take, from what finished ones took."""
-        left = self.to_run
-        if not left:
-            return "nothing left"
-        spent = _recorded_seconds(self.folder.parent, self)
-        times = [
-            fmean(spent[kind]) * job.values.get("repeats", 1)
-            for job in left
-            if (kind := json.dumps(model_of_values(job.values).model_dump())) in spent
-        ]
-        if not times:
-            return "time unknown: no job of this kind has finished yet"
-        total = duration(fmean(times) * len(left) / min(self.workers, len(left)))
-        rest = f" (from {len(times)} of a known kind)" if len(times) < len(left) else ""
-        return f"about {total}, {self.workers} at a time{rest}"
+        """How long the jobs that are left will take, from those that were done before."""
+        left = len(self.to_run)
+        spent = [job.attempt.seconds for job in self.jobs if job.done and job.attempt]
+        if not left or not spent:
+            return "time unknown: no job has finished yet" if left else "nothing left"
+        total = duration(fmean(spent) * left / min(self.workers, left))
+        return f"about {total}, {self.workers} at a time"
 
     def _stale(self) -> str:
         """A remark on results that other code than the present one computed."""
@@ -283,24 +270,6 @@ class Plan:
         commits = [job.attempt.commit for job in self.jobs if job.done and job.attempt]
         other = sum(sha != present for sha in commits)
         return f" ({other} of the done ones by another commit; force=true redoes)" if other else ""
-
-
-def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
-    """Kind of job -> seconds for one seed, from what finished in the folders of all runs."""
-    found: dict[str, list[float]] = {}
-    places = sorted(
-        folders.glob(f"*/*/{RESULT}"), key=lambda place: place.parent.parent != plan.folder
-    )
-    for place in places[:MAX_READ]:
-        try:
-            record = read_record(place)
-        except InputError:
-            # Not a result of this version: it tells no time.
-            continue
-        if record.converged and record.model is not None:
-            seconds = record.seconds_total / max(1, len(record.estimates))
-            found.setdefault(json.dumps(record.model.model_dump()), []).append(seconds)
-    return found
 
 
 def _texts(factors: Mapping[str, Any]) -> list[str]:

@@ -1,11 +1,14 @@
 """The real worker with a study that takes no time and does what files in its folder say.
 
-``kill-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that seed, once; one
-with ``wait-SEED`` goes on when that is gone. Every run leaves a line in ``runs``.
+``kill-SEED``, ``exit-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that seed,
+once; ``hold-SEED`` and ``spin-SEED`` run on in compiled code or in Python, ``spawn-SEED`` waits for a
+child; one with ``wait-SEED`` goes on when that is gone. Every run leaves a line in ``runs``.
 """
 
+import ctypes
 import os
 import signal
+import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -28,7 +31,7 @@ def run(job):
         runs.write(f"{seed}\n")
     while Path(f"wait-{seed}").exists():
         time.sleep(0.02)
-    for name in ("kill", "raise", "hog", "full"):
+    for name in ("kill", "exit", "raise", "hog", "full", "hold", "spin", "spawn"):
         order = Path(f"{name}-{seed}")
         if not order.exists():
             continue
@@ -36,6 +39,15 @@ def run(job):
         match name:
             case "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
+            case "exit":
+                os._exit(3)
+            case "hold":  # no other thread of Python runs meanwhile
+                ctypes.PyDLL(None).sleep(600)
+            case "spin":
+                while True:
+                    sum(range(1000))
+            case "spawn":
+                subprocess.run(["sleep", "311"], check=False)
             case "raise":
                 raise RuntimeError("it broke")
             case "hog":
