@@ -44,6 +44,8 @@ from experiments.runner.execution import guard
 guard.WORKER = (sys.executable, {FAKE!r})
 """
 
+MAIN = "from experiments.run import main; main()"
+
 RUN = (
     "experiment=debug", "seed=range(0,40)", "time_limit_s=5", "memory_limit_gb=0.5",
     "tracking.enabled=false",
@@ -61,8 +63,7 @@ def measure(engine: Sequence[str]) -> dict[str, Any]:
         instead.write_text(INSTEAD, encoding="utf-8")
         began = time.monotonic()
         ended = subprocess.run(
-            [sys.executable, "-P", "-c", f"{INSTEAD}from experiments.run import main\nmain()"]
-            + ["-m", *RUN, *engine],
+            [sys.executable, "-P", "-c", f"{INSTEAD}{MAIN}", "-m", *RUN, *engine],
             cwd=folder,
             env=os.environ
             | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__PRELOAD": f'["{instead}"]'},

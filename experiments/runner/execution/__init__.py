@@ -1,1 +1,1 @@
-"""Jobs run: here, in a process apart, off a list, and on Slurm."""
+"""Jobs run: in a process apart, on this machine or on the workers of a cluster."""

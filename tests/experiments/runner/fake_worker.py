@@ -1,8 +1,9 @@
 """The real worker with a study that takes no time and does what files in its folder say.
 
-``kill-SEED``, ``exit-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that seed,
-once; ``hold-SEED`` and ``spin-SEED`` run on in compiled code or in Python, ``spawn-SEED`` waits for a
-child; one with ``wait-SEED`` goes on when that is gone. Every run leaves a line in ``runs``.
+``kill-SEED``, ``exit-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that
+seed, once; ``hold-SEED`` and ``spin-SEED`` run on in compiled code or in Python, ``spawn-SEED``
+waits for a child; one with ``wait-SEED`` goes on when that is gone. Every run leaves a line in
+``runs``.
 """
 
 import ctypes
