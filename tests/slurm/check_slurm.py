@@ -21,8 +21,8 @@ PATIENCE = 600.0
 SWEEP = (
     sys.executable, "-P", "-m", "experiments.run", "-m", "sweep=debug", "tracking.enabled=false",
     "hydra.launcher.cluster=SLURMCluster", "hydra.launcher.jobs=2",
-    "hydra.launcher.options={walltime: '00:30:00', memory: 2GB}",
 )  # fmt: skip
+OPTIONS = "hydra.launcher.options={walltime: '00:30:00', memory: 2GB}"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -35,9 +35,9 @@ def asked(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
-def start(folder: Path, *overrides: str) -> subprocess.Popen[str]:
+def start(folder: Path, options: str = OPTIONS) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [*SWEEP, *overrides],
+        [*SWEEP, options],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,

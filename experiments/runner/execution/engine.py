@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -29,6 +29,7 @@ from experiments.runner.jobs.request import Request
 from experiments.sweeps.collected import head_of
 from mvest.errors import ConfigurationError, MvestError
 from mvest.quantities import within
+from mvest.reading.text import one_line
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -248,19 +249,23 @@ def _client(settings: EngineSettings, folder: Path) -> Iterator[Client]:
                     tls_client_key=settings.tls["key"],
                 )
             if settings.cluster is not None:
-                where = stack.enter_context(
-                    _cluster(settings.cluster, settings.options or {}, folder)
-                )
+                where = _cluster(settings.cluster, settings.options or {}, folder)
+                stack.callback(_close, where)
+                where.scale(1 if settings.adapt else settings.jobs)
+                where.sync(where._correct_state)
+                for worker in where.workers.values():
+                    if worker.status.name == "created":
+                        # It could not be submitted; asked again, its queue says why.
+                        where.sync(worker.start)
                 if settings.adapt:
                     where.adapt(minimum=0, maximum=settings.jobs)
-                else:
-                    where.scale(settings.jobs)
             client = stack.enter_context(
                 Client(where, scheduler_file=settings.scheduler_file, security=secure)
             )
         except (OSError, RuntimeError, ValueError, TypeError, KeyError, ImportError) as error:
             name = settings.cluster or settings.address or settings.scheduler_file
-            raise ConfigurationError(f"hydra.launcher: no cluster {name}: {error}") from error
+            why = one_line(error, 300)
+            raise ConfigurationError(f"hydra.launcher: no cluster {name}: {why}") from error
         try:
             yield client
         except BaseException:
@@ -268,6 +273,13 @@ def _client(settings: EngineSettings, folder: Path) -> Iterator[Client]:
                 # Its workers would wait for their jobs.
                 client.run(stop_jobs)
             raise
+
+
+def _close(cluster: Any) -> None:
+    # Of workers that were never submitted it finds that they are not closed, last of all.
+    with suppress(AssertionError):
+        cluster.close()
+    cluster.shutdown_on_close = False
 
 
 def require_engine(settings: EngineSettings) -> None:
