@@ -8,9 +8,7 @@ from .filters.ensemble import EnsembleFilter as EnsembleFilter
 from .filters.extended import ExtendedFilter as ExtendedFilter
 from .filters.importance import ImportanceFilter as ImportanceFilter
 from .filters.iterated import IteratedFilter as IteratedFilter
-from .filters.monte_carlo import MonteCarloFilter as MonteCarloFilter
 from .filters.paper import PaperFilter as PaperFilter
-from .filters.sampler import SamplerSettings as SamplerSettings
 from .filters.unscented import UnscentedFilter as UnscentedFilter
 from .gaussian import Gaussian as Gaussian
 from .information.consistency import Consistency as Consistency

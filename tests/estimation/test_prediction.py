@@ -9,8 +9,8 @@ from mvest.estimation import (
     ExtendedFilter,
     Gaussian,
     Identity,
+    ImportanceFilter,
     IteratedFilter,
-    MonteCarloFilter,
     PaperFilter,
     Prediction,
     SchmidtFilter,
@@ -32,7 +32,7 @@ FILTERS = (
     UnscentedFilter(),
     EnsembleFilter(),
     SchmidtFilter(IteratedFilter(), ("m[1]",)),
-    MonteCarloFilter(),
+    ImportanceFilter(),
 )
 
 
