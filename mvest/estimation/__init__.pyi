@@ -3,7 +3,6 @@ from .estimate import Estimate as Estimate
 from .estimate import Filter as Filter
 from .estimate import InnovationSummary as InnovationSummary
 from .estimate import Reason as Reason
-from .filters.considered import SchmidtFilter as SchmidtFilter
 from .filters.ensemble import EnsembleFilter as EnsembleFilter
 from .filters.extended import ExtendedFilter as ExtendedFilter
 from .filters.importance import ImportanceFilter as ImportanceFilter

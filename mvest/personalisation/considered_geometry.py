@@ -45,7 +45,6 @@ _SCALES = (
     "rest_lengths",
     "thickness",
     "fibre_degrees",
-    "samples_mm",
 )
 
 TOLERANCE = 1e-4
@@ -82,9 +81,6 @@ class ConsideredGeometry:
     factor : float
         How well the scale of the open shape's and the annulus' errors is known itself, where errors
         are learned: one standard deviation of its logarithm, as a factor.
-    samples_mm : float
-        Of a case with error samples of its frames: over which distance errors are taken for alike
-        that few samples may show alike by chance. 0: over all of the valve, as the samples say.
     share : float
         Of the variance of smooth modes that is represented; finer ones are left out.
     renewals : int
@@ -103,7 +99,6 @@ class ConsideredGeometry:
     thickness: Thickness = 0.1
     fibre_degrees: Angle = 10.0
     factor: Factor = 2.0
-    samples_mm: Length = 0.0
     share: Share = 0.9
     renewals: Count = 0
 

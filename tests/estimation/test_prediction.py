@@ -13,7 +13,6 @@ from mvest.estimation import (
     IteratedFilter,
     PaperFilter,
     Prediction,
-    SchmidtFilter,
     UnscentedFilter,
 )
 from mvest.estimation.prediction import as_prediction, predict
@@ -31,7 +30,6 @@ FILTERS = (
     IteratedFilter(),
     UnscentedFilter(),
     EnsembleFilter(),
-    SchmidtFilter(IteratedFilter(), ("m[1]",)),
     ImportanceFilter(),
 )
 
