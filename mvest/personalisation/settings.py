@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
@@ -100,10 +100,7 @@ class PressureErrors:
     each_mmHg: PressureError = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("offset_mmHg", "each_mmHg"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"pressures {name} = {value}, expected >= 0")
+        require_numbers(self, "pressures", "offset_mmHg", "each_mmHg", least=0)
 
     def unknowns(self, frames: Iterable[str]) -> tuple[Prior, ...]:
         """What is not known of the pressures of these frames."""
