@@ -1,6 +1,7 @@
 """The study of all filters, on models that are computed in no time."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import pytest
 from experiments.common.building.filters import build_filter
 from experiments.common.config import plain
 from experiments.common.records.record import read_record
+from experiments.common.schema import build
 from experiments.run import main
-from experiments.studies.filters import figure
+from experiments.studies.filters import Settings, figure, run
+from mvest.errors import ConfigurationError
 from mvest.estimation import EnsembleFilter, ExtendedFilter, ImportanceFilter, UnscentedFilter
 from mvest.reporting.style import BAD, GOOD
 from mvest.reporting.tables import table
@@ -67,6 +70,17 @@ def test_every_filter_has_an_interval_on_that_of_the_draws(width, colour, words)
     (band,) = axes.patches
     assert band.get_x() == pytest.approx(-2.0)
     assert band.get_width() == pytest.approx(4.0)
+
+
+def test_a_reference_without_draws_is_refused() -> None:
+    one = ("~filters.problems.chordae", "~filters.problems.rest_length")
+    values = plain(composed("experiment=filters", *SMALL, *one))
+    values["filters"]["reference"] = {
+        "_target_": "mvest.estimation.filters.extended.ExtendedFilter"
+    }
+    settings = build(Settings, {"filters": values["filters"]})
+    with pytest.raises(ConfigurationError, match=r"filters\.reference: no draws"):
+        run(SimpleNamespace(settings=settings, values=values))
 
 
 def test_the_study_runs_and_its_tables_follow_from_the_record(
