@@ -8,7 +8,7 @@ and all the rest, is in the rooms.
   `ClosureProtocol`; `run_gate` asks whether it can be trusted.
 * Moduli from a closed valve: `simulate_observation`, `estimate` for a `Problem`; a filter
   (`PaperFilter`, `ExtendedFilter`, `IteratedFilter`, `UnscentedFilter`, `EnsembleFilter`,
-  `MonteCarloFilter`) from a `Gaussian` prior, in coordinates `Identity` or `Log`, for any model
+  `ImportanceFilter`) from a `Gaussian` prior, in coordinates `Identity` or `Log`, for any model
   that returns a `Prediction`; `identifiability`.
 * A patient: `read_case`, `write_case`, `ValveCase`; `personalise` estimates its moduli, by
   `default_settings` or `PersonaliseSettings` with every `Prior`, and `report` writes the page.

@@ -5,6 +5,7 @@ computation that does not converge is no exception: it is a result whose `reason
 """
 
 import errno
+import math
 from pathlib import Path
 
 
@@ -30,6 +31,25 @@ class ConfigurationError(InputError):
 
 class MeshingError(MvestError):
     """An admissible surface could not be filled with an admissible mesh."""
+
+
+def require_numbers(owner: object, what: str, *names: str, least: float | None = None) -> None:
+    """Raise InputError where an attribute is no finite number above 0, or of at least ``least``.
+
+    Parameters
+    ----------
+    owner : object
+    what : str
+        What the owner is, for the message.
+    names : str
+        Of the attributes.
+    least : float, optional
+    """
+    expected = "> 0" if least is None else f">= {least:g}"
+    for name in names:
+        value = getattr(owner, name)
+        if not math.isfinite(value) or (value <= 0 if least is None else value < least):
+            raise InputError(f"{what} {name} = {value}, expected {expected}")
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:

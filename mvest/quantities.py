@@ -73,7 +73,6 @@ Tolerance: TypeAlias = Annotated[float, within(1e-15, 1, "", "relative tolerance
 Value: TypeAlias = Annotated[float, within(-1e12, 1e12, "", "in the units of any model")]
 Values: TypeAlias = Annotated[Any, within(-1e12, 1e12, "", "in the units of any model")]
 Count: TypeAlias = Annotated[int, within(0, 100_000, "", "things that each take their time")]
-Degree: TypeAlias = Annotated[int, within(0, 20, "", "of polynomials; beyond, all is round-off")]
 Halvings: TypeAlias = Annotated[int, within(0, 60, "", "of a step; then nothing is left of it")]
 Repeats: TypeAlias = Annotated[int, within(1, 100_000, "", "observations to estimate from")]
 Seed: TypeAlias = Annotated[int, within(0, 2**32 - 1, "", "what random generators take")]

@@ -106,7 +106,7 @@ FILTERS = (
     mvest.IteratedFilter(),
     mvest.UnscentedFilter(),
     mvest.EnsembleFilter(),
-    mvest.MonteCarloFilter(),
+    mvest.ImportanceFilter(),
 )
 
 

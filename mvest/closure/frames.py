@@ -73,7 +73,7 @@ class FramesModel:
         if self.errors and SCALE not in self.model.names:
             raise InputError(
                 f"errors of pressures ({', '.join(self.errors)}) need {SCALE} among the parameters "
-                "that are estimated or considered"
+                "that are estimated"
             )
 
     @property

@@ -20,14 +20,6 @@ Optimization, 2006, appendix A.2)::
 Of K samples the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 % point of Student's
 distribution with K degrees of freedom, so that an interval of ± 1.96 standard deviations is one of
 95 %.
-
-The mean square of few samples has directions in which it is zero, though errors have none; and far
-apart it takes for a correlation what is chance. A cure is to localise it: the covariance of the
-errors at places x and x' is multiplied with a correlation ρ(x, x') of some length (Houtekamer and
-Mitchell, A sequential ensemble Kalman filter for atmospheric data assimilation, Monthly Weather
-Review 129, 2001). With modes ρ = Σ φⱼ φⱼᵀ the product is that of columns φⱼ dₖ, so that samples
-of what an observation is made from are localised there, and what they do to it is given beside the
-samples. They are weighed with; the covariance is still that of the samples as they are.
 """
 
 from __future__ import annotations
@@ -77,16 +69,12 @@ class SampledErrors:
         each source. None: all are independent.
     beside : (n, q) or None
         C of the base: errors that no sample has, one standard deviation of each.
-    localised : (n, K, J) or None
-        What the filter weighs with for each sample: its J parts, of which the mean squares add up.
-        None: itself.
     """
 
     base: ObservationNoise
     samples: FloatArray
     source: IntArray | None = None
     beside: FloatArray | None = None
-    localised: FloatArray | None = None
 
     def __post_init__(self) -> None:
         samples = np.array(self.samples, dtype=np.float64)
@@ -101,13 +89,6 @@ class SampledErrors:
                 f"sources of shape {np.shape(self.source)}, expected one for each of "
                 f"{samples.shape[1]} samples"
             )
-        if self.localised is not None:
-            if np.ndim(self.localised) != 3 or self.localised.shape[:2] != samples.shape:
-                raise InputError(
-                    f"localised samples have shape {np.shape(self.localised)}, expected "
-                    f"{(*samples.shape, 'J')}"
-                )
-            require_finite(self.localised, "localised samples of errors")
         samples.setflags(write=False)
         object.__setattr__(self, "samples", samples)
 
@@ -119,23 +100,17 @@ class SampledErrors:
     @property
     def columns(self) -> FloatArray:
         """C ``(n, q)``: what the filter adds to its noise is C Cᵀ."""
-        return self._parts.reshape(self.base.size, -1) / np.sqrt(self.count)
-
-    @property
-    def _parts(self) -> FloatArray:
-        """What is weighed with for each sample, ``(n, K, J)``."""
-        return self.samples[:, :, None] if self.localised is None else self.localised
+        return self.samples / np.sqrt(self.count)
 
     @property
     def noise(self) -> ObservationNoise:
-        """R + C Cᵀ, without localisation R + 1/K Σ d dᵀ."""
+        """R + C Cᵀ = R + 1/K Σ d dᵀ."""
         return low_rank_noise(self.base, self.columns)
 
     def posterior(
         self,
         jacobian: FloatArray,
         prior: FloatArray,
-        estimated: BoolArray | None = None,
         curvature: FloatArray | None = None,
     ) -> SampledPosterior:
         """Covariance of the estimate of a linear model.
@@ -146,9 +121,6 @@ class SampledErrors:
             H at the estimate.
         prior : (p, p)
             Covariance P.
-        estimated : (p,), optional
-            Which parameters are estimated; the others keep their prior and are considered. They
-            must be independent of those in the prior. Default: all.
         curvature : (p, p), optional
             S, see `Estimate.curvature`. Default: none, as of a model that is linear.
         """
@@ -156,14 +128,12 @@ class SampledErrors:
         D = self.base.whiten(self.samples)
         P = Gaussian(np.zeros(len(prior)), prior).covariance
         S = np.zeros_like(P) if curvature is None else curvature
-        kept = np.ones(len(P), dtype=np.bool_) if estimated is None else estimated
         U, parts = self._seen()
 
         def gain(used: BoolArray) -> tuple[FloatArray, FloatArray]:
             """Of some samples, and what it leaves of an error of the prior."""
             own = parts[:, used]
-            B = np.tensordot(own, own, ([1, 2], [1, 2])) / max(int(used.sum()), 1)
-            return _gain(H, P, S, U, B, kept)
+            return _gain(H, P, S, U, own @ own.T / max(int(used.sum()), 1))
 
         K, rest = gain(np.ones(self.count, dtype=np.bool_))
         moved = np.empty((len(P), self.count))
@@ -186,27 +156,24 @@ class SampledErrors:
     def _seen(self) -> tuple[FloatArray, FloatArray]:
         """Orthonormal directions ``(n, r)`` of whitened columns, and their parts in them.
 
-        Those are ``(r, K, J)``. Directions in which they are far below the noise are left out.
+        Those are ``(r, K)``. Directions in which they are far below the noise are left out.
         """
-        parts = self._parts
         columns = self.base.whiten(self.columns)
         U, s, Vt = np.linalg.svd(columns, full_matrices=False)
         kept = s > SEEN
         own = np.sqrt(self.count) * s[kept, None] * Vt[kept]
-        return np.ascontiguousarray(U[:, kept]), own.reshape(len(own), *parts.shape[1:])
+        return np.ascontiguousarray(U[:, kept]), own
 
 
 def _gain(
-    H: FloatArray, P: FloatArray, S: FloatArray, U: FloatArray, B: FloatArray, kept: BoolArray
+    H: FloatArray, P: FloatArray, S: FloatArray, U: FloatArray, B: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Gain ``(p, n)`` for whitened observations with noise R = I + U B Uᵀ, U orthonormal.
 
     It is M P Hᵀ R⁻¹ with M = (I + P (Hᵀ R⁻¹ H + S))⁻¹ and R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ; M
-    ``(p, p)`` is what is left of an error of the prior. What is not kept does not move.
+    ``(p, p)`` is what is left of an error of the prior.
     """
     UH = U.T @ H
     weighed = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
     M = np.linalg.inv(np.eye(len(P)) + P @ (weighed.T @ H + S))
-    K = M @ P @ weighed.T
-    K[~kept], M[~kept] = 0.0, np.eye(len(P))[~kept]
-    return np.asarray(K, dtype=np.float64), np.asarray(M, dtype=np.float64)
+    return np.asarray(M @ P @ weighed.T, dtype=np.float64), np.asarray(M, dtype=np.float64)

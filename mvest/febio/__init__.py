@@ -1,5 +1,5 @@
-"""Bodies and valves as input of FEBio (file format 4), and what FEBio makes of them.
+"""Bodies and valves as input of FEBio (file format 4), and where it moves their nodes.
 
 FEBio (febio.org, MIT licence) is a finite-element program for soft tissue that others keep. Nothing
-of it is needed to write its input; to run it, name the program (`mvest.febio.program`).
+of it is needed to write its input.
 """

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.febio.document import (
     Averages,
     Control,
@@ -94,9 +94,7 @@ class FebSettings:
             raise InputError(
                 f"steps = {self.steps}, quasi_newton = {self.quasi_newton}; expected >= 1 and >= 0"
             )
-        for name in ("penalty", "tolerance", "density_factor"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} = {getattr(self, name)}, expected > 0")
+        require_numbers(self, "FEBio", "penalty", "tolerance", "density_factor")
 
 
 def valve_document(model: ClosureModel, m: FloatArray, settings: FebSettings) -> FebDocument:

@@ -7,7 +7,7 @@ which of the kinds of tissue they know (:attr:`mvest.mechanics.solid.Law.kinds`)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -144,6 +144,12 @@ class Parameter:
         """Number of the mode of a field; -1 where the name has none that can be read."""
         number = self.part.rpartition(".")[2]
         return int(number) if self.kind == "field" and number.isdecimal() else -1
+
+    def require(self, kinds: Collection[str]) -> None:
+        """Raise InputError where a law, which knows these kinds, does not know the parameter."""
+        if self.kind not in kinds:
+            known = known_names(kinds) if kinds else "none"
+            raise InputError(f"parameter {self.name!r}: the law of its leaflet knows {known}")
 
 
 def known_names(kinds: Iterable[str] = ()) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError, MaterialError, require_numbers
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 from mvest.quantities import (
@@ -129,10 +129,8 @@ class TissueSettings:
             )
         if self.law in ("exponential", "stiffening") and self.exponential is None:
             raise InputError(f"law of a tissue = {self.law!r}: its coefficients are missing")
-        if not (np.isfinite(self.stiffening) and self.stiffening >= 0.0):
-            raise InputError(f"stiffening of a tissue = {self.stiffening}, expected >= 0")
-        if not (np.isfinite(self.prestretch) and self.prestretch > 0.0):
-            raise InputError(f"prestretch of a tissue = {self.prestretch}, expected > 0")
+        require_numbers(self, "tissue", "stiffening", least=0)
+        require_numbers(self, "tissue", "prestretch")
         if self.law == "corotational" and self.prestretch != 1.0:
             raise InputError("prestretch of a tissue: the corotational law has none")
         known = [reading.value for reading in PoissonReading]
@@ -197,12 +195,8 @@ class ModulusField:
     modes: Count
 
     def __post_init__(self) -> None:
-        for name in ("correlation_length_mm", "std_log"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"field {name} = {value}, expected > 0")
-        if self.modes < 1:
-            raise InputError(f"field modes = {self.modes}, expected at least 1")
+        require_numbers(self, "field", "correlation_length_mm", "std_log")
+        require_numbers(self, "field", "modes", least=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,10 +224,7 @@ class StiffPatch:
     def __post_init__(self) -> None:
         if len(self.centre) != 3 or not np.all(np.isfinite(self.centre)):
             raise InputError(f"centre of a patch {self.centre}, expected (x, y, z) mm")
-        for name in ("radius_mm", "factor"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} of a patch = {value}, expected > 0")
+        require_numbers(self, "patch", "radius_mm", "factor")
 
     def log_scale(self, points: FloatArray) -> FloatArray:
         """What is added to log E_f ``(...)`` at points ``(..., 3)`` mm of the reference frame."""
@@ -385,8 +376,6 @@ class MechanicsSettings:
     patches: dict[str, StiffPatch] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("density", "support_stiffness", "patch_radius"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"mechanics {name} = {getattr(self, name)}, expected > 0")
+        require_numbers(self, "mechanics", "density", "support_stiffness", "patch_radius")
         if self.support not in ("hinge", "clamp"):
             raise InputError(f"annulus support {self.support!r}, expected hinge or clamp")

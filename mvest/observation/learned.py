@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.estimation.noise_family import (
     LogNormal,
     NoiseBlock,
@@ -73,16 +73,10 @@ class ErrorBeliefs:
     resolution_mm: Length = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("std_factor", "length_factor", "deviation", "other_factor", "frame_factor"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 1.0):
-                raise InputError(f"errors {name} = {value}, expected a factor >= 1")
-        for name in ("length_mm", "other_share"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"errors {name} = {value}, expected > 0")
-        if not (np.isfinite(self.resolution_mm) and self.resolution_mm >= 0.0):
-            raise InputError(f"errors resolution_mm = {self.resolution_mm}, expected >= 0")
+        factors = "std_factor", "length_factor", "deviation", "other_factor", "frame_factor"
+        require_numbers(self, "errors", *factors, least=1)
+        require_numbers(self, "errors", "length_mm", "other_share")
+        require_numbers(self, "errors", "resolution_mm", least=0)
 
     def parts(self, std: float, length: float) -> tuple[LogNormal, LogNormal, LogNormal]:
         """Smooth part, its length, and rough part of errors that are stated; all in mm."""

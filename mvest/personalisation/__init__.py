@@ -3,8 +3,7 @@
 The chain of one case. The model is built from the reference frame, its chordae and the tracked
 boundary. What is not known besides the moduli (pressure, rest lengths and stiffness of the chordae,
 a rigid displacement between the tracked boundary and the leaflets) is estimated with a prior, or
-considered, or left fixed, as each unknown says. Frames that are held out are predicted, never
-shown.
+left fixed, as each unknown says. Frames that are held out are predicted, never shown.
 """
 
 import lazy_loader

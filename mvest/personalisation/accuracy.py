@@ -73,9 +73,7 @@ def narrower(estimation: CaseEstimation, result: StudyResult) -> Mapping[str, Fl
     z = filtered.transformed_iterates[-1]
     H = filtered.prediction.jacobian * estimation.transform.derivative(z)
     errors, learned = estimation.errors.samples, filtered.learned
-    doubt = np.zeros_like(prior.covariance)
-    if learned is not None:
-        doubt[np.ix_(estimation.estimated, estimation.estimated)] = learned.covariance
+    doubt = np.zeros_like(prior.covariance) if learned is None else learned.covariance
     groups = _measurable(estimation)
 
     def widened(covariance: FloatArray, scale: float) -> FloatArray:

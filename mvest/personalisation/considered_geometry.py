@@ -20,7 +20,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.estimation.noise import ObservationNoise
 from mvest.estimation.noise_family import ErrorColumns, smooth_basis
 from mvest.estimation.prediction import Prediction, predict
@@ -36,17 +36,6 @@ from mvest.valve.geometry.proximity import closest_points
 
 SEEN = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
-
-_SCALES = (
-    "shape_mm",
-    "annulus_mm",
-    "tips_mm",
-    "insertions_mm",
-    "rest_lengths",
-    "thickness",
-    "fibre_degrees",
-    "samples_mm",
-)
 
 TOLERANCE = 1e-4
 """Of derivatives, relative, far below what is known of the size of errors."""
@@ -82,9 +71,6 @@ class ConsideredGeometry:
     factor : float
         How well the scale of the open shape's and the annulus' errors is known itself, where errors
         are learned: one standard deviation of its logarithm, as a factor.
-    samples_mm : float
-        Of a case with error samples of its frames: over which distance errors are taken for alike
-        that few samples may show alike by chance. 0: over all of the valve, as the samples say.
     share : float
         Of the variance of smooth modes that is represented; finer ones are left out.
     renewals : int
@@ -103,25 +89,17 @@ class ConsideredGeometry:
     thickness: Thickness = 0.1
     fibre_degrees: Angle = 10.0
     factor: Factor = 2.0
-    samples_mm: Length = 0.0
     share: Share = 0.9
     renewals: Count = 0
 
     def __post_init__(self) -> None:
-        for name in _SCALES:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"considered geometry {name} = {value}, expected >= 0")
-        if self.renewals < 0:
-            raise InputError(f"considered geometry renewals = {self.renewals}, expected >= 0")
-        for name in ("shape_length_mm", "annulus_length_mm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"considered geometry {name} = {value}, expected > 0")
-        if not (np.isfinite(self.factor) and self.factor >= 1.0):
-            raise InputError(f"considered geometry factor = {self.factor}, expected >= 1")
+        what = "considered geometry"
+        sizes = "shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "rest_lengths", "thickness"
+        require_numbers(self, what, *sizes, "fibre_degrees", "renewals", least=0)
+        require_numbers(self, what, "shape_length_mm", "annulus_length_mm")
+        require_numbers(self, what, "factor", least=1)
         if not 0.0 < self.share < 1.0:
-            raise InputError(f"considered geometry share = {self.share}, expected within 0 and 1")
+            raise InputError(f"{what} share = {self.share}, expected within 0 and 1")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

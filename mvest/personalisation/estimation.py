@@ -14,7 +14,6 @@ from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
-from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
@@ -94,8 +93,6 @@ class CaseEstimation:
         several = frames_model(case, settings, model)
         self._stated = CaseClosure.of(model, several, self.names, start)
         self._closure = self._stated
-        self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
-        self.estimated = np.array([name not in self._held for name in self.names])
         names = None if several is None else several.frames
         self.fitted = FittedFrames(case, settings, model.valve, names)
         self.errors = ObservationErrors(self.fitted, self.registered)
@@ -109,12 +106,10 @@ class CaseEstimation:
 
         ``final``: something is read from its covariance, which is to be that of the posterior.
         """
-        inner = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
-        if self._held:
-            return SchmidtFilter(inner, self._held)
+        plain = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
         if start is None:
-            return inner
-        return replace(inner, start=start, max_learned=LEARNED, second_order=final)
+            return plain
+        return replace(plain, start=start, max_learned=LEARNED, second_order=final)
 
     def knowledge(self) -> dict[str, float]:
         """Prior standard deviations, relative of what is positive, but of pressures' errors."""
@@ -246,15 +241,12 @@ class CaseEstimation:
         known = errors.known
         if filtered is None or filtered.prediction is None or known is None or not known.modes:
             return None
-        held = ~self.estimated
         return JointPosterior(
             to_filter(self.transform, self.prior),
             self.transform,
             self.fitted.observation(),
             errors,
             filtered.learned,
-            self.estimated,
-            filtered.prediction.jacobian[:, held] * self.prior.std[held],
         )
 
     def _displaced(
@@ -378,12 +370,9 @@ class CaseEstimation:
         z = filtered.transformed_iterates[-1]
         H = filtered.prediction.jacobian * filtered.transform.derivative(z)
         prior = to_filter(filtered.transform, filtered.prior)
-        estimated = np.isin(filtered.names, np.array(self.names)[self.estimated])
         learned = filtered.learned
         if learned is None:
-            return samples.posterior(H, prior.covariance, estimated, filtered.curvature)
+            return samples.posterior(H, prior.covariance, filtered.curvature)
         errors = self.errors.weighing(samples, learned)
-        posterior = errors.posterior(H, prior.covariance, estimated, filtered.curvature)
-        covariance = np.array(posterior.covariance)
-        covariance[np.ix_(estimated, estimated)] += learned.covariance
-        return replace(posterior, covariance=covariance)
+        posterior = errors.posterior(H, prior.covariance, filtered.curvature)
+        return replace(posterior, covariance=posterior.covariance + learned.covariance)

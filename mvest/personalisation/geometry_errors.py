@@ -25,16 +25,12 @@ from mvest.personalisation.considered_geometry import (
     TOLERANCE,
     closure_at,
     rest_lengths_by_ends,
-    smooth_modes,
 )
 from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
 from mvest.valve.geometry.proximity import closest_points
-
-FIELD_SHARE = 0.95
-"""Of the variance of the field by which samples are localised."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,38 +81,6 @@ def sample_geometry(
     if isinstance(change, str):
         return change
     return GeometryErrors(np.moveaxis(change[-1], -1, 0), vertices[:, _numbers(case)[1]])
-
-
-def localised_samples(case: ValveCase, length: float) -> tuple[FloatArray, FloatArray]:
-    """Every error sample of a case, times each of J modes of a smooth field of unit variance.
-
-    Their mean square is the covariance of the samples times the correlation of the field, of each
-    two places: errors that are far apart are not taken for alike because few samples are. Places
-    are those of the open frame's vertices and tips, whichever frame an error is of.
-
-    Parameters
-    ----------
-    case : ValveCase
-        With error samples.
-    length : float
-        Of the field's Matérn correlation, in mm.
-
-    Returns
-    -------
-    vertices : (K, J, f, n, 3) mm
-    tips : (K, J, f, t, 3) mm
-    """
-    samples, open_ = case.error_samples, case.frame(Role.REFERENCE)
-    assert samples is not None
-    modes = smooth_modes(
-        np.concatenate([open_.vertices, open_.papillary_tips]), length, FIELD_SHARE
-    )
-    modes = modes / np.linalg.norm(modes, axis=0)
-    at, n = modes[None, :, None, :, None], len(open_.vertices)
-    return (
-        samples.vertices[:, None] * at[..., :n, :],
-        samples.tips[:, None] * at[..., n:, :],
-    )
 
 
 def frame_errors(

@@ -17,7 +17,7 @@ from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
 from mvest.personalisation.observation_errors import ObservationErrors
 from mvest.problem.problem import Observed
-from mvest.typing import BoolArray, FloatArray
+from mvest.typing import FloatArray
 
 T = TypeVar("T")
 
@@ -43,10 +43,6 @@ class JointPosterior:
         With what the geometry does.
     learned : LearnedNoise or None
         By which they are known; None: as they are stated.
-    estimated : (p,)
-        Which parameters are; the others stay at their prior's mean, independent of these.
-    considered : (k, r)
-        What those others do to the observation, one standard deviation of each.
     """
 
     prior: Gaussian
@@ -54,15 +50,13 @@ class JointPosterior:
     observation: Observed
     errors: ObservationErrors
     learned: LearnedNoise | None
-    estimated: BoolArray
-    considered: FloatArray
 
     @cached_property
     def noise(self) -> ObservationNoise:
         """Of the observation of a valve with a known geometry."""
         assert self.errors.known is not None
         kinds = [own.name for own in self.errors.known.modes]
-        return self.errors.noise(self.learned, without=kinds, beside=self.considered)
+        return self.errors.noise(self.learned, without=kinds)
 
     @cached_property
     def marginal(self) -> ObservationNoise:
@@ -134,11 +128,8 @@ class JointPosterior:
         H : (k, p)
             Derivatives of what is predicted there.
         """
-        free, away = self.estimated, z - self.prior.mean
-        prior = Gaussian(self.prior.mean[free], self.prior.covariance[np.ix_(free, free)])
-        innovation = residual + H[:, free] @ away[free]
-        end = np.array(z)
-        end[free] = kalman_update(prior, innovation, H[:, free], self.marginal).posterior.mean
+        innovation = residual + H @ (z - self.prior.mean)
+        end = kalman_update(self.prior, innovation, H, self.marginal).posterior.mean
         return end, residual - H @ (end - z)
 
     def refitted(self, m: FloatArray, prediction: Prediction) -> FloatArray:
@@ -151,14 +142,13 @@ class JointPosterior:
         prediction : Prediction
             What was predicted there, with derivatives.
         """
-        z, free = np.array(self.transform.forward(m)), self.estimated
+        z = self.transform.forward(m)
         seen = predict(self.observation.of(lambda _: prediction), m, derivatives=True)
-        H = self.noise.whiten((seen.jacobian * self.transform.derivative(z))[:, free])
-        precision = np.linalg.inv(self.prior.covariance[np.ix_(free, free)])
+        H = self.noise.whiten(seen.jacobian * self.transform.derivative(z))
+        precision = np.linalg.inv(self.prior.covariance)
         slope = H.T @ self.noise.whiten(self.observation.y - seen.y)
-        slope -= precision @ (z - self.prior.mean)[free]
-        z[free] += np.linalg.solve(H.T @ H + precision, slope)
-        return self.transform.inverse(z)
+        slope -= precision @ (z - self.prior.mean)
+        return self.transform.inverse(z + np.linalg.solve(H.T @ H + precision, slope))
 
 
 def damped_step(

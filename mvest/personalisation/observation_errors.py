@@ -34,7 +34,6 @@ from mvest.personalisation.geometry_errors import (
     GeometryErrors,
     WeighedObservation,
     errors_of,
-    localised_samples,
     sample_geometry,
 )
 from mvest.problem.problem import Observed
@@ -165,26 +164,7 @@ class ObservationErrors:
             raise GeometryError(f"case {case.name}: what its error samples do: {sampled}")
         self.geometry, errors = sampled
         assert case.error_samples is not None
-        plain = SampledErrors(
-            self.noise(),
-            errors,
-            case.error_samples.source,
-            localised=self._localised(m, predicted),
-        )
-        self.samples = self.weighing(plain)
-
-    def _localised(self, m: FloatArray, predicted: FloatArray) -> FloatArray | None:
-        """What the localised samples do to the innovation ``(n, K, J)``, if they are to be."""
-        case, considered = self.fitted.case, self.fitted.settings.considered_geometry
-        if considered is None or not considered.samples_mm:
-            return None
-        vertices, tips = localised_samples(case, considered.samples_mm)
-        K, J = vertices.shape[:2]
-        joined = [part.reshape(K * J, *part.shape[2:]) for part in (vertices, tips)]
-        sampled = self.sampled(m, predicted, *joined)
-        if isinstance(sampled, str):
-            raise GeometryError(f"case {case.name}: what its localised samples do: {sampled}")
-        return sampled[1].reshape(-1, K, J)
+        self.samples = self.weighing(SampledErrors(self.noise(), errors, case.error_samples.source))
 
     def sampled(
         self,
@@ -249,7 +229,7 @@ class ObservationErrors:
             for own in self.considered
             if own.name not in without
         ]
-        if beside is not None and beside.shape[1]:
+        if beside is not None:
             columns.append(beside)
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 

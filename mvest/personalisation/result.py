@@ -50,7 +50,7 @@ class Personalised:
     settings : PersonaliseSettings
     mesh : SolidMesh
     names : tuple of str, (p,)
-        Unknowns that are estimated or considered.
+        Unknowns that are estimated.
     prior : Gaussian
         Of these.
     result : StudyResult

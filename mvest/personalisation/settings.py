@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
@@ -32,10 +32,9 @@ STIFFENS = "stiffening."
 
 
 class Treatment(Enum):
-    """What becomes of an unknown: estimated, considered (its doubt counts), or fixed."""
+    """What becomes of an unknown: estimated, or fixed at its mean."""
 
     ESTIMATED = "estimated"
-    CONSIDERED = "considered"
     FIXED = "fixed"
 
 
@@ -95,26 +94,19 @@ class PressureErrors:
     each_mmHg : float
         Of the error that each has for itself, as where a frame falls on a steep part of the curve
         that its pressure is read from; 0: none.
-    considered : bool
-        Whether they only widen the intervals, instead of being estimated.
     """
 
     offset_mmHg: PressureError = 5.0
     each_mmHg: PressureError = 5.0
-    considered: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("offset_mmHg", "each_mmHg"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"pressures {name} = {value}, expected >= 0")
+        require_numbers(self, "pressures", "offset_mmHg", "each_mmHg", least=0)
 
     def unknowns(self, frames: Iterable[str]) -> tuple[Prior, ...]:
         """What is not known of the pressures of these frames."""
         stds = {OFFSET: self.offset_mmHg}
         stds |= {f"{ERROR}.{frame}": self.each_mmHg for frame in frames}
-        treatment = Treatment.CONSIDERED if self.considered else Treatment.ESTIMATED
-        return tuple(Prior(name, 0.0, std, treatment) for name, std in stds.items() if std)
+        return tuple(Prior(name, 0.0, std) for name, std in stds.items() if std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +222,7 @@ class PersonaliseSettings:
             if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
                 raise InputError(
                     f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
-                    "estimated or considered"
+                    "estimated"
                 )
         if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
             raise InputError(

@@ -78,7 +78,7 @@ class Unknown(Frozen):
         ``E_f.anterior``; what a reader calls it; empty for a factor.
     kind : {"modulus", "nuisance", "derived"}
         A derived modulus follows from an estimated one through a fixed ratio.
-    treatment : {"estimated", "considered", "fixed"}
+    treatment : {"estimated", "fixed"}
     prior_mean, prior_std : float or None
     estimate, std : float or None
         None where the run did not get so far.
@@ -94,7 +94,7 @@ class Unknown(Frozen):
     label: str = ""
     unit: str = ""
     kind: Literal["modulus", "nuisance", "derived"] = "modulus"
-    treatment: Literal["estimated", "considered", "fixed"] = "estimated"
+    treatment: Literal["estimated", "fixed"] = "estimated"
     prior_mean: float | None = None
     prior_std: float | None = None
     estimate: float | None = None

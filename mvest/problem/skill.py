@@ -20,9 +20,6 @@ from mvest.problem.registration import REGISTRATION
 GENERIC, PRIOR = "generic guess", "prior alone"
 """What tables call the two."""
 
-PRIOR_STD = 0.5
-"""Standard deviation of a modulus relative to its mean in the prior of a case."""
-
 HALF = float(norm.ppf(0.975))
 """Standard deviations from the middle of a 95 % interval to its end."""
 

@@ -124,11 +124,6 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if abs(value) < 100 else f"{value:.0f}"
 
 
-def with_std(value: Any, std: Any) -> str:
-    """``value ± std``, or the value alone where there is no standard deviation."""
-    return number(value) if number(std) == MISSING else f"{number(value)} ± {number(std, 2)}"
-
-
 def listed(words: Sequence[str]) -> str:
     """One or more words as a sentence lists them: with commas, and "and" before the last."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

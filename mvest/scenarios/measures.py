@@ -265,40 +265,28 @@ def _peaks(values: FloatArray, volumes: FloatArray) -> PeakStress:
 
 
 Measured = dict[str, float]
-"""Name with its unit -> number."""
+"""Name with its unit -> number; each leaflet has stresses of its own.
 
-MEASURES = {
-    "gap_mm2": "regurgitant gap: area within the annulus, seen along its normal, of the lines of "
-    "sight that stay farther than half the contact reach from every leaflet's midsurface",
-    "coaptation_length_mm": "length over which the leaflets touch (midsurfaces within the contact "
-    "reach) in the middle anteroposterior section, the smaller of both",
-    "coaptation_area_mm2": "area over which the leaflets touch, mean of both",
-    "coaptation_height_mm": "coaptation area over the commissural diameter: the mean height of "
-    "the touching zone across the valve",
-    "tenting_height_mm": "largest depth of the leaflets below the annulus plane in the middle "
-    "anteroposterior section",
-    "tenting_volume_mm3": "volume between annulus plane and leaflets",
-    "ap_diameter_mm": "anteroposterior diameter of the annulus",
-    "annulus_circumference_mm": "length of the annulus in space",
-    "stress_p95_{}_mpa": "first principal Cauchy stress that 95 % of the {} leaflet's volume stays "
-    "below",
-    "stress_p99_{}_mpa": "the same for 99 %",
-    "stress_max_{}_mpa": "largest first principal Cauchy stress of the {} leaflet, which depends "
-    "on the mesh",
-}
-"""Meaning by name; {} stands for a leaflet."""
+* ``gap_mm2``: regurgitant gap, the area within the annulus, seen along its normal, of the lines of
+  sight that stay farther than half the contact reach from every leaflet's midsurface;
+* ``coaptation_length_mm``: length over which the leaflets touch (midsurfaces within the contact
+  reach) in the middle anteroposterior section, the smaller of both;
+* ``coaptation_area_mm2``: area over which the leaflets touch, mean of both;
+* ``coaptation_height_mm``: that area over the commissural diameter, the mean height of the touching
+  zone across the valve;
+* ``tenting_height_mm``: largest depth of the leaflets below the annulus plane in the middle
+  anteroposterior section;
+* ``tenting_volume_mm3``: volume between annulus plane and leaflets;
+* ``ap_diameter_mm``: anteroposterior diameter of the annulus;
+* ``annulus_circumference_mm``: length of the annulus in space;
+* ``stress_p95_LEAFLET_mpa``: first principal Cauchy stress that 95 % of the leaflet's volume stays
+  below; ``stress_p99_``: the same for 99 %; ``stress_max_``: the largest, which depends on the
+  mesh.
+"""
 
 NEVER_NEGATIVE = ("gap_", "coaptation_", "ap_diameter_", "annulus_", "stress_")
 """Beginnings of names of measures that have no negative values: areas, lengths, and the highest
 tension of a leaflet that is under pressure."""
-
-
-def meaning_of(name: str) -> str:
-    """What a measure is."""
-    if name in MEASURES:
-        return MEASURES[name]
-    _, which, region, _ = name.split("_", 3)
-    return MEASURES[f"stress_{which}_{{}}_mpa"].format(region)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

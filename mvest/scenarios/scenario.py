@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import GeometryError, InputError
+from mvest.errors import GeometryError, InputError, require_numbers
 from mvest.mechanics.forces.cables import TiedPoints
 from mvest.quantities import Length, Percent, Place, Pressure, Stiffness
 from mvest.typing import FloatArray
@@ -94,12 +94,9 @@ class Clip:
     def __post_init__(self) -> None:
         if not np.isfinite(self.position_mm):
             raise InputError(f"clip at {self.position_mm} mm, expected a finite number")
-        for name in ("width_mm", "grasp_mm", "stiffness"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"clip {name} = {value}, expected a finite number > 0")
-        if self.distance_mm is not None and not self.distance_mm > 0:
-            raise InputError(f"clip distance_mm = {self.distance_mm}, expected > 0")
+        require_numbers(self, "clip", "width_mm", "grasp_mm", "stiffness")
+        if self.distance_mm is not None:
+            require_numbers(self, "clip", "distance_mm")
 
 
 @dataclass(frozen=True, slots=True)

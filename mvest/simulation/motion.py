@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import GeometryError, InputError
+from mvest.errors import GeometryError, InputError, require_numbers
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
@@ -218,10 +218,7 @@ class MotionSettings:
                 f"frames = {self.frames} to the closed one, expected 2 to {self.steps + 2} of "
                 f"{self.steps} steps"
             )
-        if not (np.isfinite(self.duration) and self.duration > 0):
-            raise InputError(f"duration of a motion = {self.duration} s, expected > 0")
-        if not self.tolerance > 0:
-            raise InputError(f"tolerance of a motion = {self.tolerance}, expected > 0")
+        require_numbers(self, "motion", "duration", "tolerance")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

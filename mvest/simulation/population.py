@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.errors import GeometryError, InputError
+from mvest.errors import GeometryError, InputError, require_numbers
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
@@ -72,11 +72,8 @@ class PopulationSettings:
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise InputError(f"population {name} = ({low}, {high}), expected 0 <= low <= high")
-        for name in (
-            "moduli_spread", "pressure_spread", "chord_rest_length_spread", "duration_spread"
-        ):  # fmt: skip
-            if not getattr(self, name) >= 0:
-                raise InputError(f"population {name} = {getattr(self, name)}, expected >= 0")
+        spreads = "moduli_spread", "pressure_spread", "chord_rest_length_spread", "duration_spread"
+        require_numbers(self, "population", *spreads, least=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.distance import cdist
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
@@ -83,14 +83,9 @@ class World:
             raise InputError(
                 f"kernel = {self.kernel!r}, expected one of matern, {', '.join(KERNELS)}"
             )
-        if not (np.isfinite(self.length_factor) and self.length_factor > 0.0):
-            raise InputError(f"length_factor = {self.length_factor}, expected > 0")
-        for name in ("annulus_mm", "tips_mm", "pressure_off", "thickness_off", "outlier_mm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"{name} = {value} of a world, expected >= 0")
-        if not (np.isfinite(self.prestretch) and self.prestretch > 0.0):
-            raise InputError(f"prestretch = {self.prestretch} of a world, expected > 0")
+        require_numbers(self, "world", "length_factor", "prestretch")
+        sizes = "annulus_mm", "tips_mm", "pressure_off", "thickness_off", "outlier_mm"
+        require_numbers(self, "world", *sizes, least=0)
         for name in ("missing", "outliers"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)}, expected a share below 1")

@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from mvest.estimation import Gaussian, Prediction
+from mvest.estimation import Gaussian, Prediction, chi_square_band
+
+
+def consistent(values, freedom):
+    """Whether NEES or NIS of independent runs are chi-square with so many degrees of freedom.
+
+    Their sum is then in the band that holds it in 99 of 100 cases (Bar-Shalom, Li and Kirubarajan
+    2001, section 5.4).
+    """
+    low, high = chi_square_band(len(values) * freedom, 0.99)
+    return low <= np.sum(values) <= high
 
 
 class Linear:

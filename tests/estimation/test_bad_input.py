@@ -12,7 +12,6 @@ from mvest.estimation import (
     PaperFilter,
     Prediction,
     chi_square_band,
-    consistency,
     cramer_rao_bound,
     identifiability,
     moran,
@@ -178,8 +177,6 @@ BAD = {
     "NEES shape": (lambda: nees(np.zeros((2, 2)), np.eye(2)), r"\(p,\); got \(2, 2\)"),
     "NEES singular": (lambda: nees(np.zeros(2), np.diag([1.0, 0.0])), "positive definite"),
     "NEES covariance": (lambda: nees(np.zeros(2), np.eye(3)), r"\(2, 2\); got \(3, 3\)"),
-    "no runs": (lambda: consistency(np.empty(0), 2), r"N > 0; got \(0,\)"),
-    "runs NaN": (lambda: consistency(np.array([np.nan]), 2), "values must be finite"),
     "two innovations": (lambda: zero_mean(np.array([1.0, 2.0])), "n at least 3"),
     "constant innovations": (lambda: zero_mean(np.ones(5)), "all 5 innovations equal 1"),
     "neighbours shape": (

@@ -11,11 +11,9 @@ from mvest.estimation import (
     Gaussian,
     IteratedFilter,
     Log,
-    MonteCarloFilter,
     PaperFilter,
     Prediction,
     Reason,
-    SamplerSettings,
     UnscentedFilter,
 )
 from tests.estimation.problems import Linear, banana, gridded, wings
@@ -175,17 +173,3 @@ def test_a_check_is_about_its_limit() -> None:
     assert not ApproximationCheck("a", np.inf, 0.25, 1).holds
     with pytest.raises(InputError, match="a check needs a value"):
         ApproximationCheck("a", np.nan, 0.25, 1)
-
-
-def test_a_surrogate_that_never_holds_its_draws_ends_loudly() -> None:
-    # The likelihood of a hundredth of the prior's width, along a curve: no box about the draws of
-    # one round holds those of the next.
-    few = SamplerSettings(chains=2, walkers=16, steps=200)
-    found = MonteCarloFilter(max_rounds=3, degree=2, sampler=few)(
-        banana, BENT, np.array([0.0]), 1e-4
-    )
-    assert found.reason is Reason.NOT_SAMPLED
-    assert not found.trusted
-    assert found.check is not None
-    assert np.isfinite(found.check.value)
-    assert "inf" not in found.why + found.detail

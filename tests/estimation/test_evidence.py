@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from mvest.errors import InputError
-from mvest.estimation import Gaussian, IteratedFilter, Prediction, SchmidtFilter, kalman_update
+from mvest.estimation import Gaussian, IteratedFilter, Prediction, kalman_update
 from mvest.estimation.evidence import Evidence, LearnedNoise, NoiseLearner
 from mvest.estimation.noise_family import (
     BANDS,
@@ -316,22 +316,6 @@ def test_a_filter_learns_the_noise_where_the_model_is_not_linear() -> None:
         found.forward_solves
         <= IteratedFilter(1e-6)(curved, PRIOR, y, found.learned.noise).forward_solves + 1
     )
-
-
-def test_considered_parameters_are_columns_of_the_noise() -> None:
-    names = [f"m{k}" for k in range(8)]
-    rng = np.random.default_rng(3)
-    y = B @ rng.standard_normal(8) + 0.3 * rng.standard_normal(FAMILY.size)
-    considered = SchmidtFilter(IteratedFilter(1e-8), ("m6", "m7"))
-    found = considered(linear(B), PRIOR, y, FAMILY, names=names)
-    assert found.learned is not None
-    assert found.learned.names[-1] == "considered"
-    family = FAMILY.plus(ErrorColumns("considered", B[:, 6:]))
-    learned = learn_noise(family, y, B[:, :6])
-    expected = posterior_of(learned, y, B[:, :6])
-    np.testing.assert_allclose(found.mean[:6], expected.mean, atol=1e-5)
-    np.testing.assert_allclose(found.std[:6], expected.std, rtol=1e-3)
-    np.testing.assert_array_equal(found.std[6:], 1.0)
 
 
 def test_the_factor_of_added_columns_is_learned() -> None:

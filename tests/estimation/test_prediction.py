@@ -9,11 +9,10 @@ from mvest.estimation import (
     ExtendedFilter,
     Gaussian,
     Identity,
+    ImportanceFilter,
     IteratedFilter,
-    MonteCarloFilter,
     PaperFilter,
     Prediction,
-    SchmidtFilter,
     UnscentedFilter,
 )
 from mvest.estimation.prediction import as_prediction, predict
@@ -31,8 +30,7 @@ FILTERS = (
     IteratedFilter(),
     UnscentedFilter(),
     EnsembleFilter(),
-    SchmidtFilter(IteratedFilter(), ("m[1]",)),
-    MonteCarloFilter(),
+    ImportanceFilter(),
 )
 
 

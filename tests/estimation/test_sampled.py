@@ -59,14 +59,6 @@ def test_without_the_leave_one_out_the_formula_is_that_of_joseph():
     )
 
 
-def test_what_is_considered_keeps_its_prior_and_widens():
-    told = SampledErrors(observation_noise(0.3**2, N), errors(12, np.random.default_rng(4)))
-    found = told.posterior(H, P0, np.array([True, True, False])).covariance
-    assert found[2, 2] == pytest.approx(P0[2, 2])
-    whole = told.posterior(H, P0).covariance
-    assert np.all(np.diag(found)[:2] > 0.9 * np.diag(whole)[:2])
-
-
 def test_the_noise_is_that_of_the_base_and_the_mean_square_of_the_samples():
     told = SampledErrors(observation_noise(0.3**2, N), errors(7, np.random.default_rng(5)))
     W = told.noise.whiten(np.eye(N))
@@ -117,47 +109,16 @@ def smooth_errors(count, rng):
     return 0.8 * root @ rng.standard_normal((N, count))
 
 
-def localised(samples, length=0.25):
-    """Times the modes of a field of unit variance, of that correlation."""
-    w, U = np.linalg.eigh(np.exp(-0.5 * ((PLACES[:, None] - PLACES) / length) ** 2))
-    modes = U[:, w > 1e-12] * np.sqrt(w[w > 1e-12])
-    return samples[:, :, None] * modes[:, None, :]
-
-
-def test_a_localised_sample_is_weighed_with_by_its_product_with_a_correlation():
-    samples = errors(7, np.random.default_rng(12))
-    told = SampledErrors(
-        observation_noise(0.3**2, N), samples, localised=localised(samples, length=0.25)
-    )
-    W = told.noise.whiten(np.eye(N))
-    schur = samples @ samples.T / 7 * np.exp(-0.5 * ((PLACES[:, None] - PLACES) / 0.25) ** 2)
-    np.testing.assert_allclose(
-        np.linalg.inv(W.T @ W), 0.09 * np.eye(N) + schur, rtol=1e-6, atol=1e-8
-    )
-
-
-def test_samples_that_are_their_only_part_are_as_if_they_were_not_localised():
-    base, samples = observation_noise(0.2**2, N), errors(6, np.random.default_rng(13))
-    told, alone = (
-        SampledErrors(base, samples, localised=parts) for parts in (samples[:, :, None], None)
-    )
-    np.testing.assert_allclose(
-        told.posterior(H, P0).covariance, alone.posterior(H, P0).covariance, rtol=1e-12
-    )
-
-
 def test_the_posterior_is_that_of_a_gain_without_the_sample_and_what_it_was_made_from():
     rng = np.random.default_rng(14)
     samples, source = smooth_errors(6, rng), np.array([0, 0, 1, 1, 2, 2])
-    parts, considered = localised(samples), 0.1 * rng.standard_normal((N, 2))
-    told = SampledErrors(observation_noise(0.3**2, N), samples, source, considered, parts)
-    estimated = np.array([True, True, False])
+    considered = 0.1 * rng.standard_normal((N, 2))
+    told = SampledErrors(observation_noise(0.3**2, N), samples, source, considered)
 
     def gain_of(chosen):
-        C = parts[:, chosen].reshape(N, -1)
+        C = samples[:, chosen]
         R = 0.09 * np.eye(N) + C @ C.T / chosen.sum()
-        K = P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
-        return np.where(estimated[:, None], K, 0.0)
+        return P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
 
     moved = np.concatenate(
         [gain_of(source != one) @ samples[:, source == one] for one in range(3)], axis=1
@@ -166,38 +127,9 @@ def test_the_posterior_is_that_of_a_gain_without_the_sample_and_what_it_was_made
     rest = np.eye(3) - K @ H
     part = (stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975)) ** 2 / 6 * moved @ moved.T
     expected = rest @ P0 @ rest.T + part + K @ considered @ considered.T @ K.T
-    found = told.posterior(H, P0, estimated)
+    found = told.posterior(H, P0)
     np.testing.assert_allclose(found.from_samples, part, rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-4, atol=1e-9)
-
-
-def test_localised_samples_of_smooth_errors_make_a_better_gain_and_intervals_hold():
-    # A few samples of errors that are alike near each other only; how such a filter fares.
-    base, rng = observation_noise(0.05**2, N), np.random.default_rng(15)
-    square, hits, tries = np.zeros(2), np.zeros(3), 0
-    smooth_H = np.stack([np.sin((k + 1.5) * PLACES * 3) for k in range(3)], axis=1)
-    for _ in range(25):
-        samples = smooth_errors(8, rng)
-        plain = SampledErrors(base, samples)
-        told = SampledErrors(base, samples, localised=localised(samples))
-        std = np.sqrt(np.diag(told.posterior(smooth_H, P0).covariance))
-        gains = [gain(one.noise, smooth_H) for one in (plain, told)]
-        for _ in range(20):
-            m = np.sqrt(np.diag(P0)) * rng.standard_normal(3)
-            y = smooth_H @ m + smooth_errors(1, rng)[:, 0]
-            square += [np.sum((K @ y - m) ** 2) for K in gains]
-            hits += np.abs(gains[1] @ y - m) < 1.96 * std
-            tries += 1
-    assert square[1] < 0.8 * square[0]
-    assert np.all(hits / tries > 0.9)
-
-
-def test_localised_samples_of_another_shape_are_refused():
-    samples = errors(4, np.random.default_rng(16))
-    with pytest.raises(InputError, match="localised samples have shape"):
-        SampledErrors(observation_noise(1.0, N), samples, localised=np.zeros((N, 3, 2)))
-    with pytest.raises(InputError, match="localised samples of errors"):
-        SampledErrors(observation_noise(1.0, N), samples, localised=np.full((N, 4, 2), np.nan))
 
 
 @pytest.mark.parametrize(

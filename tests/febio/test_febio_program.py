@@ -1,4 +1,4 @@
-"""Bodies in FEBio beside this project's; only where the program is (see `mvest.febio.program`)."""
+"""Bodies in FEBio beside this project's; only where the program is (see `tests.febio.program`)."""
 
 from dataclasses import replace
 
@@ -8,12 +8,13 @@ import pytest
 from mvest.errors import ConfigurationError, InputError
 from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
 from mvest.febio.mesh import febio_law, febio_mesh
-from mvest.febio.program import febio_program, read_positions, run_febio
+from mvest.febio.positions import read_positions
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.solid import Law
 from mvest.mechanics.steps import NewtonSettings
+from tests.febio.program import febio_program, run_febio
 from tests.febio.test_febio_mesh import mesh_of
 
 MATERIAL = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL)

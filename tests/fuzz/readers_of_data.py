@@ -17,7 +17,7 @@ from mvest.external.contract import (
     write_answer,
     write_request,
 )
-from mvest.febio.program import read_positions
+from mvest.febio.positions import read_positions
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.problem.fields import read_case_fields

@@ -395,32 +395,6 @@ def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
     np.testing.assert_allclose(rough.std, exact.std, rtol=0.02)
 
 
-def test_a_parameter_that_is_considered_stays_what_it_is_on_the_way(monkeypatch):
-    case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
-    monkeypatch.setattr("mvest.personalisation.estimation.ROUGH", 0.0)
-    pressure = replace(unknowns()[2], std=0.3)
-    found = {}
-    for treatment in (Treatment.ESTIMATED, Treatment.CONSIDERED):
-        others = [u for u in unknowns(Treatment.FIXED, **known) if u.name != pressure.name]
-        found[treatment] = personalise(
-            case,
-            settings(
-                replace(pressure, treatment=treatment),
-                *others,
-                considered_geometry=ConsideredGeometry(renewals=6),
-                tolerance=1e-9,
-            ),
-        ).result.filtered
-    estimated, considered = found.values()
-    # Of one observation the estimate and its covariance are those of all parameters.
-    moduli = [estimated.names.index(name) for name in MODULI]
-    away = (considered.transformed.mean - estimated.transformed.mean) / estimated.transformed.std
-    assert np.abs(away[moduli]).max() < 0.15
-    np.testing.assert_allclose(
-        considered.transformed.std[moduli], estimated.transformed.std[moduli], rtol=0.1
-    )
-
-
 def test_all_closed_frames_are_displaced_as_their_derivatives_say():
     model = model_of(GENTLE, **SMALL)
     motion = model.contact_valve.motion

@@ -24,25 +24,24 @@ def test_a_step_of_parameters_and_modes_is_that_of_least_squares():
         # Of a low rank as small as can be: the filter may leave out what modes are asked for.
         known=GeometryColumns(modes, (rows,), ()),
         sizes=lambda learned: (SIZE,),
-        noise=lambda learned, *, without, beside: low_rank_noise(base, beside),
+        noise=lambda learned, *, without: low_rank_noise(base, beside),
     )
     prior = Gaussian.from_variance(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.5, 0.4]) ** 2)
-    estimated = np.array([True, True, False])
-    posterior = JointPosterior(prior, Log((True,) * 3), None, errors, None, estimated, beside)
+    posterior = JointPosterior(prior, Log((True,) * 3), None, errors, None)
 
-    z, residual = prior.mean + np.array([0.3, -0.1, 0.0]), rng.normal(0.0, 1.0, K)
+    z, residual = prior.mean + np.array([0.3, -0.1, 0.2]), rng.normal(0.0, 1.0, K)
     end, left = posterior.stepped(z, residual, H)
     found = posterior.expected(left)
 
-    # Over steps of the first two parameters, modes, and the size of the further column.
-    A = np.concatenate([H[:, :2], rows, beside], axis=1) / std
-    own = np.diag(np.concatenate([1.0 / prior.std[:2], np.full(Q, 1.0 / SIZE), [1.0]]))
-    away = np.concatenate([(prior.mean - z)[:2] / prior.std[:2], np.zeros(Q + 1)])
+    # Over steps of the parameters, modes, and the size of the further column.
+    A = np.concatenate([H, rows, beside], axis=1) / std
+    own = np.diag(np.concatenate([1.0 / prior.std, np.full(Q, 1.0 / SIZE), [1.0]]))
+    away = np.concatenate([(prior.mean - z) / prior.std, np.zeros(Q + 1)])
     best = np.linalg.lstsq(
         np.concatenate([A, own]), np.concatenate([residual / std, away]), rcond=None
     )[0]
-    np.testing.assert_allclose(end, z + np.array([*best[:2], 0.0]), atol=1e-9)
-    np.testing.assert_allclose(found[0], best[2 : 2 + Q], atol=1e-9)
+    np.testing.assert_allclose(end, z + best[:3], atol=1e-9)
+    np.testing.assert_allclose(found[0], best[3 : 3 + Q], atol=1e-9)
     lowest = posterior.improbability(end, left - rows @ found[0], found)
     for change in 1e-3 * np.eye(Q):
         moved = (found[0] + change,)

@@ -110,35 +110,6 @@ def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch)
     np.testing.assert_array_equal(fixed.result.std, whole.moduli_only.std)
 
 
-def test_doubt_that_is_considered_widens_the_interval_and_moves_nothing_else(monkeypatch):
-    use(monkeypatch)
-    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
-    considered = personalise(case, settings(*unknowns(Treatment.CONSIDERED)))
-    assert considered.result.converged
-    for name in MODULI:
-        assert std_of(considered, name) > 1.2 * std_of(fixed, name)
-    own = np.isin(considered.names, NUISANCES)
-    np.testing.assert_allclose(considered.result.estimate[own], considered.prior.mean[own])
-    # To first order considering is estimating: one step of the linear model is the same.
-    estimated = personalise(case, settings())
-    for name in MODULI:
-        assert std_of(considered, name) == pytest.approx(std_of(estimated, name), rel=0.35)
-
-
-def test_a_considered_mean_need_not_survive_its_logarithm(monkeypatch):
-    # exp(log(6.23)) is not 6.23 to the last bit.
-    use(monkeypatch)
-    given = [
-        replace(u, treatment=Treatment.CONSIDERED) if u.name == "E_f.anterior" else u
-        for u in unknowns(Treatment.FIXED)
-    ]
-    found = personalise(made_up_case(0.3, displaced=False), settings(*given))
-    assert found.result.estimate[0] == pytest.approx(6.23, rel=1e-14)
-    assert found.result.fitted is not None
-    assert len(found.distances) == 2
-
-
 def test_the_generic_valve_is_closed_once(monkeypatch):
     # The estimation begins where the generic valve was closed, and that is the longest closure.
     built = use(monkeypatch)
@@ -669,20 +640,6 @@ def test_a_budget_says_what_the_errors_of_the_frames_cost(monkeypatch):
         assert of[MOTION, modulus].alone < 0.01 * images.alone
     plain = replace(case, error_samples=None)
     assert personalise(plain, settings(*right_nuisances())).budget == ()
-
-
-def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
-    use_geometry(monkeypatch)
-    case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
-    given = [
-        replace(u, treatment=Treatment.CONSIDERED) if u.name == "shift.z" else u
-        for u in (*right_nuisances(), Prior("shift.z", 0.0, 1.0))
-    ]
-    found = personalise(case, settings(*given, moduli_only=True))
-    assert std_of(found, "shift.z") == pytest.approx(1.0)
-    assert found.result.estimate[2] == 0.0
-    assert found.moduli_only.parameters == MODULI
-    assert np.all(found.moduli_only.std > 0)
 
 
 # --- errors that are learned --------------------------------------------------------------------

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
-import yaml
 
 from mvest.problem.record import Unknown
 from mvest.problem.skill import (
-    PRIOR_STD,
     generic_guess,
     log_width,
     prior_alone,
@@ -12,7 +10,6 @@ from mvest.problem.skill import (
     share_bounds,
     skill,
 )
-from tests.places import CONF
 
 
 def answered(truth, estimate, low, high, generic) -> Unknown:
@@ -104,10 +101,3 @@ def test_scores_are_of_the_logarithm():
 )
 def test_bounds_of_a_share(inside, n, low, high):
     assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)
-
-
-def test_the_prior_of_tables_is_that_of_the_configuration():
-    text = (CONF / "personal" / "nuisances.yaml").read_text()
-    for name, about in yaml.safe_load(text)["unknowns"].items():
-        if name.startswith("E_f."):
-            assert about["std"] / about["mean"] == pytest.approx(PRIOR_STD, abs=0.005)

@@ -7,7 +7,6 @@ from mvest.reporting.markup import (
     markdown_rows,
     markdown_text,
     number,
-    with_std,
 )
 
 HOSTILE = r"<script>alert('x')</script> | `a` *b* [c](javascript:d) _e_ 5 % & $x$ \input{f} #1 ~"
@@ -60,8 +59,3 @@ def test_latex_table_has_equal_rows_and_true_numbers() -> None:
 )
 def test_numbers_are_rounded(value: float | None, text: str) -> None:
     assert number(value) == text
-
-
-def test_a_value_without_spread_stands_alone() -> None:
-    assert with_std(1.5, None) == "1.5"
-    assert with_std(1.5, 0.123) == "1.5 ± 0.12"

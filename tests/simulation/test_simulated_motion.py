@@ -187,8 +187,8 @@ def test_tips_keep_where_they_end():
         ({"held_pressure": (0.5,)}, "expected as many"),
         ({"frames": 9}, "frames = 9 to the closed one, expected 2 to 8"),
         ({"frames": 1}, "frames = 1"),
-        ({"duration": 0.0}, "duration of a motion = 0.0 s"),
-        ({"tolerance": -1.0}, "tolerance of a motion"),
+        ({"duration": 0.0}, "motion duration = 0.0, expected > 0"),
+        ({"tolerance": -1.0}, "motion tolerance"),
     ],
 )
 def test_settings_of_a_motion_are_checked(change, message):

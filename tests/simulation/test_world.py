@@ -133,7 +133,7 @@ def test_exponential_tissue_is_as_stiff_as_its_modulus_where_leaflets_are_closed
     [
         ({"kernel": "cubic"}, "expected one of matern, exponential, gaussian"),
         ({"length_factor": 0.0}, "length_factor = 0.0, expected > 0"),
-        ({"tips_mm": -1.0}, "tips_mm = -1.0 of a world, expected >= 0"),
+        ({"tips_mm": -1.0}, "world tips_mm = -1.0, expected >= 0"),
         ({"missing": 1.0}, "expected a share below 1"),
     ],
 )

@@ -42,7 +42,7 @@ class UnknownSettings:
 
     mean: Value
     std: Value
-    treatment: str = "estimated"  # or considered, or fixed
+    treatment: str = "estimated"  # or fixed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Draws from the posterior itself, weighted by runs of the model: no surrogate, nothing assumed."""
+"""Draws from the posterior itself, weighted by runs of the model: nothing is assumed of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from mvest.errors import InputError
 from mvest.estimation.check import ApproximationCheck
-from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.estimate import Estimate, Filter, OnIterate, Reason
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian, standard
 from mvest.estimation.noise import NoiseCovariance
@@ -50,7 +50,7 @@ class ImportanceFilter:
 
     In coordinates x in which the prior is N(0, I), with π(x) = exp(−J(x)):
 
-    1. The posterior's mode and its Gaussian N(x₀, P₀) come from `IteratedFilter`.
+    1. The posterior's mode and its Gaussian N(x₀, P₀) come from ``start``.
     2. A round draws points from a mixture q and runs the model there. The first mixture is of
        N(x₀, P₀), wider, and the prior. Then it is also of kernels N(xᵢ, s² Pᵢ) about runs, chosen
        by their weights, where Pᵢ = (I + Hᵢᵀ R⁻¹ Hᵢ)⁻¹ is the posterior linearised at xᵢ itself, so
@@ -64,7 +64,8 @@ class ImportanceFilter:
     Pareto tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25:72), whose
     shape k̂ says whether they can be trusted at all: not above 0.7.
 
-    A model without derivatives is drawn from with P₀ in the place of every Pᵢ.
+    A model without derivatives is drawn from with P₀ in the place of every Pᵢ, and needs a
+    ``start`` that takes such a model, `UnscentedFilter` for example.
 
     Attributes
     ----------
@@ -74,7 +75,8 @@ class ImportanceFilter:
         Runs of each round.
     effective : float
         Effective draws that are enough.
-    start : IteratedFilter
+    start : Filter
+        Finds x₀ and P₀.
     seed : int
         Of all random numbers.
 
@@ -87,7 +89,7 @@ class ImportanceFilter:
     runs: int = 320
     batch: int = 32
     effective: float = 60.0
-    start: IteratedFilter = field(default_factory=lambda: IteratedFilter(tolerance=0.01))
+    start: Filter = field(default_factory=lambda: IteratedFilter(tolerance=0.01))
     seed: int = 1
 
     def __post_init__(self) -> None:

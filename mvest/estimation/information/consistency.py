@@ -63,47 +63,6 @@ def nees(error: FloatArray, covariance: FloatArray) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Consistency:
-    """Average of N chi-square numbers against the band in which it should lie.
-
-    Attributes
-    ----------
-    average : float
-        Mean of the NEES or NIS of N independent runs.
-    expected : float
-        Its expectation, the degrees of freedom of one run.
-    band : (float, float)
-        Band that holds the average with the chosen probability.
-    runs : int
-        N.
-    """
-
-    average: float
-    expected: float
-    band: tuple[float, float]
-    runs: int
-
-    @property
-    def consistent(self) -> bool:
-        """Whether the average lies in its band; above it the covariances are too small."""
-        return self.band[0] <= self.average <= self.band[1]
-
-
-def consistency(values: FloatArray, degrees_of_freedom: int, level: float = 0.95) -> Consistency:
-    """Test NEES or NIS values (N,) of independent runs, chi-square with equal degrees of freedom.
-
-    N times their mean is chi-square with N · degrees_of_freedom degrees of freedom.
-    """
-    values = np.asarray(values, dtype=np.float64)
-    if values.ndim != 1 or values.size == 0:
-        raise InputError(f"consistency needs values of shape (N,), N > 0; got {values.shape}")
-    require_finite(values, "the values")
-    N = values.size
-    low, high = chi_square_band(N * degrees_of_freedom, level)
-    return Consistency(float(values.mean()), float(degrees_of_freedom), (low / N, high / N), N)
-
-
-@dataclass(frozen=True, slots=True)
 class ZTest:
     """A statistic against its expectation and standard deviation under the null hypothesis.
 

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
@@ -206,10 +206,7 @@ class TiedPoints:
                 f"tied points of shapes {self.first.shape} and {self.second.shape}, expected "
                 "(k, 3) twice"
             )
-        for name in ("length", "stiffness"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} of ties = {value}, expected a finite number > 0")
+        require_numbers(self, "ties", "length", "stiffness")
 
     def within(self, mesh: SolidMesh) -> Ties:
         """The same as springs between points of a mesh."""

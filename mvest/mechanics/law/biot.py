@@ -37,7 +37,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
-from mvest.mechanics.parameters import Parameter, known_names
+from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
 
 ONE, OTHER = np.array([1, 0, 0]), np.array([2, 2, 1])
@@ -143,11 +143,7 @@ class BiotLaw:
         InputError
             If the law does not know the parameter.
         """
-        if parameter.kind not in self.kinds:
-            raise InputError(
-                f"parameter {parameter.name!r}: the law of the leaflets knows "
-                f"{known_names(self.kinds)}"
-            )
+        parameter.require(self.kinds)
         here = region == which
         if parameter.kind == "E_f" and (not self.moduli or self.moduli[which].G is None):
             # All moduli follow E_f: S is linear in the scale of C.

@@ -50,7 +50,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.parameters import Parameter, known_names
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, TissueSettings
 from mvest.typing import FloatArray, IntArray
 
@@ -144,10 +144,7 @@ class ExponentialLaw:
         InputError
             If the law does not know the parameter.
         """
-        if parameter.kind not in self.kinds:
-            raise InputError(
-                f"parameter {parameter.name!r}: the exponential law knows {known_names(self.kinds)}"
-            )
+        parameter.require(self.kinds)
         kind = EXPONENTIAL_KINDS.index(parameter.kind)
         return _partial_stress(green, region, self.coefficients, kind, which)
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
-from mvest.mechanics.parameters import Parameter, known_names
+from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -94,11 +94,7 @@ class LinearLaw:
         stress: FloatArray,
     ) -> FloatArray:
         """Derivative of the stress by a parameter of region ``which``; InputError if of no use."""
-        if parameter.kind not in self.kinds:
-            raise InputError(
-                f"parameter {parameter.name!r}: the law of the leaflets knows "
-                f"{known_names(self.kinds)}"
-            )
+        parameter.require(self.kinds)
         by = np.zeros_like(self.stiffness)
         by[which] = self.moduli[which].stiffness_by(parameter.kind)
         return self._stress(by[region], green, previous, rate)

@@ -31,7 +31,7 @@ from scipy.linalg import eigh
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.mechanics.parameters import Parameter, known_names
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ModulusField
 from mvest.mechanics.solid import Law
 from mvest.typing import FloatArray, IntArray
@@ -87,15 +87,9 @@ class RegionalLaw:
         stress: FloatArray,
     ) -> FloatArray:
         """Derivative of the stress; see :meth:`mvest.mechanics.law.biot.BiotLaw.partial_stress`."""
-        law = self.laws[which]
-        if parameter.kind not in law.kinds:
-            raise InputError(
-                f"parameter {parameter.name!r}: the law of this region knows "
-                f"{known_names(law.kinds)}"
-            )
         out, own = np.zeros_like(green), self.region == which
         first = np.zeros(int(own.sum()), dtype=np.int64)
-        out[own] = law.partial_stress(
+        out[own] = self.laws[which].partial_stress(
             parameter, green[own], first, previous[own], rate, which=0, stress=stress[own]
         )
         return out

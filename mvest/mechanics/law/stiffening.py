@@ -41,7 +41,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw, as_stiff
-from mvest.mechanics.parameters import Parameter, known_names
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import TissueSettings
 from mvest.mechanics.solid import Law
 from mvest.typing import FloatArray, IntArray
@@ -76,7 +76,7 @@ class StiffeningLaw:
             If the modulus is inadmissible.
         """
         if not (np.isfinite(stiffening) and stiffening >= 0.0):
-            raise InputError(f"stiffening of a tissue = {stiffening}, expected >= 0")
+            raise InputError(f"tissue stiffening = {stiffening}, expected >= 0")
         curve = as_stiff(tissue.coefficients({}), tissue, E_f)
         return cls(
             BiotLaw.of_moduli([tissue.moduli(E_f)]), ExponentialLaw.of([curve]), float(stiffening)
@@ -119,10 +119,7 @@ class StiffeningLaw:
         InputError
             If the law does not know the parameter.
         """
-        if parameter.kind not in self.kinds:
-            raise InputError(
-                f"parameter {parameter.name!r}: the stiffening law knows {known_names(self.kinds)}"
-            )
+        parameter.require(self.kinds)
         if parameter.kind == "E_f":
             return stress / parameter.value
         linear, _ = self.linear.response(green, region, previous, 0.0)

@@ -320,8 +320,7 @@ def _intervals(axes: Any, row: int, unknown: Unknown, without: Unknown | None, i
         (without, WITHOUT, 0.17, "s", "estimate if the nuisances were taken as known"),
     )
     for source, colour, offset, marker, label in shown:
-        # A marginalised nuisance keeps its prior.
-        if source is None or source.estimate is None or source.treatment == "considered":
+        if source is None or source.estimate is None:
             continue
         if source.low is not None and source.high is not None:
             axes.plot(place(source.low, source.high), [row + offset] * 2, color=colour,

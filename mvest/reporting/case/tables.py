@@ -150,10 +150,8 @@ def _narrower(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
 def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:
     """A row for each unknown and the objective, a column for each step of the filter."""
     width = len(record.iterates[0]) if record.iterates else 0
-    for own in (free, [one for one in free if one.treatment == "estimated"]):
-        if own and len(own) == width:
-            break
-    else:
+    own = [one for one in free if one.treatment == "estimated"]
+    if not own or len(own) != width:
         return table(())
     numbers = ["start", *map(str, range(1, len(record.iterates)))]
     rows: list[dict[str, Any]] = [

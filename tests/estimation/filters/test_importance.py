@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.estimation import Gaussian, ImportanceFilter, Prediction, Reason
+from mvest.estimation import Gaussian, ImportanceFilter, Prediction, Reason, UnscentedFilter
 from tests.estimation.problems import Linear, banana, gridded, wings
 
 
@@ -32,6 +32,16 @@ def test_both_wings_are_seen(seed) -> None:
     low, high = found.interval()
     assert low[0] < -1.0
     assert high[0] > 1.0
+
+
+def test_a_model_without_derivatives_is_drawn_from_too() -> None:
+    problem = Linear(p=2)
+    sample = ImportanceFilter(start=UnscentedFilter())
+    found = sample(problem.plain, problem.prior, problem.y, problem.R)
+    assert found.reason is Reason.COMPLETED
+    std = np.sqrt(np.diagonal(problem.covariance))
+    assert np.all(np.abs(found.mean - problem.mean) < 4.0 * std / np.sqrt(60.0))
+    assert np.all(np.abs(np.log(found.std / std)) < 4.0 / np.sqrt(120.0))
 
 
 @pytest.mark.parametrize("p", [2, 5, 11])

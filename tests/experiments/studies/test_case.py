@@ -61,7 +61,7 @@ def test_settings_are_those_of_the_configuration(config):
     assert settings.correspondence
     given = plain(
         composed(
-            *OWN, "personal=considered", "personal.tolerance=0.03", "personal.max_iterations=4",
+            *OWN, "personal=imaged", "personal.tolerance=0.03", "personal.max_iterations=4",
             "personal.largest_change=0.3", "personal.correspondence=false",
             "personal.confirm=false",
             "personal.moduli_only=false",
@@ -71,7 +71,7 @@ def test_settings_are_those_of_the_configuration(config):
     settings = personalising(given)
     treated = {u.name: u.treatment for u in settings.unknowns}
     assert treated["E_f.posterior"] is Treatment.ESTIMATED
-    assert treated["turn.x"] is Treatment.CONSIDERED
+    assert treated["turn.x"] is Treatment.FIXED
     assert (settings.tolerance, settings.max_iterations, settings.largest_change) == (0.03, 4, 0.3)
     assert (settings.correspondence, settings.confirm, settings.moduli_only) == (False,) * 3
     assert settings.paper.R == 0.25
@@ -146,7 +146,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
     config["personal"]["unknowns"]["shift.x"]["treatment"] = "guessed"
     with pytest.raises(
         ConfigurationError,
-        match=r"shift\.x\.treatment = 'guessed', expected one of estimated, considered, fixed",
+        match=r"shift\.x\.treatment = 'guessed', expected one of estimated, fixed",
     ):
         personalising(config)
 

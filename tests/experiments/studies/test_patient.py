@@ -93,7 +93,7 @@ def out(tmp_path):
 
 def test_a_patient_is_simulated_once(tmp_path, simulated):
     place = make_patient(config_of(tmp_path))
-    again = make_patient(config_of(tmp_path, "personal=considered"))
+    again = make_patient(config_of(tmp_path, "personal=carried"))
     assert place == again
     assert len(simulated) == 1
     other = make_patient(config_of(tmp_path, "seed=2"))

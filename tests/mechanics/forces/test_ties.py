@@ -103,8 +103,8 @@ def test_tied_sheets_come_together_and_their_ties_carry_no_net_force():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"length": 0.0}, "length of ties = 0.0, expected"),
-        ({"stiffness": np.inf}, "stiffness of ties = inf"),
+        ({"length": 0.0}, "ties length = 0.0, expected"),
+        ({"stiffness": np.inf}, "ties stiffness = inf"),
         ({"second": np.zeros((2, 3))}, r"\(1, 3\) and \(2, 3\)"),
     ],
 )

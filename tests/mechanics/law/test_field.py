@@ -157,7 +157,7 @@ def test_a_patch_is_smooth_of_bounded_extent_and_as_stiff_as_it_says():
     points = np.array([[1.0, 2.0, 3.0], [1.0, 4.0, 3.0], [5.0, 2.0, 3.0], [1.0, 2.0, 9.0]])
     # At half the radius (1 - 1/4)^2 = 9/16 of the logarithm.
     np.testing.assert_allclose(np.exp(patch.log_scale(points)), [2, 2 ** (9 / 16), 1, 1])
-    with pytest.raises(InputError, match="factor of a patch = 0"):
+    with pytest.raises(InputError, match="patch factor = 0"):
         StiffPatch("anterior", (1.0, 2.0, 3.0), 4.0, 0.0)
     with pytest.raises(InputError, match="centre of a patch"):
         StiffPatch("anterior", (1.0, 2.0), 4.0, 2.0)

@@ -148,7 +148,7 @@ def test_derivative_by_a_modulus_agrees_with_differences():
 
 
 def test_settings_refuse_what_is_no_prestretch():
-    with pytest.raises(InputError, match="prestretch of a tissue = 0"):
+    with pytest.raises(InputError, match="tissue prestretch = 0"):
         TissueSettings(2.6, prestretch=0.0)
     with pytest.raises(InputError, match="the corotational law has none"):
         TissueSettings(2.6, law="corotational", prestretch=1.1)

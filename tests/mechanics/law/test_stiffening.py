@@ -108,9 +108,9 @@ def test_what_it_does_not_know_is_refused():
         law.partial_stress(
             Parameter("ratio.anterior", 2.6), GREEN, REGION, PREVIOUS, RATE, which=0, stress=GREEN
         )
-    with pytest.raises(InputError, match=r"stiffening of a tissue = -0\.1"):
+    with pytest.raises(InputError, match=r"tissue stiffening = -0\.1"):
         StiffeningLaw.of(TISSUE, E, -0.1)
-    with pytest.raises(InputError, match="stiffening of a tissue = -1"):
+    with pytest.raises(InputError, match="tissue stiffening = -1"):
         TissueSettings(2.6, law="stiffening", exponential=CURVE, stiffening=-1.0)
     with pytest.raises(InputError, match="law of a tissue = 'stiffening': its coeff"):
         TissueSettings(2.6, law="stiffening")

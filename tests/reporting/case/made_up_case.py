@@ -84,7 +84,7 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
 def _unknown(
     name: str, label: str, unit: str, treatment: str, prior: tuple[float, float], std: float
 ) -> Unknown:
-    estimate = FITTED[name] if treatment == "estimated" else prior[0]
+    estimate = FITTED[name] if treatment == "estimated" else None
     return Unknown(
         name=name,
         label=label,
@@ -94,9 +94,9 @@ def _unknown(
         prior_mean=prior[0],
         prior_std=prior[1],
         estimate=estimate,
-        std=std,
-        low=estimate - 1.96 * std,
-        high=estimate + 1.96 * std,
+        std=None if estimate is None else std,
+        low=None if estimate is None else estimate - 1.96 * std,
+        high=None if estimate is None else estimate + 1.96 * std,
         truth=TRUTH[name],
     )
 
@@ -105,7 +105,7 @@ UNKNOWNS = (
     _unknown("E_f.anterior", "E_f anterior", "MPa", "estimated", (4.0, 2.0), 0.8),
     _unknown("E_f.posterior", "E_f posterior", "MPa", "estimated", (3.0, 1.5), 0.3),
     _unknown("chord_slack", "slack of the chordae", "", "estimated", (0.0, 0.02), 0.008),
-    _unknown("pressure", "pressure", "mmHg", "considered", (100.0, 5.0), 5.0),
+    _unknown("pressure", "pressure", "mmHg", "fixed", (100.0, 5.0), 5.0),
 )
 
 

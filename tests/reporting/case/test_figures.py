@@ -267,7 +267,7 @@ def test_intervals_are_where_the_record_has_them(case) -> None:
 def test_nuisances_are_drawn_in_standard_deviations(case) -> None:
     axes = estimates_figure(case[0]).axes[1]
     dots = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
-    # Slack 0.026 over 0.02; the pressure is only considered and has no estimate.
+    # Slack 0.026 over 0.02; the pressure is fixed and has no estimate.
     assert dots == pytest.approx([1.3])
 
 
