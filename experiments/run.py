@@ -10,10 +10,14 @@ from __future__ import annotations
 import difflib
 import os
 import sys
+import traceback
+from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
+from typing import NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
@@ -26,13 +30,17 @@ from experiments.runner.jobs.interruption import interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from experiments.runner.tracking.beside import logging_beside
-from mvest.errors import MvestError
+from mvest.errors import ConfigurationError, MvestError
 
 PRIMARY = "In 'config': "
 """How Hydra begins messages about the primary configuration."""
 
+RESOLVING = "ConfigurationError raised while resolving interpolation: "
+"""How OmegaConf begins messages about what a resolver of ours refuses."""
+
 REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
-"""What a wrong request raises; anything else is a mistake of ours and keeps its trace."""
+"""What a wrong request raises; anything else is a mistake of ours and keeps its trace, unless it
+is Hydra that raises it."""
 
 TRACEBACKS = "HYDRA_FULL_ERROR"
 """Environment variable with which a user asks for tracebacks."""
@@ -55,6 +63,7 @@ def main() -> int:
     # Hydra then lets exceptions through, so that they can be told in one line here.
     os.environ[TRACEBACKS] = "1"
     try:
+        _require_options(sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
             raise error
@@ -63,8 +72,10 @@ def main() -> int:
     except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
-    except REFUSED as error:
-        if wants_tracebacks:
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        if wants_tracebacks or not (isinstance(error, REFUSED) or _is_raised_by_hydra(error)):
             raise
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
@@ -105,6 +116,22 @@ def run_alone(config: DictConfig) -> None:
             track(request.folder)
 
 
+def _require_options(arguments: Sequence[str]) -> None:
+    """Refuse an option that Hydra does not have; it would complete or explain it at length."""
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigurationError(f"{message}; settings are NAME=VALUE, as in experiment=debug")
+
+    parser = get_args_parser()
+    parser.allow_abbrev, parser.error = False, refuse  # type: ignore[method-assign]
+    parser.parse_args(arguments)
+
+
+def _is_raised_by_hydra(error: BaseException) -> bool:
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__")).startswith("hydra.")
+
+
 def explain(error: BaseException) -> str:
     """One line that says what is wrong and, where it can be told, what would be right."""
     if isinstance(error, OSError) and not isinstance(error, HydraException):
@@ -112,6 +139,8 @@ def explain(error: BaseException) -> str:
     own = [line.strip() for line in str(error).splitlines() if line.strip()]
     if isinstance(error, MvestError):
         return own[0]
+    if not isinstance(error, REFUSED):
+        return f"{' '.join(sys.argv[1:])}: {own[0] if own else type(error).__name__}"
     if isinstance(error, OverrideParseException):
         return f"{error.override}: {own[0]}"
     causes = [error]
@@ -126,6 +155,8 @@ def explain(error: BaseException) -> str:
         )
         known = ", ".join(choices)
         return f"{text.removeprefix(PRIMARY)}; known: {known}"
+    if refused := text.partition(RESOLVING)[2]:
+        return refused
     if isinstance(causes[-1], OmegaConfBaseException):
         full_key = next((line for line in lines if line.startswith("full_key:")), None)
         if full_key is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
+from pathlib import PurePath
 from typing import Annotated, Any, TypeAlias
 
 from hydra.core.hydra_config import HydraConfig
@@ -66,6 +67,9 @@ GROUP = "study"
 
 MAX_NAME = 120
 """Letters of a text that names files."""
+
+NAMES = ("name", "table", "study", "sweep.name")
+"""Settings that name files and folders."""
 
 Switch: TypeAlias = Annotated[bool, NOT_HASHED]
 ByParameter: TypeAlias = Annotated[dict[str, float], BY_PARAMETER]
@@ -245,6 +249,7 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
     Of files and folders that it names what lies there counts, and not their names.
     """
     values = plain(config) if isinstance(config, DictConfig) else config
+    _require_names(values)  # of the folder, which Hydra makes next
     study = values.get("study")
     kept = without(values, ("hydra", *_not_hashed(study)))
     return config_hash(_with_contents(study, kept))
@@ -268,9 +273,9 @@ def require_in_range(values: Mapping[str, Any]) -> None:
     ConfigurationError
         One line with the setting, its value and the range.
     """
-    for name in ("name", "table", "study"):
-        if len(str(values.get(name) or "")) > MAX_NAME:
-            raise ConfigurationError(f"{name} has more than {MAX_NAME} letters")
+    for name in _kinds(values.get("study")):
+        if name not in values or (name in PARTS and values[name] is None):
+            raise ConfigurationError(f"{name} has no value")
     for name, value in values.items():
         for kind in _kinds(values.get("study")).get(name, (Any,)):
             part = value
@@ -285,6 +290,16 @@ def require_in_range(values: Mapping[str, Any]) -> None:
                 require_within(f"{part}.{key} of {parameter}", value, within)
 
 
+def _require_names(values: Mapping[str, Any]) -> None:
+    for key in NAMES:
+        part, _, inner = key.partition(".")
+        name = str((values.get(part) or {}).get(inner) or "" if inner else values.get(part) or "")
+        if len(name) > MAX_NAME:
+            raise ConfigurationError(f"{key} has more than {MAX_NAME} letters")
+        if name and (PurePath(name).name != name or name[0] == "." or not name.isprintable()):
+            raise ConfigurationError(f"{key} = {name!r}, expected a name of a file or folder")
+
+
 def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration as it is written and given away: no name of a file or folder of its user.
 
@@ -295,8 +310,11 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_contents(study: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
-    settings = _settings(study)
-    return dict(values) if settings is None else dict(with_contents(settings, values))
+    kinds = _kinds(study)
+    return {
+        name: with_contents(kinds[name][0], value, values) if name in kinds else value
+        for name, value in values.items()
+    }
 
 
 @cache

@@ -76,9 +76,12 @@ def drain_here(plan: Plan) -> None:
                 for number, worker in enumerate(workers)
             ]
             wait(threads)
-        finally:
+        except BaseException:
             for worker in workers:
                 worker.stop()
+            raise
+    for worker in workers:
+        worker.close()
     for thread in threads:
         thread.result()
 

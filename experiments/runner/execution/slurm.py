@@ -7,7 +7,6 @@ for or asked about later, and what died with a task is recorded, with Slurm's wo
 from __future__ import annotations
 
 import math
-import os
 import shlex
 import subprocess
 import sys
@@ -18,11 +17,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import experiments
 from experiments.runner.execution.drain import Shard
 from experiments.runner.jobs.folder import is_done, require_writable, result_time, write_failure
 from experiments.runner.planning.plan import Plan, PlannedJob
 from mvest.errors import ConfigurationError, InputError
+from mvest.processes import environment, python
 from mvest.provenance import write_json
 from mvest.reading.documents import read_json
 
@@ -246,9 +245,8 @@ def _states(arrays: Sequence[Submission]) -> dict[str, str]:
 
 def _script(plan: Plan, settings: Mapping[str, Any], count: int) -> str:
     """What a task runs; its first argument is the offset of its array."""
-    places = [str(Path(experiments.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")]
-    path = shlex.quote(os.pathsep.join(filter(None, places)))
-    worker = shlex.join([sys.executable, "-m", "experiments.cli", "worker"])
+    path = shlex.quote(environment()["PYTHONPATH"])
+    worker = shlex.join(python("experiments.cli", "worker"))
     folder = shlex.quote(str(plan.folder.resolve()))
     return "\n".join(
         [

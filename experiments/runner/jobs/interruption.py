@@ -7,6 +7,7 @@ import functools
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -16,6 +17,9 @@ P = ParamSpec("P")
 
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a process to stop."""
+
+AGAIN_S = 0.01
+"""Until a signal is sent again that Python has dropped."""
 
 
 class Interruption(KeyboardInterrupt):
@@ -44,8 +48,10 @@ def raised() -> Iterator[None]:
 
     While that is dealt with, another SIGTERM or SIGHUP is no news: schedulers send several. Another
     Ctrl-C ends the process at once, as a kill would, which leaves nothing half-written either. A
-    signal that is ignored, as ``nohup`` has it, stays so.
+    signal that is ignored, as ``nohup`` has it, stays so. Python drops what is raised in a weak
+    reference's callback or a ``__del__``; such a signal is sent again.
     """
+    unraisable = sys.unraisablehook
     before = {number: signal.getsignal(number) for number in ASKING}
     asked = False
 
@@ -58,12 +64,25 @@ def raised() -> Iterator[None]:
         if number == signal.SIGINT:
             os._exit(128 + number)
 
+    def again(number: int) -> None:
+        nonlocal asked
+        asked = False
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+    def dropped(lost: sys.UnraisableHookArgs) -> None:
+        if isinstance(lost.exc_value, Interruption):
+            threading.Timer(AGAIN_S, again, (lost.exc_value.status - 128,)).start()
+        else:
+            unraisable(lost)
+
+    sys.unraisablehook = dropped
     for number, handler in before.items():
         if handler != signal.SIG_IGN:
             signal.signal(number, ask)
     try:
         yield
     finally:
+        sys.unraisablehook = unraisable
         # Whoever was asked to stop, here or within, is about to end; another signal may come until
         # then.
         for number, handler in before.items():
@@ -78,13 +97,19 @@ def _ignore() -> None:
 
 
 def interruptible(command: Callable[P, int]) -> Callable[P, int]:
-    """A command that returns an exit status, also where a signal asks it to stop."""
+    """A command that returns an exit status, also where a signal or its reader asks it to stop."""
 
     @functools.wraps(command)
     def stopped(*given: P.args, **named: P.kwargs) -> int:
         with raised():
             try:
-                return command(*given, **named)
+                status = command(*given, **named)
+                sys.stdout.flush()
+                return status
+            except BrokenPipeError:
+                # Whoever reads the output has seen enough, as `head` does.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                return 128 + signal.SIGPIPE
             except KeyboardInterrupt as error:
                 print(
                     "interrupted: what is finished is kept, and the same command goes on from "
