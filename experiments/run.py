@@ -143,7 +143,7 @@ def explain(error: BaseException) -> str:
         return f"{' '.join(sys.argv[1:])}: {own[0] if own else type(error).__name__}"
     if isinstance(error, OverrideParseException):
         return f"{error.override}: {own[0]}"
-    causes = [error]
+    causes: list[BaseException] = [error]
     while (cause := causes[-1].__cause__) is not None:
         causes.append(cause)
     lines = [line.strip() for e in reversed(causes) for line in str(e).splitlines() if line.strip()]

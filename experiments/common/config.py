@@ -232,7 +232,13 @@ PARTS: Mapping[str, tuple[type, ...]] = {
 
 
 def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
-    """A configuration, without some of its parts, as resolved plain data."""
+    """A configuration, without some of its parts, as resolved plain data.
+
+    Raises
+    ------
+    ConfigurationError
+        If an override has deleted a setting.
+    """
     found: dict[str, Any] = {}
     for key in map(str, config):
         if key not in without:
@@ -240,6 +246,9 @@ def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str
             value = MISSING if OmegaConf.is_missing(config, key) else config[key]
             is_part = OmegaConf.is_config(value)
             found[key] = OmegaConf.to_container(value, resolve=True) if is_part else value
+    for name in _kinds(found.get("study")):
+        if name not in config:
+            raise ConfigurationError(f"{name} has no value")
     return found
 
 
@@ -273,9 +282,7 @@ def require_in_range(values: Mapping[str, Any]) -> None:
     ConfigurationError
         One line with the setting, its value and the range.
     """
-    for name in _kinds(values.get("study")):
-        if name not in values or (name in PARTS and values[name] is None):
-            raise ConfigurationError(f"{name} has no value")
+    _require_names(values)
     for name, value in values.items():
         for kind in _kinds(values.get("study")).get(name, (Any,)):
             part = value

@@ -28,7 +28,7 @@ from experiments.runner.tracking.store import open_store
 from experiments.runner.tracking.summary import IS_SWEEP
 from experiments.runner.tracking.sync import jobs_in
 from mvest.errors import InputError, MvestError
-from mvest.processes import Program, environment, python
+from mvest.processes import ROOT, Program, environment, python
 from mvest.quantities import within
 from mvest.reading.documents import read_mapping
 
@@ -174,8 +174,8 @@ def serving(
         "--allowed-hosts", ",".join(allowed_hosts(port)),
     ]  # fmt: skip
     # Whatever the login shell has set: nobody else is let in.
-    # MLflow starts Python again, without -P.
-    given = environment(PYTHONSAFEPATH="1")
+    # MLflow starts Python again, without -P, and uvicorn there would add the working folder.
+    given = environment(PYTHONSAFEPATH="1", UVICORN_APP_DIR=str(ROOT))
     kept = {name: value for name, value in given.items() if not name.startswith(WIDER)}
     out = subprocess.DEVNULL if quiet else None
     with Program(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=kept) as server:
