@@ -20,7 +20,7 @@ from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser
 from experiments.runner.jobs.interruption import interruptible
 from mvest import __version__
-from mvest.errors import MvestError
+from mvest.errors import ConfigurationError, InputError, MvestError
 
 COMMANDS = {
     "list": "the experiments, one sentence each",
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     command, rest = (given[0], given[1:]) if given else ("--help", [])
     if NUMBA_SETTINGS.exists():
-        return _refused(f"{NUMBA_SETTINGS}: numba would obey this file; start from another folder")
+        raise InputError(f"{NUMBA_SETTINGS}: numba would obey this file; start from another folder")
     match command:
         case "-h" | "--help":
             print(_help())
@@ -102,13 +102,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         case _:
             close = difflib.get_close_matches(command, COMMANDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
-            return _refused(f"{command}: no such command; {hint}")
+            raise ConfigurationError(f"{command}: no such command; {hint}")
     return 0
-
-
-def _refused(why: object) -> int:
-    print(f"error: {why}", file=sys.stderr)
-    return 2
 
 
 def _help() -> str:
@@ -166,7 +161,7 @@ def _application(overrides: list[str]) -> int:
     """Hydra's application, which reads the command line itself."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < LEAST_GB * 2**30:
-        return _refused(
+        raise ConfigurationError(
             f"address space is limited to {limit / 2**30:.2g} GB (ulimit -v), expected at least "
             f"{LEAST_GB:g} GB"
         )

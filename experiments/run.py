@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.common.config import register
 from experiments.common.places import CONF
 from experiments.runner.jobs.folder import FailedRunError, nothing_empty
-from experiments.runner.jobs.interruption import interruptible
+from experiments.runner.jobs.interruption import TRACEBACKS, interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from experiments.runner.tracking.beside import logging_beside
@@ -37,13 +37,6 @@ PRIMARY = "In 'config': "
 
 RESOLVING = "ConfigurationError raised while resolving interpolation: "
 """How OmegaConf begins messages about what a resolver of ours refuses."""
-
-REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
-"""What a wrong request raises; anything else is a mistake of ours and keeps its trace, unless it
-is Hydra that raises it."""
-
-TRACEBACKS = "HYDRA_FULL_ERROR"
-"""Environment variable with which a user asks for tracebacks."""
 
 
 @interruptible
@@ -72,13 +65,10 @@ def main() -> int:
     except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
-    except BrokenPipeError:
-        raise
     except Exception as error:
-        if wants_tracebacks or not (isinstance(error, REFUSED) or _is_raised_by_hydra(error)):
+        if wants_tracebacks or not _is_hydra_s(error):
             raise
-        print(f"error: {explain(error)}", file=sys.stderr)
-        return 2
+        raise ConfigurationError(explain(error)) from error
     finally:
         if not wants_tracebacks:
             del os.environ[TRACEBACKS]
@@ -127,19 +117,18 @@ def _require_options(arguments: Sequence[str]) -> None:
     parser.parse_args(arguments)
 
 
-def _is_raised_by_hydra(error: BaseException) -> bool:
+def _is_hydra_s(error: Exception) -> bool:
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return True
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    return str(frame.f_globals.get("__name__")).startswith("hydra.")
+    place = str(frame.f_globals.get("__name__"))
+    return place.startswith("hydra.") and not isinstance(error, OSError)
 
 
 def explain(error: BaseException) -> str:
     """One line that says what is wrong and, where it can be told, what would be right."""
-    if isinstance(error, OSError) and not isinstance(error, HydraException):
-        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     own = [line.strip() for line in str(error).splitlines() if line.strip()]
-    if isinstance(error, MvestError):
-        return own[0]
-    if not isinstance(error, REFUSED):
+    if not isinstance(error, HydraException | OmegaConfBaseException):
         return f"{' '.join(sys.argv[1:])}: {own[0] if own else type(error).__name__}"
     if isinstance(error, OverrideParseException):
         return f"{error.override}: {own[0]}"

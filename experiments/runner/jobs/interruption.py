@@ -1,4 +1,4 @@
-"""What asks a command to stop: Ctrl-C, SIGTERM and SIGHUP all end it in the same way."""
+"""How a command ends: in one line where it is refused or stopped by Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
@@ -13,10 +13,15 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import ParamSpec
 
+from mvest.errors import MvestError
+
 P = ParamSpec("P")
 
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a process to stop."""
+
+TRACEBACKS = "HYDRA_FULL_ERROR"
+"""Environment variable with which a user asks for tracebacks."""
 
 AGAIN_S = 0.01
 """Until a signal is sent again that Python has dropped."""
@@ -90,6 +95,12 @@ def raised() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
+def _in_one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error).strip().partition("\n")[0]
+
+
 def _ignore() -> None:
     """Let no signal change the exit status of an interpreter that takes itself apart."""
     for number in ASKING:
@@ -97,7 +108,7 @@ def _ignore() -> None:
 
 
 def interruptible(command: Callable[P, int]) -> Callable[P, int]:
-    """A command that returns an exit status, also where a signal or its reader asks it to stop."""
+    """A command that returns an exit status, also where it is refused or asked to stop."""
 
     @functools.wraps(command)
     def stopped(*given: P.args, **named: P.kwargs) -> int:
@@ -110,6 +121,11 @@ def interruptible(command: Callable[P, int]) -> Callable[P, int]:
                 # Whoever reads the output has seen enough, as `head` does.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 return 128 + signal.SIGPIPE
+            except (MvestError, OSError) as error:
+                if TRACEBACKS in os.environ:
+                    raise
+                print(f"error: {_in_one_line(error)}", file=sys.stderr)
+                return 2
             except KeyboardInterrupt as error:
                 print(
                     "interrupted: what is finished is kept, and the same command goes on from "
