@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import resource
 import shutil
 import sys
 import textwrap
@@ -19,7 +20,7 @@ from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser
 from experiments.runner.jobs.interruption import interruptible
 from mvest import __version__
-from mvest.errors import MvestError
+from mvest.errors import ConfigurationError, InputError, MvestError
 
 COMMANDS = {
     "list": "the experiments, one sentence each",
@@ -36,6 +37,12 @@ COMMANDS = {
     "dashboard": "MLflow's pages, on the comparison of the last sweep",
 }
 
+NUMBA_SETTINGS = Path(".numba_config.yaml")
+"""Whoever writes this file has numba run the compiled code in a folder that it names."""
+
+LEAST_GB = 1.2
+"""Address space without which libraries cannot be loaded; they end in many ways where it lacks."""
+
 CHECK = "only read, check and draw it, in seconds, and say what an estimate would be able to tell"
 OVERRIDES = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
 
@@ -45,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command on its arguments, those of the command line by default; the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     command, rest = (given[0], given[1:]) if given else ("--help", [])
+    if NUMBA_SETTINGS.exists():
+        raise InputError(f"{NUMBA_SETTINGS}: numba would obey this file; start from another folder")
     match command:
         case "-h" | "--help":
             print(_help())
@@ -93,8 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         case _:
             close = difflib.get_close_matches(command, COMMANDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
-            print(f"error: {command}: no such command; {hint}", file=sys.stderr)
-            return 2
+            raise ConfigurationError(f"{command}: no such command; {hint}")
     return 0
 
 
@@ -158,6 +166,12 @@ def _collect(folder: Path) -> int:
 
 def _application(overrides: list[str]) -> int:
     """Hydra's application, which reads the command line itself."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < LEAST_GB * 2**30:
+        raise ConfigurationError(
+            f"address space is limited to {limit / 2**30:.2g} GB (ulimit -v), expected at least "
+            f"{LEAST_GB:g} GB"
+        )
     from experiments.run import main as application
 
     before = sys.argv

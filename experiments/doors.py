@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-import sys
 import typing
 from argparse import RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
@@ -23,9 +22,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.schema import build, schema
 from experiments.console import Parser
+from experiments.runner.jobs.interruption import interruptible
 from mvest.cases import exporting, importing
 from mvest.cases.writer import require_new, write_case
-from mvest.errors import ConfigurationError, MvestError
+from mvest.errors import ConfigurationError
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +108,7 @@ def export_command(given: Sequence[str]) -> int:
     return _pass("export", exporting, "TARGET", write, given)
 
 
+@interruptible
 def _pass(
     verb: str,
     package: ModuleType,
@@ -134,9 +135,5 @@ def _pass(
     for option in parsed.options:
         if "=" not in option:
             parser.error(f"{option}: expected OPTION=VALUE; one source and one target at a time")
-    try:
-        write(door, parsed.source, parsed.target, door.settings(parsed.options))
-    except (MvestError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    write(door, parsed.source, parsed.target, door.settings(parsed.options))
     return 0

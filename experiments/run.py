@@ -11,10 +11,14 @@ import difflib
 import math
 import os
 import sys
+import traceback
+from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
+from typing import NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
@@ -24,20 +28,17 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.common.config import register
 from experiments.common.places import CONF
 from experiments.runner.jobs.folder import FailedRunError, nothing_empty
-from experiments.runner.jobs.interruption import interruptible
+from experiments.runner.jobs.interruption import TRACEBACKS, interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from experiments.runner.tracking.beside import logging_beside
-from mvest.errors import MvestError
+from mvest.errors import ConfigurationError, MvestError
 
 PRIMARY = "In 'config': "
 """How Hydra begins messages about the primary configuration."""
 
-REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
-"""What a wrong request raises; anything else is a mistake of ours and keeps its trace."""
-
-TRACEBACKS = "HYDRA_FULL_ERROR"
-"""Environment variable with which a user asks for tracebacks."""
+RESOLVING = "ConfigurationError raised while resolving interpolation: "
+"""How OmegaConf begins messages about what a resolver of ours refuses."""
 
 
 @interruptible
@@ -61,6 +62,7 @@ def main() -> int:
     # Hydra then lets exceptions through, so that they can be told in one line here.
     os.environ[TRACEBACKS] = "1"
     try:
+        _require_options(sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
             raise error
@@ -69,11 +71,10 @@ def main() -> int:
     except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
-    except REFUSED as error:
-        if wants_tracebacks:
+    except Exception as error:
+        if wants_tracebacks or not _is_hydra_s(error):
             raise
-        print(f"error: {explain(error)}", file=sys.stderr)
-        return 2
+        raise ConfigurationError(explain(error)) from error
     finally:
         if not wants_tracebacks:
             del os.environ[TRACEBACKS]
@@ -119,16 +120,33 @@ def run_alone(config: DictConfig) -> float:
         return math.nan if record is None else objective_of(record, config.objective)
 
 
+def _require_options(arguments: Sequence[str]) -> None:
+    """Refuse an option that Hydra does not have; it would complete or explain it at length."""
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigurationError(f"{message}; settings are NAME=VALUE, as in experiment=debug")
+
+    parser = get_args_parser()
+    parser.allow_abbrev, parser.error = False, refuse  # type: ignore[method-assign]
+    parser.parse_args(arguments)
+
+
+def _is_hydra_s(error: Exception) -> bool:
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return True
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    place = str(frame.f_globals.get("__name__"))
+    return place.startswith("hydra.") and not isinstance(error, OSError)
+
+
 def explain(error: BaseException) -> str:
     """One line that says what is wrong and, where it can be told, what would be right."""
-    if isinstance(error, OSError) and not isinstance(error, HydraException):
-        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     own = [line.strip() for line in str(error).splitlines() if line.strip()]
-    if isinstance(error, MvestError):
-        return own[0]
+    if not isinstance(error, HydraException | OmegaConfBaseException):
+        return f"{' '.join(sys.argv[1:])}: {own[0] if own else type(error).__name__}"
     if isinstance(error, OverrideParseException):
         return f"{error.override}: {own[0]}"
-    causes = [error]
+    causes: list[BaseException] = [error]
     while (cause := causes[-1].__cause__) is not None:
         causes.append(cause)
     lines = [line.strip() for e in reversed(causes) for line in str(e).splitlines() if line.strip()]
@@ -140,6 +158,8 @@ def explain(error: BaseException) -> str:
         )
         known = ", ".join(choices)
         return f"{text.removeprefix(PRIMARY)}; known: {known}"
+    if refused := text.partition(RESOLVING)[2]:
+        return refused
     if isinstance(causes[-1], OmegaConfBaseException):
         full_key = next((line for line in lines if line.startswith("full_key:")), None)
         if full_key is not None:

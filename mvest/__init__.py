@@ -27,6 +27,9 @@ Inside the library lengths are mm, times s, masses tonne, forces N and stresses 
 
 import lazy_loader
 
+from mvest._compiling import choose_cache
+
 __version__ = "0.1.0"
 
+choose_cache()
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

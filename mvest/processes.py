@@ -17,12 +17,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
 KEEPER = Path(__file__).with_name("_keeper.py")
+
+ROOT = Path(__file__).resolve().parents[1]
+"""What holds this package, and those that were installed with it."""
 
 GRACE_S = 1.0
 """Between asking a program to stop and stopping it."""
@@ -102,13 +104,26 @@ class Program(AbstractContextManager["Program"]):
                 with suppress(OSError):
                     stream.close()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def python(module: str, *arguments: str) -> list[str]:
+    """Command that runs a module in another Python; start it with an `environment`.
+
+    The folder in which it is started is no place to import from: it may be a case of somebody else.
+    """
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+def environment(**more: str) -> dict[str, str]:
+    """Environment of another Python: this one's and ``more``; it finds the packages found here.
+
+    Entries of ``PYTHONPATH`` that are empty or relative mean the working folder, and are left out.
+    """
+    places = [str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    path = os.pathsep.join(dict.fromkeys(filter(os.path.isabs, places)))
+    return {**os.environ, "PYTHONPATH": path, **more}
 
 
 def run(
@@ -162,6 +177,8 @@ def side_by_side(
         return (function(*arguments) for arguments in calls)
     import joblib  # and with it asyncio, which one process needs not wait for
 
+    # joblib starts processes now and later, without -P.
+    os.environ.update(environment(PYTHONSAFEPATH="1"))
     with joblib.parallel_config(
         backend="loky", inner_max_num_threads=1, initializer=_watch, initargs=(os.getpid(),)
     ):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
+from pathlib import PurePath
 from typing import Annotated, Any, TypeAlias
 
 from hydra.core.hydra_config import HydraConfig
@@ -66,6 +67,9 @@ GROUP = "study"
 
 MAX_NAME = 120
 """Letters of a text that names files."""
+
+NAMES = ("name", "table", "study", "sweep.name")
+"""Settings that name files and folders."""
 
 Switch: TypeAlias = Annotated[bool, NOT_HASHED]
 ByParameter: TypeAlias = Annotated[dict[str, float], BY_PARAMETER]
@@ -229,7 +233,13 @@ PARTS: Mapping[str, tuple[type, ...]] = {
 
 
 def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
-    """A configuration, without some of its parts, as resolved plain data."""
+    """A configuration, without some of its parts, as resolved plain data.
+
+    Raises
+    ------
+    ConfigurationError
+        If an override has deleted a setting.
+    """
     found: dict[str, Any] = {}
     for key in map(str, config):
         if key not in without:
@@ -237,6 +247,9 @@ def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str
             value = MISSING if OmegaConf.is_missing(config, key) else config[key]
             is_part = OmegaConf.is_config(value)
             found[key] = OmegaConf.to_container(value, resolve=True) if is_part else value
+    for name in _kinds(found.get("study")):
+        if name not in config:
+            raise ConfigurationError(f"{name} has no value")
     return found
 
 
@@ -246,6 +259,7 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
     Of files and folders that it names what lies there counts, and not their names.
     """
     values = plain(config) if isinstance(config, DictConfig) else config
+    _require_names(values)  # of the folder, which Hydra makes next
     study = values.get("study")
     kept = without(values, ("hydra", *_not_hashed(study)))
     return config_hash(_with_contents(study, kept))
@@ -269,9 +283,7 @@ def require_in_range(values: Mapping[str, Any]) -> None:
     ConfigurationError
         One line with the setting, its value and the range.
     """
-    for name in ("name", "table", "study"):
-        if len(str(values.get(name) or "")) > MAX_NAME:
-            raise ConfigurationError(f"{name} has more than {MAX_NAME} letters")
+    _require_names(values)
     for name, value in values.items():
         for kind in _kinds(values.get("study")).get(name, (Any,)):
             part = value
@@ -286,6 +298,16 @@ def require_in_range(values: Mapping[str, Any]) -> None:
                 require_within(f"{part}.{key} of {parameter}", value, within)
 
 
+def _require_names(values: Mapping[str, Any]) -> None:
+    for key in NAMES:
+        part, _, inner = key.partition(".")
+        name = str((values.get(part) or {}).get(inner) or "" if inner else values.get(part) or "")
+        if len(name) > MAX_NAME:
+            raise ConfigurationError(f"{key} has more than {MAX_NAME} letters")
+        if name and (PurePath(name).name != name or name[0] == "." or not name.isprintable()):
+            raise ConfigurationError(f"{key} = {name!r}, expected a name of a file or folder")
+
+
 def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration as it is written and given away: no name of a file or folder of its user.
 
@@ -296,8 +318,11 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_contents(study: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
-    settings = _settings(study)
-    return dict(values) if settings is None else dict(with_contents(settings, values))
+    kinds = _kinds(study)
+    return {
+        name: with_contents(kinds[name][0], value, values) if name in kinds else value
+        for name, value in values.items()
+    }
 
 
 @cache

@@ -77,26 +77,35 @@ InputFile = Annotated[str | None, Reads(contents)]
 
 
 def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None) -> Any:
-    """Values of a schema, or of one of its types, with what its settings read in their place."""
-    if value is None or value == MISSING or not _may_read(kind):
+    """Values of a schema, or of one of its types, with what its settings read in their place.
+
+    Equal numbers become alike, so that 1 and 1.0 are one setting in a hash: in a float, and where a
+    type states no more than a range, they are floats, and in what has no type whole ones are ints.
+    """
+    if value is None or value == MISSING or not _may_change(kind):
         return value
-    kind, marks = _unwrapped(kind)
+    given, (kind, marks) = kind, _unwrapped(kind)
     for mark in marks:
         if isinstance(mark, Reads):
             return mark.contents(value, beside or {})
-    arguments = typing.get_args(kind)
-    if _is_schema(kind):
-        hints = hints_of(kind)
-        return {k: with_contents(hints.get(k), item, value) for k, item in value.items()}
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if kind is float or (kind is Any and any(isinstance(m, FieldInfo) for m in marks)):
+            return float(value)
+        return int(value) if kind is Any and float(value).is_integer() else value
     if isinstance(value, Mapping):
-        return {key: with_contents(arguments[1], item) for key, item in value.items()}
-    return [with_contents(arguments[0], item) for item in value]
+        hints = hints_of(kind) if _is_schema(kind) else {}
+        inner = None if hints else (typing.get_args(kind) or (given,))[-1]
+        return {k: with_contents(hints.get(k, inner), item, value) for k, item in value.items()}
+    if isinstance(value, list | tuple):
+        inner = (typing.get_args(kind) or (given,))[0]
+        return [with_contents(inner, item) for item in value]
+    return value
 
 
 @cache
-def _may_read(kind: Any) -> bool:
+def _may_change(kind: Any) -> bool:
     inner = hints_of(kind).values() if _is_schema(kind) else typing.get_args(kind)
-    return isinstance(kind, Reads) or any(map(_may_read, inner))
+    return kind in (Any, float) or isinstance(kind, Reads) or any(map(_may_change, inner))
 
 
 def _is_schema(kind: Any) -> bool:
@@ -188,6 +197,8 @@ def require_admissible_values(
         return
     if isinstance(value, int | float):
         require_within(key, value, within)
+    elif value == MISSING:
+        raise ConfigurationError(f"{key} has no value")
     elif isinstance(value, str):
         try:
             check_words(value, MAX_LETTERS)

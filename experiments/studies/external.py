@@ -188,9 +188,9 @@ def model_of(task: Task, name: str, count: int) -> ObservationModel:
 
 
 def _file(python: str) -> Path | None:
-    """The file of a FILE:FUNCTION, from where the command was typed or from the checkout."""
+    """The file of a FILE:FUNCTION, from the checkout or from where the command was typed."""
     name = python.rpartition(":")[0]
-    places = (Path(name).absolute(), CHECKOUT / name)
+    places = (CHECKOUT / name, Path(name).absolute())
     return next((place for place in places if place.is_file()), None)
 
 

@@ -138,6 +138,30 @@ def test_an_estimate_loads_neither_tables_nor_figures_nor_cases(tmp_path):
     )
 
 
+def test_a_reader_that_has_seen_enough_ends_the_list_quietly():
+    command = f"{sys.executable} -m mvest list"
+    shell = f"set -o pipefail; {command} | true"
+    done = subprocess.run(
+        ["bash", "-c", shell], cwd=ROOT, env=here(), capture_output=True, text=True, check=False
+    )
+    assert done.returncode in (0, 141)
+    assert done.stderr == ""
+
+
+def test_too_small_an_address_space_is_one_line(tmp_path):
+    done = subprocess.run(
+        ["sh", "-c", f"ulimit -v 400000; exec {sys.executable} -m mvest run experiment=debug"],
+        cwd=tmp_path,
+        env=here(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "ulimit -v" in line
+
+
 def here() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(ROOT)}
 

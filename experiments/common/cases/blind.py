@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-import experiments
 from experiments.common.cases.own_case import case_result, read_configured, run_case, run_volume
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model
@@ -30,7 +29,7 @@ from experiments.common.study import Result
 from mvest.errors import InputError, MvestError
 from mvest.files import write_atomically
 from mvest.problem.record import EstimateRecord
-from mvest.processes import run
+from mvest.processes import environment, python, run
 from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
@@ -98,20 +97,14 @@ def estimate_blindly(
     path = folder / ESTIMATE
     for left in (path, folder / FIELDS):
         left.unlink(missing_ok=True)
-    places = [
-        str(Path(experiments.__file__).resolve().parents[1]),
-        os.environ.get("PYTHONPATH", ""),
-    ]
     ended = run(
-        [sys.executable, "-m", "experiments.common.cases.blind"],
+        python("experiments.common.cases.blind"),
         input=json.dumps(request),
         stdout=DEVNULL,
         stderr=PIPE,
         text=True,
         encoding="utf-8",
-        env=os.environ
-        | dict.fromkeys(THREAD_VARIABLES, "1")
-        | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
+        env=environment(**dict.fromkeys(THREAD_VARIABLES, "1")),
     )
     if ended.returncode or not path.is_file():
         last = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import atexit
 import json
-import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -19,7 +17,6 @@ from functools import cache
 from pathlib import Path
 from subprocess import PIPE, TimeoutExpired
 
-import experiments
 from experiments.common.records.record import Record
 from experiments.runner.jobs.folder import (
     finished_record,
@@ -34,10 +31,10 @@ from experiments.runner.jobs.folder import (
 from experiments.runner.jobs.limits import MEMORY_LIMIT, default_memory_gb
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
-from mvest.processes import Program
+from mvest.processes import Program, environment, python
 from mvest.provenance import THREAD_VARIABLES
 
-WORKER = (sys.executable, "-m", "experiments.runner.execution.worker")
+WORKER = python("experiments.runner.execution.worker")
 """Command of a process that runs jobs."""
 
 LEAVE_S = 2.0
@@ -156,20 +153,13 @@ class WorkerProcess:
         if self._program is not None and self._program.process.poll() is not None:
             self.close()
         if self._program is None:
-            # The package itself, wherever the command is typed.
-            places = [
-                str(Path(experiments.__file__).resolve().parents[1]),
-                os.environ.get("PYTHONPATH", ""),
-            ]
             self._program = Program(
                 self._command,
                 stdin=PIPE,
                 stdout=PIPE,
                 text=True,
                 encoding="utf-8",
-                env=os.environ
-                | dict.fromkeys(THREAD_VARIABLES, "1")
-                | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
+                env=environment(**dict.fromkeys(THREAD_VARIABLES, "1")),
             )
         if self._stopped:
             self.close()

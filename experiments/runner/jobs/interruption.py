@@ -1,4 +1,4 @@
-"""What asks a command to stop: Ctrl-C, SIGTERM and SIGHUP all end it in the same way."""
+"""How a command ends: in one line where it is refused or stopped by Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
@@ -7,15 +7,24 @@ import functools
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import ParamSpec
 
+from mvest.errors import MvestError
+
 P = ParamSpec("P")
 
 ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a process to stop."""
+
+TRACEBACKS = "HYDRA_FULL_ERROR"
+"""Environment variable with which a user asks for tracebacks."""
+
+AGAIN_S = 0.01
+"""Until a signal is sent again that Python has dropped."""
 
 
 class Interruption(KeyboardInterrupt):
@@ -44,8 +53,10 @@ def raised() -> Iterator[None]:
 
     While that is dealt with, another SIGTERM or SIGHUP is no news: schedulers send several. Another
     Ctrl-C ends the process at once, as a kill would, which leaves nothing half-written either. A
-    signal that is ignored, as ``nohup`` has it, stays so.
+    signal that is ignored, as ``nohup`` has it, stays so. Python drops what is raised in a weak
+    reference's callback or a ``__del__``; such a signal is sent again.
     """
+    unraisable = sys.unraisablehook
     before = {number: signal.getsignal(number) for number in ASKING}
     asked = False
 
@@ -58,17 +69,36 @@ def raised() -> Iterator[None]:
         if number == signal.SIGINT:
             os._exit(128 + number)
 
+    def again(number: int) -> None:
+        nonlocal asked
+        asked = False
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+    def dropped(lost: sys.UnraisableHookArgs) -> None:
+        if isinstance(lost.exc_value, Interruption):
+            threading.Timer(AGAIN_S, again, (lost.exc_value.status - 128,)).start()
+        else:
+            unraisable(lost)
+
+    sys.unraisablehook = dropped
     for number, handler in before.items():
         if handler != signal.SIG_IGN:
             signal.signal(number, ask)
     try:
         yield
     finally:
+        sys.unraisablehook = unraisable
         # Whoever was asked to stop, here or within, is about to end; another signal may come until
         # then.
         for number, handler in before.items():
             if not asked and signal.getsignal(number) is ask:
                 signal.signal(number, handler)
+
+
+def _in_one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error).strip().partition("\n")[0]
 
 
 def _ignore() -> None:
@@ -78,13 +108,24 @@ def _ignore() -> None:
 
 
 def interruptible(command: Callable[P, int]) -> Callable[P, int]:
-    """A command that returns an exit status, also where a signal asks it to stop."""
+    """A command that returns an exit status, also where it is refused or asked to stop."""
 
     @functools.wraps(command)
     def stopped(*given: P.args, **named: P.kwargs) -> int:
         with raised():
             try:
-                return command(*given, **named)
+                status = command(*given, **named)
+                sys.stdout.flush()
+                return status
+            except BrokenPipeError:
+                # Whoever reads the output has seen enough, as `head` does.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                return 128 + signal.SIGPIPE
+            except (MvestError, OSError) as error:
+                if TRACEBACKS in os.environ:
+                    raise
+                print(f"error: {_in_one_line(error)}", file=sys.stderr)
+                return 2
             except KeyboardInterrupt as error:
                 print(
                     "interrupted: what is finished is kept, and the same command goes on from "

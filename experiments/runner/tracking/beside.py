@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,10 +11,9 @@ from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import Any
 
-import experiments
 from experiments.runner.tracking.upload import REMEDY, is_due, track_job
 from mvest.errors import MvestError
-from mvest.processes import Program
+from mvest.processes import Program, environment, python
 
 LOGGING = "experiments.runner.tracking.beside"
 """Module that the other process runs."""
@@ -36,14 +34,13 @@ def logging_beside(config: Mapping[str, Any]) -> Iterator[Callable[[Path], None]
     if not config["tracking"]["enabled"] or config["check"]:
         yield lambda _: None
         return
-    places = [str(Path(experiments.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")]
     with Program(
-        [sys.executable, "-m", LOGGING],
+        python(LOGGING),
         stdin=PIPE,
         stderr=PIPE,
         text=True,
         encoding="utf-8",
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
+        env=environment(),
     ) as program:
         yield partial(
             _order, program.process, {name: config[name] for name in ("name", "paths", "tracking")}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -29,7 +28,7 @@ from experiments.runner.tracking.store import open_store
 from experiments.runner.tracking.summary import IS_SWEEP
 from experiments.runner.tracking.sync import jobs_in
 from mvest.errors import InputError, MvestError
-from mvest.processes import Program
+from mvest.processes import ROOT, Program, environment, python
 from mvest.quantities import within
 from mvest.reading.documents import read_mapping
 
@@ -169,13 +168,15 @@ def serving(
             ) from error
         port = int(probe.getsockname()[1])
     command = [
-        sys.executable, "-m", "mlflow", "server", "--backend-store-uri", place,
+        *python("mlflow", "server"), "--backend-store-uri", place,
         "--default-artifact-root", (outputs.resolve() / "mlartifacts").as_uri(),
         "--host", HOSTS[0], "--port", str(port), "--workers", "1",
         "--allowed-hosts", ",".join(allowed_hosts(port)),
     ]  # fmt: skip
     # Whatever the login shell has set: nobody else is let in.
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(WIDER)}
+    # MLflow starts Python again, without -P, and uvicorn there would add the working folder.
+    given = environment(PYTHONSAFEPATH="1", UVICORN_APP_DIR=str(ROOT))
+    kept = {name: value for name, value in given.items() if not name.startswith(WIDER)}
     out = subprocess.DEVNULL if quiet else None
     with Program(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=kept) as server:
         _await(f"http://127.0.0.1:{port}", server.process)

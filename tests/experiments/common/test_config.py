@@ -73,6 +73,24 @@ def test_a_hash_depends_on_what_changes_the_result_only() -> None:
     assert len(others) == 9
 
 
+@pytest.mark.parametrize(
+    ("experiment", "one", "other"),
+    [
+        ("table1", "filter.R=1", "filter.R=1.0"),
+        ("table1", "filter.P0=[1,2]", "filter.P0=[1.0,2]"),
+        ("table1", "filter.P0=[[1,0],[0,1]]", "filter.P0=[[1.0,0.0],[0.0,1.0]]"),
+        ("table1", "filter.initial=[4,3]", "filter.initial=[4.0,3.0]"),
+        ("table1", "filter.method.Q=1", "filter.method.Q=1.0"),
+        ("donor", "donor.starts=[[1,2]]", "donor.starts=[[1.0,2.0]]"),
+        ("models", "external.settings.cells=4", "external.settings.cells=4.0"),
+    ],
+)  # fmt: skip
+def test_equal_numbers_have_one_hash(experiment, one, other) -> None:
+    first, second = (hash_of(composed(f"experiment={experiment}", line)) for line in (one, other))
+    assert first == second
+    assert first != hash_of(composed(f"experiment={experiment}"))
+
+
 def test_what_within_a_part_changes_no_number_is_no_part_of_the_hash() -> None:
     base = hash_of(composed("experiment=imaging"))
     same = ["imaging.processes=7", "imaging.publish_model=true"]

@@ -132,6 +132,17 @@ ERRORS = [
     ("sweep.size=full", "sweep.size"),
     ("time_limit_s=soon", "time_limit_s: Value 'soon'"),
     ("force=perhaps", "force: Value 'perhaps'"),
+    ("filter=null", "filter=null: "),
+    ("mesh=null", "mesh=null: "),
+    ("~filter", "filter.mode has no value"),
+    ("~seed", "seed has no value"),
+    ("--experiment", "unrecognized arguments: --experiment; settings are NAME=VALUE"),
+    ("name=../escape", "name = '../escape', expected a name"),
+    ("name=.hidden", "name = '.hidden', expected a name"),
+    ("table=deeper/table", "table = 'deeper/table', expected a name"),
+    ("+sweep.name=../escape", "sweep.name = '../escape', expected a name"),
+    ("name='a\x07b'", "expected a name"),
+    ("hydra.run.dir=${paths.outputs}/${name}/x name=..", "expected a name"),
 ]  # fmt: skip
 
 
@@ -139,7 +150,7 @@ ERRORS = [
 def test_a_wrong_request_is_one_clear_line(run, tmp_path, override: str, words: str) -> None:
     (tmp_path / "file").touch()
     first = [] if override.startswith("experiment=") else ["experiment=debug"]
-    status, out, err = run(*first, override)
+    status, out, err = run(*first, *override.split())
     assert status == 2
     assert out == ""
     assert err.startswith("error: ")

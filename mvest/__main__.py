@@ -1,0 +1,17 @@
+"""The console command ``mvest``, and ``python -m mvest``: leads to the experiments beside this."""
+
+import sys
+from pathlib import Path
+
+
+def main() -> int:
+    """Run the command line; returns the exit status."""
+    # Of all packages called experiments, the one that was installed with this.
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from experiments.cli import main as command
+
+    return command()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
