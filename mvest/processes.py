@@ -24,6 +24,9 @@ T = TypeVar("T")
 
 KEEPER = Path(__file__).with_name("_keeper.py")
 
+ROOT = Path(__file__).resolve().parents[1]
+"""What holds this package, and those that were installed with it."""
+
 GRACE_S = 1.0
 """Between asking a program to stop and stopping it."""
 
@@ -91,6 +94,8 @@ class Program(AbstractContextManager["Program"]):
         """Ask for the program's end, without waiting for it; from any thread."""
         with suppress(OSError):  # it has ended
             self._lifeline.shutdown(socket.SHUT_WR)
+            # A keeper that was stopped does not notice.
+            self.process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
         """End the program, and wait until it and all that it has started is gone."""
@@ -109,6 +114,24 @@ class Program(AbstractContextManager["Program"]):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def python(module: str, *arguments: str) -> list[str]:
+    """Command that runs a module in another Python; start it with an `environment`.
+
+    The folder in which it is started is no place to import from: it may be a case of somebody else.
+    """
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+def environment(**more: str) -> dict[str, str]:
+    """Environment of another Python: this one's and ``more``; it finds the packages found here.
+
+    Entries of ``PYTHONPATH`` that are empty or relative mean the working folder, and are left out.
+    """
+    places = [str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    path = os.pathsep.join(dict.fromkeys(filter(os.path.isabs, places)))
+    return {**os.environ, "PYTHONPATH": path, **more}
 
 
 def run(
