@@ -44,17 +44,28 @@ class WorkerProcess:
         self._stopped = False
         atexit.register(self.close)
 
-    def run(
-        self, request: Request, memory_gb: float | None = None, *, aloud: bool = False
-    ) -> str | None:
+    def run(self, request: Request, at_a_time: int = 1, *, aloud: bool = False) -> str | None:
         """Run one job; None if it wrote its record, otherwise the reason why it did not.
 
         With ``aloud`` the job's progress is shown, and a refusal is a `ConfigurationError`. Raises
-        `StoppedError` if `stop` was called.
+        `StoppedError` if `stop` was called. See `run_apart`.
         """
-        program, began, line = self._started(), time.monotonic(), ""
+        if self._program is not None and self._program.process.poll() is not None:
+            self.close()
+        program = self._program = self._program or Program(
+            self._command,
+            stdin=PIPE,
+            stdout=PIPE,
+            encoding="utf-8",
+            env=environment(**dict.fromkeys(THREAD_VARIABLES, "1")),
+        )
+        if self._stopped:
+            self.close()
+            raise StoppedError
         process: Any = program.process
-        limit_s = request.values.get("time_limit_s") or threading.TIMEOUT_MAX
+        began, line = time.monotonic(), ""
+        memory_gb = request.values["memory_limit_gb"] or default_memory_gb(at_a_time)
+        limit_s = request.values["time_limit_s"] or threading.TIMEOUT_MAX
         timer = threading.Timer(limit_s, program.end)
         timer.daemon = True
         timer.start()
@@ -72,20 +83,20 @@ class WorkerProcess:
         finally:
             timer.cancel()
         expired = time.monotonic() - began >= limit_s
-        answer = json.loads(line) if line.endswith("\n") and not expired else None
-        if answer is None or not answer["healthy"]:
-            self.close()
-        if answer is not None:
-            if aloud and answer.get("refused"):
-                raise ConfigurationError(answer["reason"])
+        if line.endswith("\n") and not expired:
+            answer = json.loads(line)
             reason: str | None = answer["reason"]
+            if aloud and answer["refused"]:
+                raise ConfigurationError(reason)
+            if reason is not None and not answer["refused"]:
+                self.close()
             return reason
+        self.close()
         if self._stopped:
             raise StoppedError
         if expired:
             return f"time limit of {limit_s:g} s"
-        held = "" if memory_gb is None else f"; memory limit {memory_gb:.3g} GB"
-        return _end(process.returncode) + held
+        return f"{_end(process.returncode)}; memory limit {memory_gb:.3g} GB"
 
     def close(self) -> None:
         """End the process, and whatever it has started."""
@@ -105,18 +116,6 @@ class WorkerProcess:
         program = self._program
         if program is not None:
             program.end()
-
-    def _started(self) -> Program:
-        if self._program is not None and self._program.process.poll() is not None:
-            self.close()
-        if self._program is None:
-            streams = {"stdin": PIPE, "stdout": PIPE, "encoding": "utf-8"}
-            one_thread = environment(**dict.fromkeys(THREAD_VARIABLES, "1"))
-            self._program = Program(self._command, env=one_thread, **streams)
-        if self._stopped:
-            self.close()
-            raise StoppedError
-        return self._program
 
 
 def new_worker() -> WorkerProcess:
@@ -149,8 +148,7 @@ def run_apart(
         if record is None:
             started = time.time()
             jobs.make_way(request)
-            memory = request.values["memory_limit_gb"] or default_memory_gb(at_a_time)
-            reason = (worker or own_worker()).run(request, memory, aloud=aloud)
+            reason = (worker or own_worker()).run(request, at_a_time, aloud=aloud)
             if reason is None:
                 record = jobs.read_result(request.folder, request.config_hash)
             record = record or jobs.write_failure(request, reason or "it left no record", started)

@@ -41,9 +41,8 @@ def main() -> None:
                 for stream in (1,) if aloud else (1, 2):
                     os.dup2(log.fileno(), stream)
             answered = answer(request, memory_gb)
-            for text in (sys.stdout, sys.stderr):
-                with suppress(OSError):  # the log's disk is full
-                    text.flush()
+            with suppress(OSError):  # the log's disk is full
+                sys.stdout.flush()
             os.dup2(nothing, 1)
             os.dup2(terminal, 2)
             answers.write(json.dumps(answered) + "\n")
@@ -54,23 +53,19 @@ def main() -> None:
 
 
 def answer(request: Request, memory_gb: float) -> dict[str, Any]:
-    """Run one job: ``{"reason": None}`` if it wrote its record, otherwise why it did not.
+    """Run one job; the ``reason`` is None if it wrote its record, otherwise why it did not.
 
-    ``healthy`` says whether another job may run in this process, ``refused`` that the request is
-    wrong and nothing was computed.
+    ``refused`` says that the request is wrong, and that this process may run another one.
     """
     try:
         compute(request, memory_gb)
     except FailedRunError:
         pass  # it is recorded
-    except MvestError as error:
-        print(f"error: {error}")
-        return {"reason": reason_of(error), "healthy": True, "refused": True}
     except Exception as error:
         # Whatever it is costs its own job; the traceback is in the log.
         traceback.print_exception(error, file=sys.stdout)
-        return {"reason": reason_of(error), "healthy": isinstance(error, OSError)}
-    return {"reason": None, "healthy": True}
+        return {"reason": reason_of(error), "refused": isinstance(error, MvestError)}
+    return {"reason": None, "refused": False}
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ for line in sys.stdin:
     if "sleep" in order: time.sleep(order["sleep"])
     said = {"pid": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
     with open(os.path.join(request["folder"], "said.json"), "w") as file: json.dump(said, file)
-    print(json.dumps({"reason": order.get("reason"), "healthy": order.get("healthy", True)}))
+    print(json.dumps({"reason": order.get("reason"), "refused": order.get("refused", False)}))
     sys.stdout.flush()
 """
 """A worker that does as it is told."""
@@ -55,7 +55,11 @@ def worker():
     found.close()
 
 
-TRUTH = {"values": [1.0], "refine": 1, **dict.fromkeys(("element", "source", "columns", "rows", "layers"))}
+TRUTH = {
+    "values": [1.0],
+    "refine": 1,
+    **dict.fromkeys(("element", "source", "columns", "rows", "layers")),
+}
 
 MESH = {"columns": 1, "rows": 1, "layers": 1, "source": "structured", "edge_length": 2.5}
 
@@ -106,7 +110,7 @@ def said(folder: Path) -> dict:
         ({"exit": 0}, "exit status 0"),
         ({"sleep": 60, "limit": 0.2}, "time limit of 0.2 s"),
         ({"reason": "it buckled"}, "it buckled"),
-        ({"reason": "out of memory", "healthy": False}, "out of memory"),
+        ({"reason": "mesh.rows = 0", "refused": True}, "mesh.rows = 0"),
         ({}, "it left no record"),
     ],
 )
@@ -130,8 +134,8 @@ def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
 
     first = pid()
     assert pid() == first
-    assert pid(reason="inadmissible") == first
-    assert pid(reason="out of memory", healthy=False) == first
+    assert pid(reason="inadmissible", refused=True) == first
+    assert pid(reason="out of memory") == first
     second = pid()
     assert second != first
     os.kill(second, signal.SIGKILL)
@@ -314,7 +318,7 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
         "import sys; from pathlib import Path\n"
         "from experiments.runner.execution.guard import WorkerProcess\n"
         "from tests.experiments.runner.execution.test_guard import request\n"
-        "WorkerProcess((sys.executable, 'long.py')).run(request(Path.cwd()), 4.0)"
+        "WorkerProcess((sys.executable, 'long.py')).run(request(Path.cwd()))"
     )
     (tmp_path / "long.py").write_text(LONG)
     parent = subprocess.Popen(
@@ -336,20 +340,19 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "reason", "healthy"),
+    ("error", "reason"),
     [
-        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0", True),
-        (FailedRunError("it buckled", Path("a")), None, True),
-        (MemoryError(), "out of memory", False),
-        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device", True),
-        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero", False),
+        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0"),
+        (FailedRunError("it buckled", Path("a")), None),
+        (MemoryError(), "out of memory"),
+        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device"),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
     ],
 )
-def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason, healthy):
+def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason):
     def fail(*_):
         raise error
 
     monkeypatch.setattr(worker_module, "compute", fail)
     answered = worker_module.answer(request(tmp_path), 4.0)
-    refused = {"refused": True} if isinstance(error, ConfigurationError) else {}
-    assert answered == {"reason": reason, "healthy": healthy, **refused}
+    assert answered == {"reason": reason, "refused": isinstance(error, ConfigurationError)}
