@@ -96,7 +96,12 @@ class WorkerProcess:
             raise StoppedError
         if expired:
             return f"time limit of {limit_s:g} s"
-        return f"{_end(process.returncode)}; memory limit {memory_gb:.3g} GB"
+        code = process.returncode
+        ended = f"its process ended with exit status {code}"
+        if code < 0:
+            hint = "; the system does so when memory runs out" if code == -signal.SIGKILL else ""
+            ended = f"killed by signal {-code} ({signal.strsignal(-code)}{hint})"
+        return f"{ended}; memory limit {memory_gb:.3g} GB"
 
     def close(self) -> None:
         """End the process, and whatever it has started."""
@@ -153,12 +158,3 @@ def run_apart(
                 record = jobs.read_result(request.folder, request.config_hash)
             record = record or jobs.write_failure(request, reason or "it left no record", started)
         return record
-
-
-def _end(code: int) -> str:
-    """How a process ended, in words."""
-    if code >= 0:
-        return f"its process ended with exit status {code}"
-    name = {int(known): known.name for known in signal.Signals}.get(-code, "unknown")
-    hint = "; the system does so when memory runs out" if name == "SIGKILL" else ""
-    return f"killed by signal {-code} ({name}{hint})"

@@ -17,6 +17,8 @@ from experiments.runner.execution.check import require_checks, require_room
 from experiments.runner.execution.guard import run_apart
 from experiments.runner.jobs.folder import (
     CONFIG,
+    RESULT,
+    UNWRITTEN,
     FailedRunError,
     computed_record,
     lock,
@@ -24,7 +26,6 @@ from experiments.runner.jobs.folder import (
     mark_done,
     replace_record,
     require_writable,
-    unwritten,
     usable_record,
     write_failure,
     write_hydra,
@@ -113,7 +114,8 @@ def compute(request: Request, memory_gb: float) -> None:
             raise
         except Exception as error:
             # Whatever a library for figures or texts raises: the numbers are not lost with it.
-            raise InputError(f"{reason_of(error)}; {unwritten(request.folder)}") from error
+            missing = UNWRITTEN.format(request.folder)
+            raise InputError(f"{reason_of(error)}; {missing}") from error
         _raise_failure(record, request.folder)
 
 
@@ -185,4 +187,4 @@ def _publish(study: Study[Any], request: Request, record: Record) -> None:
 def _raise_failure(record: Record, folder: Path) -> None:
     if not record.converged:
         detail = f" ({record.detail})" if record.detail else ""
-        raise FailedRunError(record.reason + detail, folder)
+        raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")

@@ -38,6 +38,9 @@ from mvest.reading.documents import read_mapping
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
 """Files of a job: its marker, record, configuration, output, and lock."""
 
+UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
+"""What to say where the numbers of a job are on disk and something else could not be written."""
+
 HYDRA = ".hydra"
 """Folder of the configuration as Hydra's users know it."""
 
@@ -47,14 +50,6 @@ NEW_FIELDS = f"{PREFIX}{FIELDS}"
 
 class FailedRunError(Exception):
     """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
-
-    def __init__(self, reason: str, folder: Path) -> None:
-        super().__init__(reason, folder)
-        self.reason = reason
-        self.folder = folder
-
-    def __str__(self) -> str:
-        return f"{self.reason} (recorded in {self.folder / RESULT})"
 
 
 def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
@@ -122,9 +117,8 @@ def usable_record(request: Request, asked_ns: int | None = None) -> Record | Non
 def last_record(folder: Path, config_hash: str) -> Record | None:
     """The record of the last attempt; None if that was cut off before everything was on disk."""
     record = read_result(folder, config_hash)
-    if record is None or is_done(folder) == record.converged:
-        return record
-    return None
+    cut_off = record is not None and is_done(folder) != record.converged
+    return None if cut_off else record
 
 
 def computed_record(folder: Path, config_hash: str) -> Record | None:
@@ -242,25 +236,10 @@ def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
                     place.rmdir()
 
 
-def unwritten(folder: Path) -> str:
-    """What to say where the numbers of a job are on disk and something else could not be."""
-    return f"the estimate is in {folder / RESULT}, and the same command writes what is missing"
-
-
 def write_failure(request: Request, reason: str, started: float) -> Record:
-    """Record why a job ended, unless it had computed its estimate; that is then reported.
+    """Record why a job that ``started`` (s since the epoch) ended, and return that record.
 
-    Parameters
-    ----------
-    request : Request
-    reason : str
-    started : float
-        Seconds since the epoch.
-
-    Returns
-    -------
-    Record
-        The record that is there now.
+    If it had already computed its estimate, that record stays, and a warning says so.
 
     Raises
     ------
@@ -269,7 +248,7 @@ def write_failure(request: Request, reason: str, started: float) -> Record:
     """
     computed = computed_record(request.folder, request.config_hash)
     if computed is not None:
-        print(f"warning: {reason}; {unwritten(request.folder)}", file=sys.stderr)
+        print(f"warning: {reason}; {UNWRITTEN.format(request.folder)}", file=sys.stderr)
         return computed
     failure = Result(status="failed", reason=reason)
     record = stamp(request.values, request.config_hash, failure, started)
