@@ -167,6 +167,15 @@ def run(
         return subprocess.CompletedProcess(command, program.process.returncode, out, err)
 
 
+def ending(code: int) -> str:
+    """How a process ended, in words; a negative exit status is the signal that killed it."""
+    if code >= 0:
+        return f"exit status {code}"
+    name = {int(known): known.name for known in signal.Signals}.get(-code, "unknown")
+    hint = "; the system does so when memory runs out" if name == "SIGKILL" else ""
+    return f"killed by signal {-code} ({name}{hint})"
+
+
 def side_by_side(
     function: Callable[..., T], calls: Iterable[tuple[Any, ...]], processes: int
 ) -> Iterator[T]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import json
-import signal
 import threading
 import time
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from experiments.runner.jobs import folder as jobs
 from experiments.runner.jobs.limits import default_memory_gb
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
-from mvest.processes import Program, environment, python
+from mvest.processes import Program, ending, environment, python
 from mvest.provenance import THREAD_VARIABLES
 
 WORKER = python("experiments.runner.execution.worker")
@@ -96,12 +95,7 @@ class WorkerProcess:
             raise StoppedError
         if expired:
             return f"time limit of {limit_s:g} s"
-        code = process.returncode
-        ended = f"its process ended with exit status {code}"
-        if code < 0:
-            hint = "; the system does so when memory runs out" if code == -signal.SIGKILL else ""
-            ended = f"killed by signal {-code} ({signal.strsignal(-code)}{hint})"
-        return f"{ended}; memory limit {memory_gb:.3g} GB"
+        return f"{ending(process.returncode)}; memory limit {memory_gb:.3g} GB"
 
     def close(self) -> None:
         """End the process, and whatever it has started."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
+import traceback
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -117,6 +119,22 @@ def compute(request: Request, memory_gb: float) -> None:
             missing = UNWRITTEN.format(request.folder)
             raise InputError(f"{reason_of(error)}; {missing}") from error
         _raise_failure(record, request.folder)
+
+
+def answer(request: Request, memory_gb: float) -> dict[str, Any]:
+    """What a worker answers: the ``reason`` is None if the job wrote its record.
+
+    ``refused`` says that the request is wrong, and that this process may run another one.
+    """
+    try:
+        compute(request, memory_gb)
+    except FailedRunError:
+        pass  # it is recorded
+    except Exception as error:
+        # Whatever it is costs its own job; the traceback is in the log.
+        traceback.print_exception(error, file=sys.stdout)
+        return {"reason": reason_of(error), "refused": isinstance(error, MvestError)}
+    return {"reason": None, "refused": False}
 
 
 def reason_of(error: Exception) -> str:

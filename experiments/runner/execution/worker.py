@@ -9,16 +9,13 @@ import gc
 import json
 import os
 import sys
-import traceback
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from experiments.runner.execution.job import compute, reason_of
-from experiments.runner.jobs.folder import LOG, FailedRunError
+from experiments.runner.execution.job import answer
+from experiments.runner.jobs.folder import LOG
 from experiments.runner.jobs.interruption import raised
 from experiments.runner.jobs.request import Request
-from mvest.errors import MvestError
 
 
 def main() -> None:
@@ -50,22 +47,6 @@ def main() -> None:
             # What a job leaves behind goes before the next; what stays is not looked through again.
             gc.collect()
             gc.freeze()
-
-
-def answer(request: Request, memory_gb: float) -> dict[str, Any]:
-    """Run one job; the ``reason`` is None if it wrote its record, otherwise why it did not.
-
-    ``refused`` says that the request is wrong, and that this process may run another one.
-    """
-    try:
-        compute(request, memory_gb)
-    except FailedRunError:
-        pass  # it is recorded
-    except Exception as error:
-        # Whatever it is costs its own job; the traceback is in the log.
-        traceback.print_exception(error, file=sys.stdout)
-        return {"reason": reason_of(error), "refused": isinstance(error, MvestError)}
-    return {"reason": None, "refused": False}
 
 
 if __name__ == "__main__":

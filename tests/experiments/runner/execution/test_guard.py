@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import experiments.runner.execution.worker as worker_module
 from experiments.common.records.record import VERSION, Record, stamp, write_record
 from experiments.common.study import Result
+from experiments.runner.execution import job
 from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.jobs.folder import (
     FailedRunError,
@@ -104,8 +104,8 @@ def said(folder: Path) -> dict:
 @pytest.mark.parametrize(
     ("order", "reason"),
     [
-        ({"signal": int(signal.SIGKILL)}, "killed by signal 9 (Killed; the system"),
-        ({"signal": int(signal.SIGSEGV)}, "killed by signal 11 (Segmentation fault)"),
+        ({"signal": int(signal.SIGKILL)}, "killed by signal 9 (SIGKILL"),
+        ({"signal": int(signal.SIGSEGV)}, "killed by signal 11 (SIGSEGV)"),
         ({"exit": 3}, "exit status 3"),
         ({"exit": 0}, "exit status 0"),
         ({"sleep": 60, "limit": 0.2}, "time limit of 0.2 s"),
@@ -353,6 +353,6 @@ def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, 
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(worker_module, "compute", fail)
-    answered = worker_module.answer(request(tmp_path), 4.0)
+    monkeypatch.setattr(job, "compute", fail)
+    answered = job.answer(request(tmp_path), 4.0)
     assert answered == {"reason": reason, "refused": isinstance(error, ConfigurationError)}
