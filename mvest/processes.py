@@ -93,6 +93,8 @@ class Program(AbstractContextManager["Program"]):
         """Ask for the program's end, without waiting for it; from any thread."""
         with suppress(OSError):  # it has ended
             self._lifeline.shutdown(socket.SHUT_WR)
+            # A keeper that was stopped does not notice.
+            self.process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
         """End the program, and wait until it and all that it has started is gone."""
@@ -157,6 +159,15 @@ def run(
     with Program(command, **options) as program:
         out, err = program.process.communicate(input, timeout)
         return subprocess.CompletedProcess(command, program.process.returncode, out, err)
+
+
+def ending(code: int) -> str:
+    """How a process ended, in words; a negative exit status is the signal that killed it."""
+    if code >= 0:
+        return f"exit status {code}"
+    name = {int(known): known.name for known in signal.Signals}.get(-code, "unknown")
+    hint = "; the system does so when memory runs out" if name == "SIGKILL" else ""
+    return f"killed by signal {-code} ({name}{hint})"
 
 
 def side_by_side(

@@ -11,7 +11,6 @@ import contextlib
 import os
 import re
 import shutil
-import signal
 import subprocess
 import threading
 import time
@@ -21,7 +20,7 @@ from pathlib import Path
 
 from mvest.errors import ConfigurationError
 from mvest.external.contract import REQUEST
-from mvest.processes import Program
+from mvest.processes import Program, ending
 
 OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 """Files of a run's folder that hold what its program said."""
@@ -153,7 +152,8 @@ class Command:
         with program:
             stopped = self._watch(program.process, started, stop)
         seconds = time.monotonic() - started
-        reason = stopped or _status(program.process.returncode)
+        code = program.process.returncode
+        reason = stopped or (ending(code) if code else "")
         return Ending(reason + _last_words(folder) if reason else "", seconds)
 
     def _watch(
@@ -179,18 +179,6 @@ class Command:
             "here": str(Path.cwd()),
         }
         return PLACEHOLDER.sub(lambda found: places[found[1]], text)
-
-
-def _status(code: int) -> str:
-    """How a program ended by itself, in words; empty for exit status 0."""
-    if code == 0:
-        return ""
-    if code > 0:
-        return f"exit status {code}"
-    try:
-        return f"killed by signal {signal.Signals(-code).name}"
-    except ValueError:
-        return f"killed by signal {-code}"
 
 
 def _last_words(folder: Path) -> str:

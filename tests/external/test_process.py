@@ -89,7 +89,7 @@ def test_the_end_of_a_crashed_program_is_told_with_its_last_words(tmp_path):
     reason = python(lines).run(tmp_path).reason
     assert reason == "exit status 3; its last words: line 5 | line 6 | line 7 | line 8"
     reason = python("import os; os.kill(os.getpid(), 11)").run(tmp_path).reason
-    assert reason == "killed by signal SIGSEGV"
+    assert reason == "killed by signal 11 (SIGSEGV)"
     # What is no text, colours a terminal or never ends a line does no harm.
     noise = (
         "import sys; sys.stderr.buffer.write(b'\\x1b[31m\\xff\\x00' + b'x' * 10**5); sys.exit(1)"

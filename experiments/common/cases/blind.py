@@ -23,7 +23,7 @@ import numpy as np
 
 from experiments.common.cases.own_case import case_result, read_configured, run_case, run_volume
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
-from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model
+from experiments.common.records.record import NOT_GATED, Mesh, Model
 from experiments.common.schema import build
 from experiments.common.study import Result
 from mvest.errors import InputError, MvestError
@@ -34,7 +34,7 @@ from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
 
-ESTIMATE = "estimate.json"
+ESTIMATE, ARRAYS = "estimate.json", "estimate.npz"
 """What the process leaves in the output folder."""
 
 MAX_MEMORY = 10 * 2**30
@@ -95,7 +95,7 @@ def estimate_blindly(
         "gate": gate,
     }
     path = folder / ESTIMATE
-    for left in (path, folder / FIELDS):
+    for left in (path, folder / ARRAYS):
         left.unlink(missing_ok=True)
     ended = run(
         python("experiments.common.cases.blind"),
@@ -130,7 +130,7 @@ def read_estimate(folder: Path) -> Result:
     InputError
         If it left nothing.
     """
-    left, arrays = read_mapping(folder / ESTIMATE), folder / FIELDS
+    left, arrays = read_mapping(folder / ESTIMATE), folder / ARRAYS
     return case_result(
         EstimateRecord.model_validate(left["estimate"]),
         Mesh.model_validate(left["mesh"]),
@@ -144,7 +144,7 @@ def write_estimate(folder: Path, result: Result) -> None:
     """Leave the result of a case for `read_estimate`."""
     if result.arrays:
         arrays: dict[str, Any] = dict(result.arrays)
-        write_atomically(folder / FIELDS, partial(np.savez_compressed, **arrays))
+        write_atomically(folder / ARRAYS, partial(np.savez_compressed, **arrays))
     assert result.mesh is not None
     assert result.model is not None
     left = {"estimate": result.estimates[0], "mesh": result.mesh, "model": result.model}
@@ -158,7 +158,9 @@ def main() -> int:
     resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, hard))
     request = json.load(sys.stdin)
     folder = Path(request["folder"])
-    seal(Path(request["sealed"]))
+    # The configuration describes the patient, too.
+    for place in (Path(request["sealed"]), folder / ".hydra", folder.parent / ".hydra"):
+        seal(place)
     values = request["values"]
     try:
         if values.get("volume") is None:

@@ -309,18 +309,21 @@ def _source() -> dict[str, Any]:
     return provenance()
 
 
-def write_record(path: Path, record: Record) -> None:
+def write_record(path: Path, record: Record, arrays: Path | None = None) -> None:
     """Write a record as JSON, whole or not at all, with digests of itself and of its arrays.
+
+    The arrays are those beside it if not given.
 
     Raises
     ------
     InputError
         If it cannot be written.
     """
-    write_json(path, sealed_record(record, path.with_name(FIELDS)))
+    write_json(path, sealed_record(record, arrays or path.with_name(FIELDS)))
 
 
 ARRAYS = "arrays_sha256"
+"""In a record's file, the digest of its arrays."""
 
 
 def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:

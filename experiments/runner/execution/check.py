@@ -7,7 +7,7 @@ from typing import Any
 
 from experiments.common.building.closure import mechanics_of
 from experiments.common.building.truth import truth_mesh
-from experiments.common.study import load_study
+from experiments.common.study import Check, Study, load_study, study_names
 from experiments.runner.tracking.store import require_no_password
 from mvest.errors import ConfigurationError
 
@@ -40,6 +40,24 @@ def require_admissible(values: Mapping[str, Any]) -> None:
     require_no_password(values["tracking"]["uri"])
     mechanics_of(values)
     study.require(values)
+
+
+def require_checks(study: Study[Any], values: Mapping[str, Any]) -> tuple[Check, ...]:
+    """What ``check=true`` says of a study.
+
+    Raises
+    ------
+    ConfigurationError
+        If it has nothing to say of studies of this kind.
+    """
+    checks = study.checks()
+    if not checks:
+        kinds = ", ".join(name for name in study_names() if load_study(name).checks())
+        raise ConfigurationError(
+            f"experiment {values['name']}: check=true has nothing to say of a study of the kind "
+            f"{values['study']}; expected one of {kinds}"
+        )
+    return checks
 
 
 def require_room(values: Mapping[str, Any], limit_gb: float) -> None:

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from uuid import uuid4
 
-import experiments
 from experiments.common.records.record import Record, stamp
 from experiments.common.study import Result
 from experiments.runner.execution.guard import WorkerProcess, new_worker, run_apart
@@ -28,6 +27,7 @@ from experiments.runner.jobs.folder import require_writable, write_failure
 from experiments.runner.jobs.request import Request
 from experiments.sweeps.collected import head_of
 from mvest.errors import ConfigurationError, MvestError
+from mvest.processes import environment
 from mvest.quantities import within
 from mvest.reading.text import one_line
 
@@ -48,9 +48,6 @@ DASK = {
     "distributed.worker.memory.terminate": False,
 }
 """Settings of dask for jobs in processes of their own."""
-
-PACKAGE = str(Path(experiments.__file__).resolve().parents[1])
-"""Where workers elsewhere find this package."""
 
 AT_ONCE = 500
 """Jobs that are sent to dask's scheduler in one message."""
@@ -342,6 +339,6 @@ def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
         "worker_extra_args": ["--no-dashboard", "--dashboard-address", f"{LOOPBACK}:0"],
     }
     folder.mkdir(mode=0o700, exist_ok=True)
-    prologue = [f"export PYTHONPATH={shlex.quote(PACKAGE)}"]
+    prologue = [f"export PYTHONPATH={shlex.quote(environment()['PYTHONPATH'])}"]
     prologue += options.get("job_script_prologue", ())
     return _kinds()[name](**{**own, **options, "job_script_prologue": prologue})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ class Request:
     publish_as : str or None
         Name of its record in the results; None where they are not to be touched.
     overrides : tuple of str
-        Those that it was composed with.
+        What was requested in Hydra's syntax.
 
     Raises
     ------
@@ -49,31 +49,22 @@ class Request:
     @classmethod
     def of(cls, config: DictConfig) -> Request:
         """What Hydra composed for the job it is just starting."""
-        hydra = HydraConfig.get()
-        values = plain(config)
-        return cls(
-            values,
-            hash_of(values),
-            Path(hydra.runtime.output_dir),
-            publish_as(values, hydra.overrides.task, None),
-            tuple(hydra.overrides.task),
-        )
+        hydra, values = HydraConfig.get(), plain(config)
+        overrides = tuple(hydra.overrides.task)
+        published = publish_as(values, overrides, None)
+        folder = Path(hydra.runtime.output_dir)
+        return cls(values, hash_of(values), folder, published, overrides)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Request:
         """The request that :meth:`to_json` wrote."""
-        given = {"folder": Path(data["folder"]), "overrides": tuple(data["overrides"])}
-        return cls(**{**data, **given})
+        made = {"folder": Path(data["folder"]), "overrides": tuple(data["overrides"])}
+        return cls(**{**data, **made})
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
-        return {
-            "values": self.values,
-            "config_hash": self.config_hash,
-            "folder": str(self.folder),
-            "publish_as": self.publish_as,
-            "overrides": self.overrides,
-        }
+        data = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**data, "folder": str(self.folder)}
 
 
 def publish_as(
@@ -81,20 +72,11 @@ def publish_as(
 ) -> str | None:
     """Name of a run's record in the results; None where they are not to be touched.
 
-    Parameters
-    ----------
-    values : mapping
-        The resolved configuration.
-    overrides : sequence of str
-    swept : mapping or None
-        What the experiment itself varies (empty: nothing), if this is one run of several.
+    ``swept`` is what the experiment itself varies (empty: nothing) if this is one run of several.
     """
     # A sweep is published as a whole.
-    if (
-        not values["publish"]
-        or values["sweep"]
-        or not as_published(overrides, swept, values["study"])
-    ):
+    published = values["publish"] and not values["sweep"]
+    if not published or not as_published(overrides, swept, values["study"]):
         return None
     if swept is None:
         return str(values["name"])

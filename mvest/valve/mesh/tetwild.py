@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,7 @@ import numpy as np
 
 from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
 from mvest.kept import Entry
-from mvest.processes import run
+from mvest.processes import ending, run
 from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
@@ -230,13 +229,7 @@ def _mesh(
 def _failure(code: int, stderr: str) -> str:
     lines = [line for line in stderr.splitlines() if line.strip()]
     said = f": {lines[-1].strip()}" if lines else " without a message"
-    if code < 0:
-        try:
-            name = signal.Signals(-code).name
-        except ValueError:
-            name = str(-code)
-        return f"crashed with signal {name}{said}"
-    return f"failed with exit status {code}{said}"
+    return f"failed: {ending(code)}{said}"
 
 
 def _checked(

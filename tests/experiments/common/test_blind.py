@@ -211,3 +211,13 @@ def test_the_real_process_says_what_is_wrong_with_a_case(tmp_path):
     values = {"case": None, "personal": {}, "mechanics": {}}
     with pytest.raises(InputError, match=r"no case\.yaml in this folder"):
         estimate_blindly(values, tmp_path, tmp_path / "case", tmp_path / "hidden")
+
+
+def test_what_was_configured_of_a_patient_is_sealed(tmp_path):
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "case.yaml").touch()
+    values = {"case": None, "personal": {}, "mechanics": {}}
+    for folder in (tmp_path, tmp_path / "second"):
+        folder.mkdir(exist_ok=True)
+        with pytest.raises(InputError, match=r"\.hydra.* is sealed"):
+            estimate_blindly(values, folder, tmp_path / ".hydra", tmp_path / "hidden")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from experiments import tables
 from experiments.common.records.record import read_record
@@ -296,6 +297,27 @@ def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of
     assert again.splitlines()[:5] == first.splitlines()[:5]
     assert run(*usual, "force=true")[0] == 0
     assert len(calls) > once
+
+
+def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
+    run, tmp_path, instead_of_closing
+) -> None:
+    def interrupted(m, rest) -> Prediction:
+        raise KeyboardInterrupt
+
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false", "hydra.run.dir=here")
+    instead_of_closing(shrinking)
+    assert run(*usual)[0] == 0
+    places = [tmp_path / "here" / name for name in ("result.json", "done", "fields.npz")]
+    before = [place.read_bytes() for place in places]
+    instead_of_closing(interrupted)
+    assert run(*usual, "force=true")[0] == 130
+    assert [place.read_bytes() for place in places] == before
+    status, out, _ = run(*usual)
+    assert status == 0
+    assert "force=true runs it again" in out
+    overrides = (tmp_path / "here" / ".hydra" / "overrides.yaml").read_text()
+    assert yaml.safe_load(overrides) == [*usual[:3], "force=true"]
 
 
 FAILURES = {

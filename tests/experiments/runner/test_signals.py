@@ -151,6 +151,25 @@ def test_a_signal_leaves_nothing_behind(stage, signals, undisturbed, tmp_path, r
         assert [run.info.status for run in runs] == ["FINISHED"] * 5, "four jobs and the sweep"
 
 
+def test_a_forced_sweep_that_is_killed_leaves_the_former_results(tmp_path):
+    finished(tmp_path, UNTRACKED)
+    before = answer(tmp_path)
+    (tmp_path / "hold").write_text("writing")
+    sweep = start(tmp_path, UNTRACKED, "force=true")
+    try:
+        until(lambda: (tmp_path / "at").exists() or sweep.poll() is not None)
+        assert sweep.poll() is None, sweep.communicate()[0]
+    finally:
+        sweep.kill()
+        sweep.communicate()
+    assert gone(tmp_path), alive(tmp_path)
+    (tmp_path / "hold").unlink()
+    computed = (tmp_path / "runs").read_text()
+    finished(tmp_path, UNTRACKED)
+    assert answer(tmp_path) == before
+    assert (tmp_path / "runs").read_text() == computed
+
+
 def test_the_time_limit_of_a_job_ends_the_programs_that_it_started(tmp_path):
     (tmp_path / "hold").write_text("simulating")
     one = ("filter.initial=[5,3]", "sweep.small.seed=1")

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from experiments.runner import sweep
 from experiments.runner.execution import engine, guard
@@ -23,6 +24,7 @@ from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.planning.progress import SweepBar
 from experiments.studies import twin
 from experiments.sweeps.collected import Sweep, read_sweep
+from mvest.files import sha256_of
 from tests.experiments.studies.made_up import made_up
 from tests.places import ROOT
 
@@ -68,7 +70,9 @@ def test_a_sweep_is_planned_run_and_collected(run):
     assert {"filter.initial=[5,3]", "seed=1"} <= set(first["overrides"])
     for job in plan["jobs"]:
         folder = DEBUG / job["folder"]
-        assert (folder / "done").read_bytes() == b""
+        assert (folder / "done").read_text() == sha256_of(folder / "result.json")
+        said = yaml.safe_load((folder / ".hydra" / "config.yaml").read_text())
+        assert said["seed"] == job["factors"]["seed"]
         assert f"seed {job['factors']['seed']}" in (folder / "log.txt").read_text()
 
     found = collected()
@@ -303,7 +307,8 @@ def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
             kept.append(b"x" * 2**24)
 
     monkeypatch.setattr(twin, "STUDY", replace(twin.STUDY, run=hog))
-    limit = round(limits._resident_and_reserved()[0] / limits.GB + 0.2, 2)
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    limit = round(resident / limits.GB + 0.2, 2)
     before = resource.getrlimit(resource.RLIMIT_DATA)
     status, _, err = run("experiment=debug", f"memory_limit_gb={limit}")
     assert status == 1

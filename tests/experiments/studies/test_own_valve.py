@@ -5,6 +5,7 @@ anywhere, as in a scanner's coordinates, and meshed anew where frames do not cor
 """
 
 import json
+from dataclasses import replace
 
 import meshio
 import numpy as np
@@ -13,6 +14,8 @@ import yaml
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
+from experiments.common.study import Result
+from experiments.studies import case
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
@@ -234,6 +237,36 @@ def test_a_case_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, kind, cor
     assert ("matched to the reference" in out) is not corresponds
     assert list((tmp_path / "outputs" / "own_valve").glob("*/case.png"))
     assert "is not known, the model has no prediction at the assumed parameters" in out
+
+
+def test_a_finished_case_is_shown_again_until_its_files_change(run, tmp_path, monkeypatch, seen):
+    calls = []
+
+    def estimate(job):
+        calls.append(job.folder)
+        return Result(numbers={"a_mm": 1.0})
+
+    def report(folder, record):
+        (folder / "report.html").touch()
+        return []
+
+    monkeypatch.setattr(case, "STUDY", replace(case.STUDY, run=estimate, files=report))
+    folder = write(tmp_path / "mine", seen, FORMATS["vtp"], Scanner(3), True)
+    here = ("time_limit_s=null", "tracking.enabled=false")
+    status, first, err = run(folder, *here)
+    assert status == 0, err
+    # With its usual time limit, too.
+    for more in (here, here[1:]):
+        status, again, err = run(folder, *more)
+        assert (status, len(calls)) == (0, 1), err
+        assert again.startswith(first)
+        assert first.endswith(f"a mm: 1\nWritten to {calls[0]}\nReport: {calls[0]}/report.html\n")
+    assert run(folder, *here, "force=true")[0] == 0
+    assert calls == [calls[0]] * 2
+    with (folder / "case.yaml").open("a") as file:
+        file.write("description: seen again\n")
+    assert run(folder, *here)[0] == 0
+    assert calls[2] != calls[0]
 
 
 @pytest.mark.slow

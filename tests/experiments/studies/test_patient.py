@@ -183,7 +183,7 @@ def test_nothing_is_revealed_before_the_estimation_has_ended(
     monkeypatch.setattr(patient, "reveal", watch)
     values = config_of(tmp_path)
     result = run(values, out)
-    assert set(files) == {"estimate.json", "fields.npz"}
+    assert set(files) == {"estimate.json", "estimate.npz"}
     hidden = json.loads(files["estimate.json"])
     # The priors and the settings of the mechanics are given to everyone.
     del hidden["estimate"]["details"]["settings"]

@@ -1,19 +1,22 @@
 """A process apart: its death, its time and its memory cost its own job, and it leaves with us."""
 
+import errno
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import experiments.runner.execution.worker as worker_module
 from experiments.common.records.record import VERSION, Record, stamp, write_record
 from experiments.common.study import Result
+from experiments.runner.execution import job
 from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.jobs.folder import (
     FailedRunError,
@@ -24,9 +27,10 @@ from experiments.runner.jobs.folder import (
     mark_done,
 )
 from experiments.runner.jobs.request import Request
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import THREAD_VARIABLES, sealed, write_json
 from tests.places import ROOT
+from tests.processes import until
 
 OBEDIENT = """
 import json, os, sys, time
@@ -38,7 +42,7 @@ for line in sys.stdin:
     if "sleep" in order: time.sleep(order["sleep"])
     said = {"pid": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
     with open(os.path.join(request["folder"], "said.json"), "w") as file: json.dump(said, file)
-    print(json.dumps({"reason": order.get("reason"), "healthy": order.get("healthy", True)}))
+    print(json.dumps({"reason": order.get("reason"), "refused": order.get("refused", False)}))
     sys.stdout.flush()
 """
 """A worker that does as it is told."""
@@ -49,6 +53,15 @@ def worker():
     found = WorkerProcess((sys.executable, "-c", OBEDIENT))
     yield found
     found.close()
+
+
+TRUTH = {
+    "values": [1.0],
+    "refine": 1,
+    **dict.fromkeys(("element", "source", "columns", "rows", "layers")),
+}
+
+MESH = {"columns": 1, "rows": 1, "layers": 1, "source": "structured", "edge_length": 2.5}
 
 
 def request(folder: Path, **order) -> Request:
@@ -62,10 +75,10 @@ def request(folder: Path, **order) -> Request:
             "paper": None,
             "seed": 1,
         },
-        **{"parameters": ["x"], "factors": {"k": 1}, "truth": {"values": [1.0]}},
+        **{"parameters": ["x"], "factors": {"k": 1}, "truth": TRUTH},
         **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
         **{"mechanics": {"element": "hex18"}, "tracking": {"enabled": False}, "force": False},
-        **{"mesh": {"columns": 1, "rows": 1, "layers": 1, "source": "structured"}},
+        **{"mesh": MESH, "figures": False},
         "time_limit_s": order.pop("limit", None),
         "memory_limit_gb": None,
         "order": order,
@@ -97,7 +110,7 @@ def said(folder: Path) -> dict:
         ({"exit": 0}, "exit status 0"),
         ({"sleep": 60, "limit": 0.2}, "time limit of 0.2 s"),
         ({"reason": "it buckled"}, "it buckled"),
-        ({"reason": "out of memory", "healthy": False}, "out of memory"),
+        ({"reason": "mesh.rows = 0", "refused": True}, "mesh.rows = 0"),
         ({}, "it left no record"),
     ],
 )
@@ -121,8 +134,8 @@ def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
 
     first = pid()
     assert pid() == first
-    assert pid(reason="inadmissible") == first
-    assert pid(reason="out of memory", healthy=False) == first
+    assert pid(reason="inadmissible", refused=True) == first
+    assert pid(reason="out of memory") == first
     second = pid()
     assert second != first
     os.kill(second, signal.SIGKILL)
@@ -135,12 +148,24 @@ def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
 def test_a_process_without_a_job_leaves_by_itself_and_a_busy_one_does_not(tmp_path):
     left = tmp_path / "left"
     leaving = f"\nimport pathlib; time.sleep(0.2); pathlib.Path({str(left)!r}).touch()"
-    for order, stays in (({}, True), ({"sleep": 60}, False)):
+    for order, stays in (({}, True), ({"sleep": 60, "limit": 3.0}, False)):
         left.unlink(missing_ok=True)
         found = WorkerProcess((sys.executable, "-c", OBEDIENT + leaving))
-        found.run(request(tmp_path, **order), time_limit_s=3.0)
+        found.run(request(tmp_path, **order))
         found.close()
         assert left.exists() is stays
+
+
+def test_a_stopped_worker_and_its_supervisor_do_not_escape_their_time_limit(worker, tmp_path):
+    asked = request(tmp_path, sleep=60, limit=3.0)
+    reasons = []
+    waits = threading.Thread(target=lambda: reasons.append(run_apart(asked, worker).reason))
+    waits.start()
+    until(lambda: worker._program is not None)
+    for pid in (worker._program.process.pid, worker._program.pid):
+        os.kill(pid, signal.SIGSTOP)
+    waits.join(60)
+    assert reasons == ["time limit of 3 s"]
 
 
 def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypatch):
@@ -227,30 +252,49 @@ def test_a_damaged_result_is_none(worker, tmp_path, content):
     assert run_apart(request(tmp_path, exit=3), worker).status == "failed"
 
 
-def test_a_second_process_waits_for_the_folder(tmp_path):
+def test_a_second_process_says_that_it_waits_for_the_folder(tmp_path):
     code = (
         "import sys; from pathlib import Path; from experiments.runner.jobs.folder import lock\n"
         "with lock(Path(sys.argv[1])): print('in', flush=True); sys.stdin.read()"
     )
-    other = subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+
+    def start():
+        return subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path)],
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    processes = [start()]
     try:
-        assert other.stdout.readline() == "in\n"
-        with pytest.raises(TimeoutError), lock(tmp_path).acquire(timeout=0.1):
-            pass
+        assert processes[0].stdout.readline() == "in\n"
+        processes.append(start())
+        waits = f"waiting for another process that works in {tmp_path}\n"
+        assert processes[1].stderr.readline() == waits
         # The lock falls with whoever held it, however it ended.
-        other.kill()
-        other.communicate()
-        with lock(tmp_path).acquire(timeout=30):
-            pass
+        processes[0].kill()
+        assert processes[1].stdout.readline() == "in\n"
     finally:
-        other.kill()
-        other.communicate()
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.ENOLCK, "No locks available"), (errno.EMFILE, "Too many open files")],
+)
+def test_a_folder_that_cannot_be_locked_is_named(tmp_path, monkeypatch, number, words):
+    def fails(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", fails)
+    with pytest.raises(InputError) as refused, lock(tmp_path):
+        pass
+    assert str(refused.value) == f"cannot lock {tmp_path / '.lock'}: {words}"
 
 
 LONG = """
@@ -271,12 +315,10 @@ worker.main()
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for the process in /proc")
 def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     code = (
-        "import sys, json; from pathlib import Path\n"
+        "import sys; from pathlib import Path\n"
         "from experiments.runner.execution.guard import WorkerProcess\n"
-        "from experiments.runner.jobs.request import Request\n"
-        "values = {'study': 'twin', 'factors': {}, 'figures': False}\n"
-        "asked = Request(values, '0' * 64, Path.cwd())\n"
-        "WorkerProcess((sys.executable, 'long.py')).run(asked)"
+        "from tests.experiments.runner.execution.test_guard import request\n"
+        "WorkerProcess((sys.executable, 'long.py')).run(request(Path.cwd()))"
     )
     (tmp_path / "long.py").write_text(LONG)
     parent = subprocess.Popen(
@@ -298,20 +340,19 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "reason", "healthy"),
+    ("error", "reason"),
     [
-        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0", True),
-        (FailedRunError("it buckled", Path("a")), None, True),
-        (MemoryError(), "out of memory", False),
-        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device", True),
-        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero", False),
+        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0"),
+        (FailedRunError("it buckled"), None),
+        (MemoryError(), "out of memory"),
+        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device"),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
     ],
 )
-def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason, healthy):
-    def fail(_):
+def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason):
+    def fail(*_):
         raise error
 
-    monkeypatch.setattr(worker_module, "compute", fail)
-    answered = worker_module.answer(request(tmp_path))
-    refused = {"refused": True} if isinstance(error, ConfigurationError) else {}
-    assert answered == {"reason": reason, "healthy": healthy, **refused}
+    monkeypatch.setattr(job, "compute", fail)
+    answered = job.answer(request(tmp_path), 4.0)
+    assert answered == {"reason": reason, "refused": isinstance(error, ConfigurationError)}

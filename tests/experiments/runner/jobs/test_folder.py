@@ -1,14 +1,116 @@
-"""The folder of a job: what an attempt leaves for the next one."""
+"""The folder of a job: what an attempt leaves for the next one, and what it must not destroy."""
 
-from experiments.runner.jobs.folder import DONE, RESULT, clear
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from experiments.common.records.record import FIELDS, stamp
+from experiments.common.study import Result
+from experiments.runner.jobs import folder as jobs
+from experiments.runner.jobs.request import Request
 from mvest.files import PREFIX
+from tests.experiments.runner.execution import test_guard
 
 
-def test_what_an_earlier_attempt_left_is_taken_away_and_nothing_else(tmp_path):
+def request(folder: Path, force: bool = False) -> Request:
+    asked = test_guard.request(folder)
+    asked.values["force"] = force
+    return asked
+
+
+def finish(asked: Request, number: float, mark: bool = True) -> None:
+    """A record of success with one number and arrays of it."""
+    result = Result(numbers={"a_mm": number})
+    record = stamp(asked.values, asked.config_hash, result, 0.0)
+    jobs.replace_record(asked.folder, record, {"x": np.full(3, number)})
+    if mark:
+        jobs.mark_done(asked.folder)
+
+
+def number(asked: Request) -> float | None:
+    """The number of the finished record; None if the job has to be run."""
+    record = jobs.finished_record(asked.folder, asked.config_hash)
+    if record is None:
+        return None
+    found = record.numbers["a_mm"]
+    assert (np.load(asked.folder / FIELDS)["x"] == found).all()
+    return found
+
+
+def test_what_an_earlier_attempt_left_is_removed_and_nothing_else(tmp_path):
     kept = {".lock", ".hidden.png", "config.json", "valve.png"}
-    for name in (*kept, DONE, RESULT, f"{PREFIX}1-result.json", f"{PREFIX}2-valve.png"):
+    for name in (*kept, jobs.DONE, f"{PREFIX}1-result.json", f"{PREFIX}2-valve.png"):
         (tmp_path / name).touch()
+    (tmp_path / jobs.RESULT).write_text("{}")
     (tmp_path / f"{PREFIX}3-case").mkdir()
     (tmp_path / f"{PREFIX}3-case" / "case.yaml").touch()
-    clear(tmp_path)
+    jobs.make_way(request(tmp_path))
     assert {path.name for path in tmp_path.iterdir()} == kept
+
+
+def test_a_finished_result_stays_until_its_replacement_is_whole(tmp_path):
+    asked = request(tmp_path, force=True)
+    finish(asked, 1.0)
+    assert jobs.usable_record(asked) is None
+    jobs.make_way(asked)
+    assert number(asked) == 1.0, "where the attempt is interrupted"
+    finish(asked, 2.0, mark=False)
+    assert number(asked) is None, "what follows from it is not written"
+    assert jobs.computed_record(tmp_path, asked.config_hash) is not None
+    jobs.mark_done(tmp_path)
+    assert number(asked) == 2.0
+    assert jobs.usable_record(request(tmp_path)) is not None
+    jobs.write_failure(asked, "time limit of 1 s", 0.0)
+    assert number(asked) is None
+    assert not (tmp_path / FIELDS).exists()
+
+
+@pytest.mark.parametrize("step", ["write_atomically", "write_record", "_adopt_arrays"])
+def test_a_kill_while_arrays_and_record_are_replaced_loses_neither(tmp_path, monkeypatch, step):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    asked = request(tmp_path)
+    finish(asked, 1.0)
+    with monkeypatch.context() as patched:
+        patched.setattr(jobs, step, killed)
+        with pytest.raises(KeyboardInterrupt):
+            finish(asked, 2.0)
+    if step == "_adopt_arrays":
+        jobs.make_way(asked)
+        assert jobs.computed_record(tmp_path, asked.config_hash).numbers == {"a_mm": 2.0}
+        jobs.mark_done(tmp_path)
+    assert number(asked) == (2.0 if step == "_adopt_arrays" else 1.0)
+
+
+def test_another_configurations_result_stays_until_it_is_replaced(tmp_path):
+    asked = request(tmp_path)
+    finish(asked, 1.0)
+    jobs.make_way(Request(asked.values, "1" * 64, tmp_path))
+    assert number(asked) == 1.0
+
+
+def test_a_request_keeps_its_overrides(tmp_path):
+    plain = request(tmp_path)
+    asked = Request(plain.values, plain.config_hash, tmp_path, None, ("seed=2", "+a='b c'"))
+    assert Request.from_json(json.loads(json.dumps(asked.to_json()))) == asked
+    jobs.write_hydra(asked)
+    place = tmp_path / jobs.HYDRA
+    assert yaml.safe_load((place / "overrides.yaml").read_text()) == ["seed=2", "+a='b c'"]
+    assert yaml.safe_load((place / "config.yaml").read_text()) == asked.values
+
+
+@pytest.mark.parametrize(("name", "left"), [("log.txt", True), (None, False)])
+def test_a_folder_with_nothing_but_what_hydra_wrote_goes(tmp_path, name, left):
+    folder = tmp_path / "outputs" / "debug" / "0123"
+    (folder / jobs.HYDRA).mkdir(parents=True)
+    for file in (f"{jobs.HYDRA}/config.yaml", jobs.LOCK, name):
+        if file is not None:
+            (folder / file).touch()
+    with jobs.nothing_empty(folder, tmp_path / "outputs"):
+        pass
+    assert (folder / jobs.HYDRA).exists() is left
+    assert (tmp_path / "outputs").exists() is left

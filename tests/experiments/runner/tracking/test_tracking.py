@@ -19,6 +19,7 @@ from pandas import read_parquet
 
 from experiments.common.records.record import Record, write_record
 from experiments.runner.collecting import comparison
+from experiments.runner.jobs.folder import mark_done
 from experiments.runner.planning.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import store as stores
 from experiments.runner.tracking import summary, sync
@@ -122,7 +123,7 @@ def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
     write_record(folder / "result.json", record)
     (folder / "iterates.png").write_bytes(b"picture")
     if record.converged:
-        (folder / "done").touch()
+        mark_done(folder)
     return folder
 
 
