@@ -25,7 +25,6 @@ from experiments.runner.jobs.folder import FailedRunError, nothing_empty
 from experiments.runner.jobs.interruption import interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
-from experiments.runner.tracking.beside import logging_beside
 from mvest.errors import MvestError
 
 PRIMARY = "In 'config': "
@@ -88,6 +87,7 @@ def run_alone(config: DictConfig) -> None:
     from experiments.runner.execution.check import require_admissible
     from experiments.runner.execution.job import run_job
     from experiments.runner.planning.compose import plan_run
+    from experiments.runner.tracking.log import log_run
 
     with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
         request = Request.of(config)
@@ -96,13 +96,13 @@ def run_alone(config: DictConfig) -> None:
             require_admissible(request.values)
             print(plan.summary(), plan.listing(), sep="\n")
             return
-        with logging_beside(request.values) as track:
-            try:
-                run_job(request)
-            except FailedRunError:
-                track(request.folder)
-                raise
-            track(request.folder)
+        try:
+            run_job(request)
+        except FailedRunError:
+            log_run(request.folder, request.values)
+            raise
+        if not config.check:
+            log_run(request.folder, request.values)
 
 
 def explain(error: BaseException) -> str:

@@ -25,9 +25,7 @@ from experiments.runner.jobs.folder import last_record, nothing_empty, require_w
 from experiments.runner.planning.compose import make_plan
 from experiments.runner.planning.plan import Plan
 from experiments.runner.planning.progress import SweepBar
-from experiments.runner.tracking.store import Store
-from experiments.runner.tracking.summary import SWEEP
-from experiments.runner.tracking.sync import log_sweep, open_early
+from experiments.runner.tracking.log import SWEEP, log_sweep
 from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
@@ -138,8 +136,6 @@ def run_plan(config: DictConfig, plan: Plan) -> int:
             print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
         print(f"`mvest collect {plan.folder}` writes what became of them")
         return 0
-    # Before any job runs: a wrong address is seen now.
-    store = open_early(plan.common, plan) if plan.common["tracking"]["enabled"] else None
     if plan.to_run:
         announce_compilation("the first jobs")
         try:
@@ -161,7 +157,7 @@ def run_plan(config: DictConfig, plan: Plan) -> int:
                 f"error: the sweep cannot go on ({error}); run the same command again to go on",
                 file=sys.stderr,
             )
-    return _collect(plan, 0, store)
+    return _collect(plan, 0)
 
 
 def _launcher(config: DictConfig) -> str:
@@ -175,11 +171,10 @@ def _launcher(config: DictConfig) -> str:
     return chosen
 
 
-def _collect(plan: Plan, to_come: int, store: Store | None = None) -> int:
+def _collect(plan: Plan, to_come: int) -> int:
     """Write, log and publish what became of a sweep; the exit status."""
     found = _write(plan)
-    if plan.common["tracking"]["enabled"]:
-        log_sweep(plan.common, plan, store)
+    log_sweep(plan.folder, plan.common)
     restored = _restore(plan)
     if restored:
         print(f"{plan.name}: results take over {restored} runs of earlier attempts")

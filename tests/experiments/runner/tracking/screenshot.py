@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from experiments.runner.tracking.dashboard import last_comparison, serving
+from experiments.runner.tracking.dashboard import last_sweep, serving
 from mvest.errors import InputError, MvestError
 from mvest.processes import run
 
@@ -42,9 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--to", default=Path("results/dashboard.png"), type=Path)
     given = parser.parse_args(arguments)
     try:
-        comparison = last_comparison(given.outputs)
-        with serving(comparison.place, given.outputs, 0, quiet=True) as (address, _):
-            look_at(comparison.page(address), f"--screenshot={given.to.resolve()}")
+        place, page, _ = last_sweep(given.outputs)
+        with serving(place, 0, quiet=True) as (address, _):
+            look_at(address + page, f"--screenshot={given.to.resolve()}")
         with Image.open(given.to) as picture:
             cropped = picture.crop((0, 0, *PICTURE))
         cropped.save(given.to)
