@@ -138,13 +138,16 @@ def _dashboard(rest: list[str]) -> int:
     """Serve MLflow's pages until it is interrupted."""
     import webbrowser
 
+    from experiments.common.schema import require_within
     from experiments.runner.tracking.dashboard import last_sweep, serving
+    from mvest.quantities import within
 
     parser = Parser("mvest dashboard", description=COMMANDS["dashboard"])
     parser.add_argument("outputs", nargs="?", default="outputs", type=Path, metavar="FOLDER")
     parser.add_argument("--port", default=5000, type=int, help="5000 if not given; 0: a free one")
     parsed = parser.parse_args(rest)
     try:
+        require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
         place, page, said = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):
             print(f"{said}: {address}{page}", flush=True)

@@ -16,6 +16,7 @@ from experiments.common.progress import announce_compilation
 from experiments.common.records.record import Record
 from experiments.common.schema import require_admissible_values
 from experiments.common.study import load_study
+from experiments.results.estimates import sweep_table
 from experiments.results.keep import publish, records_of
 from experiments.runner.collecting.collect import NOT_RUN, collect, read_ends
 from experiments.runner.execution import slurm
@@ -29,6 +30,7 @@ from experiments.runner.tracking.log import SWEEP, log_sweep
 from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
+from mvest.files import write_atomically
 from mvest.quantities import Gigabytes, Processes, within
 
 
@@ -44,6 +46,9 @@ class LauncherSettings:
     mem_gb: Gigabytes
     poll_s: Annotated[float, within(0.01, 3600, "s", "an hour is too long to notice an end")]
 
+
+TABLE = "jobs.parquet"
+"""File in a sweep's folder: all its jobs as a table."""
 
 LAUNCHERS = ("local", "basic", "slurm")
 """Who can run jobs; Hydra's basic one stands for one process."""
@@ -174,6 +179,7 @@ def _launcher(config: DictConfig) -> str:
 def _collect(plan: Plan, to_come: int) -> int:
     """Write, log and publish what became of a sweep; the exit status."""
     found = _write(plan)
+    write_atomically(plan.folder / TABLE, sweep_table(found).to_parquet())
     log_sweep(plan.folder, plan.common)
     restored = _restore(plan)
     if restored:

@@ -96,7 +96,7 @@ def serving(
     try:
         with socket.create_server(("127.0.0.1", port)) as probe:
             port = int(probe.getsockname()[1])
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise InputError(f"port {port} cannot be used ({error}); name one by --port") from error
     command = [sys.executable, "-P", "-m", "mlflow", "server", "--backend-store-uri", place]
     command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]

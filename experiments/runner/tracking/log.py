@@ -111,9 +111,10 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     counts, name, tracking = Counter[str](), str(config["name"]), config["tracking"]
     if not tracking["enabled"]:
         return counts
-    plan: dict[str, Any] = {"jobs": [{"folder": "", "overrides": _typed(folder), "factors": {}}]}
     if is_sweep := (folder / PLAN).is_file():
         plan = read_mapping(folder / PLAN)
+    else:
+        plan = {"jobs": [{"folder": "", "overrides": _typed(folder), "factors": {}}]}
     each = len(plan["jobs"]) <= MANY if tracking.get("runs") is None else tracking["runs"]
     words = {word.partition("=")[0]: "" for job in plan["jobs"] for word in job["overrides"]}
     entries, settings, rows, factors = [], [], [], []
@@ -137,7 +138,9 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
             whole = {key: ",".join(values) for key, values in swept.items()}
             parent, done = _put(_sweep(folder, plan), whole, known)
             counts[done] += 1
-        for entry, row in zip(tqdm(entries, disable=None, leave=False), varied(rows, factors), strict=True):
+        for entry, row in zip(
+            tqdm(entries, disable=None, leave=False), varied(rows, factors), strict=True
+        ):
             if entry is not None:
                 counts[_put(entry, row, known, parent)[1]] += 1
     return counts
