@@ -17,7 +17,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 DEVELOP := .venv/.develop
 
-.PHONY: help install reproduce tables test test-all fuzz docs bench lint format dashboard sync screenshot slurm-check lock clean
+.PHONY: help install reproduce tables test test-all fuzz docs bench lint format dashboard screenshot slurm-check lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -89,10 +89,7 @@ format: $(DEVELOP) ## rewrite the code in the house format
 	$(BIN)/ruff format .
 
 dashboard: $(INSTALLED) ## MLflow's pages, on the comparison of the last sweep (PORT=5000)
-	$(BIN)/python -m experiments.runner.tracking.dashboard $(if $(PORT),--port $(PORT))
-
-sync: $(INSTALLED) ## upload to MLflow what is on disk and not there yet
-	$(BIN)/python -m experiments.runner.tracking.sync
+	$(BIN)/mvest dashboard $(if $(PORT),--port $(PORT))
 
 screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium)
 	$(BIN)/python -m tests.experiments.runner.tracking.screenshot

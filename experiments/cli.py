@@ -34,6 +34,7 @@ COMMANDS = {
     "table": "all estimates of a folder as one table for statistics: table outputs estimates.csv",
     "worker": "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
     "collect": "what became of the jobs of a sweep that others ran",
+    "sync": "what is on disk and not in MLflow is logged there: sync outputs",
     "dashboard": "MLflow's pages, on the comparison of the last sweep",
 }
 
@@ -95,10 +96,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser = Parser("mvest collect", description=COMMANDS[command])
             parser.add_argument("folder", type=Path, metavar="FOLDER")
             return _collect(parser.parse_args(rest).folder)
+        case "sync":
+            return _sync(rest)
         case "dashboard":
-            from experiments.runner.tracking.dashboard import main as dashboard
-
-            return dashboard(rest)
+            return _dashboard(rest)
         case _:
             close = difflib.get_close_matches(command, COMMANDS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
@@ -114,7 +115,7 @@ def _help() -> str:
 
 def _table(rest: list[str]) -> int:
     """Write all estimates of a folder as one table, and what its columns mean."""
-    from experiments.runner.collecting.estimate_table import write_estimates
+    from experiments.results.estimates import write_estimates
 
     parser = Parser("mvest table", description=COMMANDS["table"])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of runs, or results/")
@@ -126,6 +127,45 @@ def _table(rest: list[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _sync(rest: list[str]) -> int:
+    """Bring MLflow to the state of folders of outputs."""
+    from experiments.runner.tracking.log import sync
+
+    parser = Parser("mvest sync", description=COMMANDS["sync"])
+    parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="outputs if none")
+    folders: list[Path] = parser.parse_args(rest).folders or [Path("outputs")]
+    for folder in folders:
+        if not folder.is_dir():
+            parser.error(f"{folder}: there is no such folder")
+    return max(sync(folder) for folder in folders)
+
+
+def _dashboard(rest: list[str]) -> int:
+    """Serve MLflow's pages until it is interrupted."""
+    import webbrowser
+
+    from experiments.common.schema import require_within
+    from experiments.runner.tracking.dashboard import last_sweep, serving
+    from mvest.quantities import within
+
+    parser = Parser("mvest dashboard", description=COMMANDS["dashboard"])
+    parser.add_argument("outputs", nargs="?", default="outputs", type=Path, metavar="FOLDER")
+    parser.add_argument("--port", default=5000, type=int, help="5000 if not given; 0: a free one")
+    parsed = parser.parse_args(rest)
+    try:
+        require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
+        place, page, said = last_sweep(parsed.outputs)
+        with serving(place, parsed.port) as (address, server):
+            print(f"{said}: {address}{page}", flush=True)
+            webbrowser.open(address + page)
+            return server.wait()
+    except MvestError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 0
 
 
 def _worker(rest: list[str]) -> int:

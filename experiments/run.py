@@ -31,7 +31,6 @@ from experiments.runner.jobs.folder import FailedRunError, nothing_empty
 from experiments.runner.jobs.interruption import TRACEBACKS, interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
-from experiments.runner.tracking.beside import logging_beside
 from mvest.errors import ConfigurationError, MvestError
 
 PRIMARY = "In 'config': "
@@ -100,6 +99,7 @@ def run_alone(config: DictConfig) -> float:
     from experiments.runner.planning.compose import planned_job
     from experiments.runner.planning.plan import Plan
     from experiments.runner.sweep import objective_of
+    from experiments.runner.tracking.log import log_run
 
     with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
         request = Request.of(config)
@@ -109,13 +109,14 @@ def run_alone(config: DictConfig) -> float:
             require_admissible(request.values)
             print(plan.summary(), plan.listing(), sep="\n")
             return math.nan
-        with logging_beside(request.values) as track:
-            try:
-                run_job(request)
-            except FailedRunError:
-                track(request.folder)
-                raise
-            track(request.folder)
+        try:
+            run_job(request)
+        except FailedRunError:
+            log_run(request.folder, request.values)
+            raise
+        if config.check:
+            return math.nan
+        log_run(request.folder, request.values)
         record = read_result(request.folder, request.config_hash)
         return math.nan if record is None else objective_of(record, config.objective)
 

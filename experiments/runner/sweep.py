@@ -15,13 +15,14 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
+from experiments.common.records.metrics import metrics
 from experiments.common.records.record import Record
 from experiments.common.records.writer import LONGEST
 from experiments.common.schema import build, require_admissible_values
 from experiments.common.study import load_study
+from experiments.results.estimates import sweep_table
 from experiments.results.keep import publish
 from experiments.runner.collecting.collect import NOT_RUN, collect
-from experiments.runner.collecting.comparison import metrics
 from experiments.runner.execution.check import require_admissible
 from experiments.runner.execution.engine import Ended, EngineSettings, require_engine, run_jobs
 from experiments.runner.jobs.folder import (
@@ -33,13 +34,15 @@ from experiments.runner.jobs.folder import (
 from experiments.runner.planning.compose import make_plan
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.planning.progress import SweepBar
+from experiments.runner.tracking.log import SWEEP, log_sweep
 from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from experiments.sweeps.runs import by_setting
 from mvest.errors import ConfigurationError, MvestError
+from mvest.files import write_atomically
 
-SWEEP, MULTIRUN = "sweep.json", "multirun.yaml"
-"""Files in a sweep's folder: its results, and its configuration as Hydra writes it."""
+MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
+"""Files in a sweep's folder: its configuration as Hydra writes it, and all its jobs as a table."""
 
 SHOWN = ("setting", "parameter", "runs", "failed", "estimate", "median error", "largest error")
 """Columns of the table by settings that a terminal has room for."""
@@ -114,7 +117,11 @@ class SweepRun:
             return []
         self._run(plan, batch, settings)
         found = {job.hash: job.record for job in finish(plan, self._ended).jobs}
-        return [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+        returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+        # Of ten thousand jobs not kept while they are logged.
+        self._ended, found = {}, {}
+        log_sweep(plan.folder, plan.common)
+        return returned
 
     def _run(self, plan: Plan, batch: Plan, settings: EngineSettings) -> None:
         """Run the jobs of a batch that are not done."""
@@ -157,12 +164,14 @@ def collect_sweep(folder: Path) -> int:
     MvestError
         If nothing is planned in the folder, or the results cannot be written.
     """
-    found = finish(Plan.read(folder), {})
+    plan = Plan.read(folder)
+    found = finish(plan, {})
+    log_sweep(plan.folder, plan.common)
     return 0 if all(record.converged for record in found.records) else 1
 
 
 def finish(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
-    """Write, log, show and publish what became of a sweep.
+    """Write, show and publish what became of a sweep.
 
     Raises
     ------
@@ -174,11 +183,7 @@ def finish(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
     for path in write_sweep(plan.folder, found):
         if path.suffix in (".md", ".png"):
             print(f"Written to {path}")
-    if plan.common["tracking"]["enabled"]:
-        # Imports MLflow, for seconds.
-        from experiments.runner.tracking.sync import log_sweep
-
-        log_sweep(plan.common, plan, None)
+    write_atomically(plan.folder / TABLE, sweep_table(found).to_parquet())
     _publish_runs(plan)
     if all(record.reason != NOT_RUN for record in found.records):
         _publish(plan, found)
@@ -222,7 +227,7 @@ def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:
 
 def objective_of(record: Record, name: str) -> float:
     """A number of a record, by the name that MLflow shows; NaN where it has none."""
-    return next((value for key, value, _ in metrics(record) if key == name), math.nan)
+    return metrics(record)[0].get(name, math.nan)
 
 
 def _outcome(plan: Plan, found: Sweep) -> str:

@@ -1,208 +1,128 @@
-"""MLflow's pages on the last sweep: ``mvest dashboard``.
-
-They open on MLflow's own comparison of runs, at the address that its button "Compare" leads to. It
-draws parallel coordinates over the settings in which the runs differ and the first number that they
-have in common, the mean error.
-"""
+"""MLflow's pages: ``mvest dashboard``, on the comparison of the last sweep's runs."""
 
 from __future__ import annotations
 
-import argparse
 import json
+import os
 import socket
 import subprocess
 import sys
 import time
 import urllib.request
-import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from experiments.common.schema import require_within
-from experiments.runner.jobs.interruption import raised
 from experiments.runner.planning.plan import PLAN
-from experiments.runner.tracking.store import open_store
-from experiments.runner.tracking.summary import IS_SWEEP
-from experiments.runner.tracking.sync import jobs_in
-from mvest.errors import InputError, MvestError
-from mvest.processes import ROOT, Program, environment, python
-from mvest.quantities import within
+from experiments.runner.tracking.log import PARENT, runs_of
+from experiments.runner.tracking.store import MANNERS, opened
+from mvest.errors import InputError
+from mvest.processes import Program
 from mvest.reading.documents import read_mapping
 
-MAX_COMPARED = 100
-"""Runs that MLflow's comparison of runs can show: it reads them one by one."""
+MOST = 100
+"""Runs that MLflow's page of comparison can show: it reads them one by one."""
 
-PATIENCE = 600.0
-"""Seconds within which a server that lives must answer; making a database can take minutes."""
+PATIENCE_S = 120.0
+"""Seconds within which the server must answer."""
 
-SAY = 10.0
-"""Seconds between two lines about a server that does not answer yet."""
+SERVED = MANNERS | {
+    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+    # If somebody asks the assistant all the same, it works in a container or not at all.
+    "MLFLOW_ENABLE_ASSISTANT_SANDBOX": "true",
+    "MLFLOW_ENABLE_REMOTE_ASSISTANT": "false",
+    "PYTHONSAFEPATH": "1",
+}
+"""Environment of the server: no telemetry, no jobs, no assistant, no module of a case's folder."""
 
-HOSTS = ("127.0.0.1", "localhost", "[::1]")
-"""This machine, in a browser's words."""
-
-HTTP_PORT = 80
-"""The port that browsers leave out."""
-
-WIDER = "MLFLOW_SERVER_"
-"""Beginning of the environment variables that change whom MLflow's server answers."""
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """The runs of a sweep.
-
-    Attributes
-    ----------
-    place : str
-        Address of the store.
-    experiment : str
-        Id of the experiment.
-    sweep_id : str
-    runs : tuple of str
-        Ids of its runs.
-    summary : str
-        Id of the run that stands for the whole sweep; empty if there is none.
-    """
-
-    place: str
-    experiment: str
-    sweep_id: str
-    runs: tuple[str, ...]
-    summary: str = ""
-
-    def page(self, server: str) -> str:
-        """Address of the page that compares the runs, or lists them where they are too many."""
-        if not self.runs:
-            return f"{server}/#/experiments/{self.experiment}/runs/{self.summary}"
-        if len(self.runs) > MAX_COMPARED:
-            chosen = quote(f'tags.sweep_id = "{self.sweep_id}"')
-            return f"{server}/#/experiments/{self.experiment}/runs?searchFilter={chosen}"
-        runs = json.dumps(self.runs, separators=(",", ":"))
-        experiments = json.dumps([self.experiment])
-        return (
-            f"{server}/#/compare-runs?runs={quote(runs)}&experiments={quote(experiments)}"
-            "&workflowType=machine_learning"
-        )
+HOST = "mvest.localhost"
+"""This machine, by a name at which MLflow's pages do not open their assistant."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve MLflow's pages on the last sweep until interrupted."""
-    parser = argparse.ArgumentParser(prog="mvest dashboard", description=__doc__)
-    parser.add_argument("outputs", nargs="?", default="outputs", type=Path)
-    parser.add_argument("--port", default=5000, type=int)
-    given = parser.parse_args(arguments)
-    try:
-        require_within("--port", given.port, within(0, 65_535, "", "ports; 0: a free one"))
-        comparison = last_comparison(given.outputs)
-        with raised(), serving(comparison.place, given.outputs, given.port) as (address, server):
-            page = comparison.page(address)
-            print(f"last sweep, {len(comparison.runs)} runs: {page}", flush=True)
-            webbrowser.open(page)
-            return server.wait()
-    except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 0
+def last_sweep(outputs: Path) -> tuple[str, str, str]:
+    """Of the sweep that was planned last: its store, the path of its page, and a line on it.
 
-
-def last_comparison(outputs: Path) -> Comparison:
-    """The runs of the sweep that was started last.
+    The page compares the runs that finished with a plausible answer. Where they are too many it
+    lists them; where there are none it shows the sweep as a whole.
 
     Raises
     ------
     InputError
-        If there is no sweep, or none of its runs has been logged.
+        If there is no sweep, or it has not been logged.
     TrackingError
         If the store cannot be read.
     """
-    plans = [(read_mapping(path), path.parent) for path in outputs.glob(f"*/{PLAN}")]
-    for plan, folder in sorted(plans, key=lambda one: str(one[0]["created"]), reverse=True):
-        names = {Path(job["folder"]).name for job in plan["jobs"]}
-        jobs = [job for job in jobs_in(folder) if job.name in names]
-        if not jobs:
-            continue
-        config = read_mapping(jobs[0] / "config.json")
-        store = open_store(config["tracking"]["uri"], outputs, str(config["name"]))
-        of_sweep = [
-            run
-            for run in store.list_runs()
-            if run.data.tags.get("sweep_id") == plan.get("sweep_id")
-            and run.info.status != "RUNNING"
-        ]
-        whole = [run.info.run_id for run in of_sweep if run.data.tags.get("kind") == IS_SWEEP]
-        runs = [run.info.run_id for run in of_sweep if run.info.run_id not in whole]
-        if not of_sweep:
-            raise InputError(f"no run of {folder} is in {store.place}: try `make sync`")
-        if len(runs) < len(jobs) and (runs or not whole):
-            left = len(jobs) - len(runs)
-            print(f"warning: {left} results are not in MLflow; `make sync`", file=sys.stderr)
-        return Comparison(
-            store.place, store.experiment, str(plan["sweep_id"]), tuple(runs), "".join(whole[:1])
-        )
-    raise InputError(f"{outputs} holds no finished sweep; run one, or name another folder")
+    plans = sorted(outputs.glob(f"*/{PLAN}"), key=lambda path: path.stat().st_mtime)
+    if not plans:
+        raise InputError(f"{outputs} holds no sweep; run one, or name another folder")
+    plan, sweep = read_mapping(plans[-1]), plans[-1].parent.name
+    name = str(plan["values"]["name"])
+    with opened(plan["values"]["tracking"]["uri"], outputs, name) as place:
+        whole = runs_of(name, f"tags.sweep_id = '{plan['sweep_id']}'")
+        if not whole:
+            raise InputError(f"{sweep} is not in {place}; `mvest sync {outputs}` logs it")
+        parent, experiment = whole[0].info.run_id, whole[0].info.experiment_id
+        jobs = f"tags.`{PARENT}` = '{parent}'"
+        chosen = f"{jobs} and tags.plausible = 'yes'"
+        runs, count = [run.info.run_id for run in runs_of(name, chosen)], len(runs_of(name, jobs))
+    page = f"/#/experiments/{experiment}/runs"
+    if not runs:
+        page += f"/{parent}"
+    elif len(runs) > MOST:
+        page += f"?searchFilter={quote(chosen)}"
+    else:
+        ids, experiments = (quote(json.dumps(some)) for some in (runs, [experiment]))
+        page = f"/#/compare-runs?runs={ids}&experiments={experiments}&workflowType=machine_learning"
+    left = count - len(runs)
+    return (
+        place,
+        page,
+        f"{sweep}, {len(runs)} runs" + f" ({left} failed or implausible)" * bool(left),
+    )
 
 
 @contextmanager
 def serving(
-    place: str, outputs: Path, port: int, *, quiet: bool = False
+    place: str, port: int, *, quiet: bool = False
 ) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """MLflow's pages on this machine only: their address, and the server, which ends with this.
+    """MLflow's server, for this machine only: its address, and its process, which ends with this.
 
     Raises
     ------
     InputError
-        If the port is taken, or the server ends or is silent for too long.
+        If the port is taken, or the server does not start.
     """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise InputError(
-                f"port {port} is taken ({error.strerror}); name another one with --port"
-            ) from error
-        port = int(probe.getsockname()[1])
-    command = [
-        *python("mlflow", "server"), "--backend-store-uri", place,
-        "--default-artifact-root", (outputs.resolve() / "mlartifacts").as_uri(),
-        "--host", HOSTS[0], "--port", str(port), "--workers", "1",
-        "--allowed-hosts", ",".join(allowed_hosts(port)),
-    ]  # fmt: skip
+    try:
+        with socket.create_server(("127.0.0.1", port)) as probe:
+            port = int(probe.getsockname()[1])
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used ({error}); name one by --port") from error
+    command = [sys.executable, "-P", "-m", "mlflow", "server", "--backend-store-uri", place]
+    command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    hosts = allowed_hosts(port)
+    command += ["--allowed-hosts", ",".join(hosts)]
+    command += ["--cors-allowed-origins", ",".join(f"http://{host}" for host in hosts)]
     # Whatever the login shell has set: nobody else is let in.
-    # MLflow starts Python again, without -P, and uvicorn there would add the working folder.
-    given = environment(PYTHONSAFEPATH="1", UVICORN_APP_DIR=str(ROOT))
-    kept = {name: value for name, value in given.items() if not name.startswith(WIDER)}
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
     out = subprocess.DEVNULL if quiet else None
-    with Program(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=kept) as server:
-        _await(f"http://127.0.0.1:{port}", server.process)
-        yield f"http://127.0.0.1:{port}", server.process
+    # uvicorn looks for modules in the folder that it is started in.
+    with Program(
+        command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=kept, cwd="/"
+    ) as server:
+        until = time.monotonic() + PATIENCE_S
+        while server.process.poll() is None and time.monotonic() < until:
+            with (
+                suppress(OSError),
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=2.0),
+            ):
+                break
+            time.sleep(0.2)
+        else:
+            raise InputError(f"MLflow's server at port {port} did not start")
+        yield f"http://{HOST}:{port}", server.process
 
 
 def allowed_hosts(port: int) -> list[str]:
-    """The hosts that a request may name: a page of any other, led here by its name, reads nothing.
-
-    MLflow's own list lets names like 192.168.evil.com in.
-    """
-    return [f"{host}:{port}" for host in HOSTS] + (list(HOSTS) if port == HTTP_PORT else [])
-
-
-def _await(address: str, server: subprocess.Popen[bytes]) -> None:
-    """Wait until the server answers, and say so while it does not."""
-    began = said = time.monotonic()
-    while server.poll() is None and (now := time.monotonic()) < began + PATIENCE:
-        with suppress(OSError), urllib.request.urlopen(f"{address}/health", timeout=2.0):
-            return
-        if now > said + SAY:
-            said = now
-            print(f"MLflow's server is starting, {now - began:.0f} s so far", file=sys.stderr)
-        time.sleep(0.2)
-    raise InputError(f"MLflow's server at {address} did not start")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    """The hosts that a request may name; MLflow's own list lets names like 10.evil.com in."""
+    return [f"{host}:{port}" for host in (HOST, "127.0.0.1", "localhost", "[::1]")]

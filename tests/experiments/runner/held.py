@@ -59,16 +59,11 @@ def main() -> int:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     from experiments import cli
     from experiments.runner.execution import guard
-    from experiments.runner.tracking import sync
-    from experiments.runner.tracking import upload as uploading
 
-    def upload(*given, **named):
-        client = given[0].client
-        client.set_terminated = lambda *_, **__: hold()
-        return uploading.upload(*given, **named)
+    if stage() == "logging":
+        import mlflow
 
-    if stage() == "uploading":
-        sync.upload = upload
+        mlflow.MlflowClient.set_terminated = lambda *_, **__: hold()
     guard.WORKER = (sys.executable, __file__, "worker")
     return cli.main(sys.argv[1:])
 

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.runner.tracking.store import open_store
+from experiments.runner.tracking.log import runs_of
+from experiments.runner.tracking.store import opened
 from experiments.sweeps.collected import read_sweep
 from tests.places import ROOT
 from tests.processes import alive, gone, linux, until
@@ -29,7 +30,7 @@ STATUS = {
 }  # fmt: skip
 """Signals -> exit status."""
 
-STAGES = "planning", "simulating", "estimating", "writing", "collecting", "uploading", "drawing"
+STAGES = "planning", "simulating", "estimating", "writing", "collecting", "logging", "drawing"
 QUICK = {
     ("planning", "HUP"), ("simulating", "KILL"), ("estimating", "TERM"), ("writing", "KILL"),
     ("drawing", "INT INT"),
@@ -102,8 +103,8 @@ def undisturbed(tmp_path_factory):
 @pytest.fixture(scope="module")
 def database(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("store")
-    open_store(None, folder, "another")
-    return folder / "mlflow.db"
+    with opened(None, folder, "another"):
+        return folder / "mlflow.db"
 
 
 @pytest.mark.parametrize(("stage", "signals"), CASES)
@@ -113,7 +114,7 @@ def test_a_signal_leaves_nothing_behind(stage, signals, undisturbed, tmp_path, r
         more.append(PUBLISHED)
     if stage in ("simulating", "estimating"):
         more.append("hydra.launcher.n_jobs=2")
-    if stage == "uploading":
+    if stage == "logging":
         (tmp_path / "outputs").mkdir()
         shutil.copy(request.getfixturevalue("database"), tmp_path / "outputs" / "mlflow.db")
         more = []
@@ -145,9 +146,9 @@ def test_a_signal_leaves_nothing_behind(stage, signals, undisturbed, tmp_path, r
         assert answer(tmp_path) == undisturbed
     else:
         assert answer(tmp_path)["runs"] == undisturbed["runs"]
-    if stage == "uploading":
-        store = open_store(None, tmp_path / "outputs", "sweep_debug")
-        runs = store.list_runs()
+    if stage == "logging":
+        with opened(None, tmp_path / "outputs", "sweep_debug"):
+            runs = runs_of("sweep_debug", "")
         assert [run.info.status for run in runs] == ["FINISHED"] * 5, "four jobs and the sweep"
 
 

@@ -13,9 +13,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from PIL import Image
-
-from experiments.runner.tracking.dashboard import last_comparison, serving
+from experiments.runner.tracking.dashboard import last_sweep, serving
 from mvest.errors import InputError, MvestError
 from mvest.processes import run
 
@@ -28,8 +26,8 @@ FLAGS = (
 )  # fmt: skip
 """Chromium as a program that speaks to nobody but the page, which it gives 30 s to draw itself."""
 
-PICTURE, PANEL = (1600, 970), 410
-"""Pixels of the picture, and of the panel at its right with which a new user is greeted."""
+PICTURE = (1600, 970)
+"""Pixels of the picture."""
 
 PATIENCE = 120.0
 """Seconds of the clock that a page may take."""
@@ -42,12 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--to", default=Path("results/dashboard.png"), type=Path)
     given = parser.parse_args(arguments)
     try:
-        comparison = last_comparison(given.outputs)
-        with serving(comparison.place, given.outputs, 0, quiet=True) as (address, _):
-            look_at(comparison.page(address), f"--screenshot={given.to.resolve()}")
-        with Image.open(given.to) as picture:
-            cropped = picture.crop((0, 0, *PICTURE))
-        cropped.save(given.to)
+        place, page, _ = last_sweep(given.outputs)
+        with serving(place, 0, quiet=True) as (address, _):
+            look_at(address + page, f"--screenshot={given.to.resolve()}")
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -67,7 +62,7 @@ def look_at(address: str, what: str) -> str:
     if program is None:
         raise InputError("Chromium is not installed (Debian: apt install chromium)")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        window = f"--window-size={PICTURE[0] + PANEL},{PICTURE[1]}"
+        window = f"--window-size={PICTURE[0]},{PICTURE[1]}"
         command = [program, *FLAGS, window, f"--user-data-dir={profile}", what, address]
         try:
             seen = run(

@@ -12,6 +12,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 
@@ -40,10 +41,10 @@ def outputs(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def shown(outputs) -> str:
     """The comparison's page as it is drawn."""
-    compared = dashboard.last_comparison(outputs)
+    place, page, _ = dashboard.last_sweep(outputs)
     try:
-        with dashboard.serving(compared.place, outputs, 0, quiet=True) as (address, _):
-            return screenshot.look_at(compared.page(address), "--dump-dom")
+        with dashboard.serving(place, 0, quiet=True) as (address, _):
+            return screenshot.look_at(address + page, "--dump-dom")
     except InputError as error:
         if "not installed" in str(error):
             pytest.skip(str(error))
@@ -53,8 +54,8 @@ def shown(outputs) -> str:
 def test_the_page_compares_every_run_and_calls_it_by_what_differs(shown, outputs) -> None:
     jobs = json.loads((outputs / "sweep_debug" / "plan.json").read_text())["jobs"]
     assert f"Comparing {len(jobs)} Runs" in shown
-    runs = set(dashboard.last_comparison(outputs).runs)
-    assert set(re.findall(r"/runs/([0-9a-f]{32})", shown)) == runs
+    runs = re.findall(r"[0-9a-f]{32}", unquote(dashboard.last_sweep(outputs)[1]))
+    assert set(re.findall(r"/runs/([0-9a-f]{32})", shown)) == set(runs)
     assert len(runs) == len(jobs) == 4
     for job in jobs:
         assert job["name"] in shown
@@ -63,11 +64,15 @@ def test_the_page_compares_every_run_and_calls_it_by_what_differs(shown, outputs
 
 def test_its_axes_are_settings_that_differ_and_the_error(shown) -> None:
     axes = re.findall(r'class="axis-title"[^>]*>([^<]*)<', shown)
-    # P0 and the noise are the same in all of them: they have no axis.
-    assert axes == ["initial.anterior", "initial.posterior", "seed", "error.mean"]
+    # By the names that are typed; what is the same in all of them has no axis.
+    assert axes == ["filter.initial.anterior", "filter.initial.posterior", "seed", "error.mean"]
     # Numbers along the axes, not names: a setting that MLflow takes for text has no scale.
     ticks = [text.replace("−", "-") for text in re.findall(r"<text[^>]*>([\d.−-]+)</text>", shown)]
     assert {5.0, 4.0, 3.0, 2.0, 1.0} <= {float(tick) for tick in ticks}
+
+
+def test_no_assistant_asks_for_anything(shown) -> None:
+    assert "ssistant" not in re.sub(r"<(script|style).*?</\1>", "", shown, flags=re.S)
 
 
 def test_the_picture_is_made(outputs, shown, tmp_path) -> None:
@@ -78,13 +83,13 @@ def test_the_picture_is_made(outputs, shown, tmp_path) -> None:
 @pytest.fixture(scope="module")
 def address(outputs) -> Iterator[str]:
     """Of a server on the sweep, whatever the login shell says of whom to answer."""
-    place = dashboard.last_comparison(outputs).place
+    place, _, _ = dashboard.last_sweep(outputs)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MLFLOW_SERVER_ALLOWED_HOSTS", "*")
         patch.setenv("MLFLOW_SERVER_CORS_ALLOWED_ORIGINS", "*")
         patch.setenv("MLFLOW_SERVER_DISABLE_SECURITY_MIDDLEWARE", "true")
-        with dashboard.serving(place, outputs, 0, quiet=True) as (at, _):
-            yield at
+        with dashboard.serving(place, 0, quiet=True) as (at, _):
+            yield at.replace(dashboard.HOST, "127.0.0.1")
 
 
 def asked(address: str, *, host: str, origin: str = "", path: str = "experiments/search") -> int:
@@ -100,7 +105,7 @@ def asked(address: str, *, host: str, origin: str = "", path: str = "experiments
         return refused.code
 
 
-@pytest.mark.parametrize("name", dashboard.HOSTS)
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "[::1]", dashboard.HOST])
 def test_its_own_page_is_answered(address, name) -> None:
     own = f"{name}:{address.rpartition(':')[2]}"
     assert asked(address, host=own) == 200
@@ -121,6 +126,15 @@ def test_no_page_from_elsewhere_changes_anything(address, origin) -> None:
     assert asked(address, host=address.removeprefix("http://"), origin=origin) == 403
 
 
+def test_no_module_of_the_working_folder_is_run(outputs, tmp_path, monkeypatch) -> None:
+    place, _, _ = dashboard.last_sweep(outputs)
+    for name in ("mlflow", "uvicorn", "fastapi", "sqlalchemy", "click", "filelock", "json", "ssl"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    with dashboard.serving(place, 0, quiet=True):
+        assert not (tmp_path / "ran").exists()
+
+
 def listening(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
@@ -134,7 +148,7 @@ def test_a_stopped_dashboard_leaves_no_server_behind(outputs, tmp_path, end, sta
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    command = ("-m", "experiments.runner.tracking.dashboard", str(outputs), "--port", str(port))
+    command = ("-m", "experiments.cli", "dashboard", str(outputs), "--port", str(port))
     with (tmp_path / "said").open("w") as said:
         shown = subprocess.Popen(
             [sys.executable, *command],
@@ -158,6 +172,6 @@ def test_a_stopped_dashboard_leaves_no_server_behind(outputs, tmp_path, end, sta
 def test_a_server_that_ends_is_not_waited_for(outputs) -> None:
     with (
         pytest.raises(InputError, match="did not start"),
-        dashboard.serving("nonsense://place", outputs, 0, quiet=True),
+        dashboard.serving("nonsense://place", 0, quiet=True),
     ):
         pytest.fail("it cannot serve this")

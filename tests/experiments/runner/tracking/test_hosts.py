@@ -1,11 +1,15 @@
 """Whom the dashboard answers: its own address and port, and no name that leads there."""
 
+import socket
+
 import pytest
 from mlflow.server.security_utils import is_allowed_host_header
 
+from experiments.cli import main
 from experiments.runner.tracking import dashboard
+from mvest.errors import InputError
 
-OWN = ("127.0.0.1:5000", "localhost:5000", "[::1]:5000")
+OWN = ("127.0.0.1:5000", "localhost:5000", "[::1]:5000", "mvest.localhost:5000")
 
 OTHERS = (
     "192.168.evil.com",
@@ -18,6 +22,7 @@ OTHERS = (
     "localhost:5001",
     "localhost:5000.evil.com",
     "localhost:evil.com",
+    "evil.localhost:5000",
     "127.0.0.1:5000.evil.com",
     "0.0.0.0:5000",
     "LOCALHOST.evil.com:5000",
@@ -37,13 +42,16 @@ def test_no_other_name_is(host: str) -> None:
     assert not is_allowed_host_header(dashboard.allowed_hosts(5000), host)
 
 
-def test_the_port_may_be_left_out_where_browsers_do() -> None:
-    allowed = dashboard.allowed_hosts(80)
-    assert is_allowed_host_header(allowed, "localhost")
-    assert is_allowed_host_header(allowed, "localhost:80")
-    assert not is_allowed_host_header(allowed, "192.168.evil.com")
-
-
 def test_a_port_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert dashboard.main(["--port", "99999"]) == 2
+    assert main(["dashboard", "--port", "99999"]) == 2
     assert "--port = 99999, expected 0 to 65535" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(InputError, match=f"port {port} cannot be used"),
+            dashboard.serving("sqlite://", port),
+        ):
+            pytest.fail("it cannot serve there")

@@ -10,8 +10,8 @@ from pandas import read_csv, read_parquet
 
 from experiments.cli import main
 from experiments.common.records.record import write_record
+from experiments.results.estimates import COLUMNS, estimate_table, write_estimates
 from experiments.results.keep import write_records
-from experiments.runner.collecting.estimate_table import COLUMNS, estimate_table, write_estimates
 from experiments.sweeps.collected import write_sweep_file
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
@@ -117,5 +117,29 @@ def test_what_is_refused(tmp_path: Path, capsys) -> None:
     place = record(tmp_path / "a", estimates=(made_up_estimate((1.0, 2.0)),))
     place.write_text(place.read_text().replace("1.0", "1.5", 1))
     assert main(["table", str(tmp_path), str(tmp_path / "t.csv")]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    damaged, nothing = capsys.readouterr().err.splitlines()
+    assert damaged.startswith("warning: left out: ")
+    assert "a/result.json" in damaged
+    assert "no record of a run or sweep" in nothing
     assert not (tmp_path / "t.csv").exists()
+
+
+def test_a_folder_of_outputs_has_copies_and_foreign_files(tmp_path: Path, capsys) -> None:
+    mine = record(tmp_path / "debug" / "a", estimates=(made_up_estimate(),))
+    # The record of a run with arrays, which MLflow keeps without them.
+    copy = tmp_path / "mlartifacts" / "run" / "artifacts" / "result.json"
+    copy.parent.mkdir(parents=True)
+    copy.write_text(mine.read_text().replace('"arrays_sha256": null', '"arrays_sha256": "1"'))
+    foreign = {"other/result.json": '{"a": 1}', "cut/result.json": "{", "old/sweep.json": "[]"}
+    for name, text in foreign.items():
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(text)
+    # What an unreadable sweep stands for is read from its jobs.
+    record(tmp_path / "old" / "job", estimates=(made_up_estimate(),))
+    assert main(["table", str(tmp_path), str(tmp_path / "t.csv")]) == 0
+    assert set(read_csv(tmp_path / "t.csv")["record"]) == {
+        "debug/a/result.json", "old/job/result.json",
+    }  # fmt: skip
+    warned = capsys.readouterr().err.splitlines()
+    assert len(warned) == len(foreign)
+    assert all(any(name in line for line in warned) for name in foreign)

@@ -7,6 +7,7 @@ beside it as a data dictionary), failures as rows without numbers, nothing aggre
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,29 +71,37 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
 def estimate_table(folder: Path) -> DataFrame:
     """The estimates of all records and sweeps below a folder of runs, or of published results.
 
+    A file that cannot be read, is foreign or is not as it was written costs a line of warning.
+    Copies that MLflow keeps are left out.
+
     Raises
     ------
     InputError
-        If there is none, or a file is damaged or not as it was written.
+        If there is none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder")
     rows: list[dict[str, Any]] = []
     tables = sorted((folder / RECORDS).glob("*.jsonl"))
     published = sorted((folder / SWEEPS).glob("*.json"))
-    sweeps = published or ([] if tables else sorted(folder.rglob("sweep.json")))
+    sweeps = published or ([] if tables else _below(folder, "sweep.json"))
+    runs = [] if tables or published else _below(folder, "result.json")
     # A sweep stands for its jobs.
-    whole = {path.parent for path in sweeps}
-    runs = [] if tables or published else sorted(folder.rglob("result.json"))
-    for path in tables:
-        kept = records_of(folder, path.stem)
-        for name, record in kept.records.items() if kept else ():
-            rows += _rows(record, f"{RECORDS}/{path.name}#{name}")
-    for path in sweeps:
-        rows += _of_sweep(read_sweep(path), path.relative_to(folder).as_posix())
-    for path in runs:
-        if not whole & set(path.parents):
-            rows += _rows(read_record(path), path.relative_to(folder).as_posix())
+    whole: set[Path] = set()
+    for path in [*tables, *sweeps, *runs]:
+        place = path.relative_to(folder).as_posix()
+        try:
+            if path in tables:
+                kept = records_of(folder, path.stem)
+                for name, record in kept.records.items() if kept else ():
+                    rows += _rows(record, f"{place}#{name}")
+            elif path in sweeps:
+                rows += _of_sweep(read_sweep(path), place)
+                whole.add(path.parent)
+            elif not whole & set(path.parents):
+                rows += _rows(read_record(path), place)
+        except InputError as error:
+            print(f"warning: left out: {error}", file=sys.stderr)
     if not rows:
         raise InputError(f"{folder}: no record of a run or sweep that holds estimates")
     return _typed(rows)
@@ -124,6 +133,11 @@ def write_estimates(folder: Path, target: Path) -> list[Path]:
         ]
     except OSError as error:
         raise cannot_write(target, error) from error
+
+
+def _below(folder: Path, name: str) -> list[Path]:
+    copies = {"mlartifacts", "mlruns"}
+    return [path for path in sorted(folder.rglob(name)) if not copies & set(path.parts)]
 
 
 def _of_sweep(sweep: Sweep, place: str | None = None) -> list[dict[str, Any]]:
