@@ -96,8 +96,7 @@ def run_alone(config: DictConfig) -> float:
     from experiments.runner.execution.check import require_admissible
     from experiments.runner.execution.job import run_job
     from experiments.runner.jobs.folder import read_result
-    from experiments.runner.planning.compose import planned_job
-    from experiments.runner.planning.plan import Plan
+    from experiments.runner.planning.plan import Plan, PlannedJob
     from experiments.runner.sweep import objective_of
     from experiments.runner.tracking.log import log_run
 
@@ -105,7 +104,7 @@ def run_alone(config: DictConfig) -> float:
         request = Request.of(config)
         if config.dry_run:
             name, folder = str(request.values["name"]), request.folder.parent
-            plan = Plan(name, folder, {}, (planned_job(request),), 1)
+            plan = Plan(name, folder, {}, (PlannedJob.of(request),), 1)
             require_admissible(request.values)
             print(plan.summary(), plan.listing(), sep="\n")
             return math.nan

@@ -58,7 +58,6 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "forward_solves": ("integer", "", "runs of the model for this estimate"),
     "seconds": ("number", "s", "wall-clock time of this estimate"),
     "seconds_of_job": ("number", "s", "wall-clock time of its whole job, all seeds together"),
-    "overhead_of_job": ("number", "s", "of that, neither simulating nor estimating"),
     "config_sha256": ("text", "", "of the configuration"),
     "mesh_sha256": ("text", "", "of the estimator's mesh"),
     "commit": ("text", "", "of the code that computed it"),
@@ -143,7 +142,7 @@ def _below(folder: Path, name: str) -> list[Path]:
 def _of_sweep(sweep: Sweep, place: str | None = None) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for job in sweep.jobs:
-        rows += _rows(job.record, place, job=job.hash, overhead_of_job=job.overhead)
+        rows += _rows(job.record, place, job=job.hash)
     return rows
 
 

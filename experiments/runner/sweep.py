@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
@@ -17,14 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.common.progress import announce_compilation
 from experiments.common.records.metrics import metrics
 from experiments.common.records.record import Record
-from experiments.common.records.writer import LONGEST
 from experiments.common.schema import build, require_admissible_values
 from experiments.common.study import load_study
 from experiments.results.estimates import sweep_table
-from experiments.results.keep import publish
+from experiments.results.publish import publish_runs, publish_sweep
 from experiments.runner.collecting.collect import NOT_RUN, collect
 from experiments.runner.execution.check import require_admissible
-from experiments.runner.execution.engine import Ended, EngineSettings, require_engine, run_jobs
+from experiments.runner.execution.engine import EngineSettings, require_engine, run_jobs
 from experiments.runner.jobs.folder import (
     FailedRunError,
     last_record,
@@ -35,17 +33,13 @@ from experiments.runner.planning.compose import make_plan
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.planning.progress import SweepBar
 from experiments.runner.tracking.log import SWEEP, log_sweep
-from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
-from experiments.sweeps.report import write_sweep
-from experiments.sweeps.runs import by_setting
+from experiments.sweeps.collected import Sweep, write_sweep_file
+from experiments.sweeps.report import text_of, write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.files import write_atomically
 
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
 """Files in a sweep's folder: its configuration as Hydra writes it, and all its jobs as a table."""
-
-SHOWN = ("setting", "parameter", "runs", "failed", "estimate", "median error", "largest error")
-"""Columns of the table by settings that a terminal has room for."""
 
 GIVEN_ONCE = ("planned", "basic")
 """Sweepers that know all their jobs beforehand; others may try a job twice."""
@@ -65,7 +59,7 @@ class SweepRun:
     def __init__(self, loader: ConfigLoader, config: DictConfig) -> None:
         self._loader, self._config = loader, config
         self._jobs: dict[str, PlannedJob] = {}
-        self._ended: dict[str, Ended] = {}
+        self._ended: dict[str, Record] = {}
 
     def launch(self, overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Find out what jobs mean, refuse a wrong one before anything is written, and run them.
@@ -136,9 +130,9 @@ class SweepRun:
         )
         try:
             with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
-                for k, ended in ends:
-                    self._ended[jobs[k].request.config_hash] = ended
-                    bar.ended(jobs[k], ended.record)
+                for k, record in ends:
+                    self._ended[jobs[k].request.config_hash] = record
+                    bar.ended(jobs[k], record)
         except KeyboardInterrupt:
             ends.close()
             collected(plan, self._ended)
@@ -170,7 +164,7 @@ def collect_sweep(folder: Path) -> int:
     return 0 if all(record.converged for record in found.records) else 1
 
 
-def finish(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
+def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     """Write, show and publish what became of a sweep.
 
     Raises
@@ -179,18 +173,30 @@ def finish(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
         If the results cannot be written.
     """
     found = collected(plan, ended)
-    print(_answer(found))
+    print(text_of(found))
     for path in write_sweep(plan.folder, found):
         if path.suffix in (".md", ".png"):
             print(f"Written to {path}")
     write_atomically(plan.folder / TABLE, sweep_table(found).to_parquet())
-    _publish_runs(plan)
-    if all(record.reason != NOT_RUN for record in found.records):
-        _publish(plan, found)
+    publish_runs(
+        (
+            job.request.publish_as,
+            last_record(job.folder, job.request.config_hash),
+            job.folder,
+            Path(job.values["paths"]["results"]),
+        )
+        for job in plan.jobs
+        if job.request.publish_as
+    )
+    results = plan.common["paths"]["results"]
+    if plan.publish and all(one.reason != NOT_RUN for one in found.records):
+        publish_sweep(Path(results), found)
+    elif plan.publish is False:
+        print(f"{results} left as it is: this sweep has overrides")
     return found
 
 
-def collected(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
+def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     """Write ``sweep.json`` and say in a line how the sweep ended."""
     path = plan.folder / SWEEP
     found = collect(plan, ended)
@@ -198,19 +204,6 @@ def collected(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
     print(_outcome(plan, found))
     print(f"Written to {path}")
     return found
-
-
-def _answer(found: Sweep) -> str:
-    """The table of a sweep for a terminal: what was estimated in each setting, and how well."""
-    # Imports for a second.
-    from pandas import DataFrame
-
-    table = by_setting(found)
-    if len(table) > LONGEST:
-        return f"{len(table)} settings and parameters: too many for a terminal"
-    shown = {name: table.values[name] for name in SHOWN}
-    rows = replace(table, values={**shown, "SD over runs": table.values["SD over runs"]}).readable()
-    return str(DataFrame(rows).to_string(index=False))
 
 
 def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:
@@ -232,49 +225,15 @@ def objective_of(record: Record, name: str) -> float:
 
 def _outcome(plan: Plan, found: Sweep) -> str:
     """How a sweep ended, in one line."""
-    total, ran = len(plan.jobs), len(plan.to_run)
+    total, before = len(plan.jobs), sum(not job.to_run for job in plan.jobs)
     failed = [record for record in found.records if not record.converged]
     missing = sum(record.reason == NOT_RUN for record in failed)
-    stored = [record.numbers.get("truth_store") for record in found.records]
-    text = f"{plan.name}: {total - len(failed)} of {total} jobs done"
-    text += f" ({total - ran} before), " if total > ran else ", "
-    text += f"{len(failed) - missing} without an estimate"
-    if missing:
-        text += f", {missing} not finished"
-    text += f"; stored truths used {stored.count('hit')} times, {stored.count('miss')} simulated"
-    overheads = [job.overhead for job in found.jobs if job.overhead is not None]
-    if overheads:
-        text += f"; overhead {median(overheads):.2f} s per job"
-    return text
-
-
-def _publish_runs(plan: Plan) -> None:
-    """Let the results take over the runs of a sweep that have records of their own there."""
-    groups: dict[tuple[Path, str, str], dict[str, tuple[Record, Path]]] = {}
-    for job in plan.jobs:
-        name = job.request.publish_as
-        record = last_record(job.folder, job.request.config_hash) if name else None
-        if record is not None and (record.converged or load_study(record.study).keeps_failures):
-            group = Path(job.values["paths"]["results"]), record.study, record.table
-            groups.setdefault(group, {})[str(name)] = record, job.folder
-    for (results, study, _), runs in groups.items():
-        publish(load_study(study), results, runs)
-        print(f"Results in {results}")
-
-
-def _publish(plan: Plan, found: Sweep) -> None:
-    """Let the results take over a sweep that was run as it is configured."""
-    if plan.publish is None:
-        return
-    results = Path(plan.common["paths"]["results"])
-    if not plan.publish:
-        print(f"{results} left as it is: this sweep has overrides")
-        return
-    folder = results / SWEEPS
-    require_writable(folder)
-    write_sweep_file(folder / f"{found.name}.json", found)
-    write_sweep(results, found)
-    print(f"Results in {results}")
+    parts = [
+        f"{total - len(failed)} of {total} jobs done" + (f" ({before} before)" if before else ""),
+        f"{len(failed) - missing} without an estimate",
+        *([f"{missing} not finished"] if missing else []),
+    ]
+    return f"{plan.name}: {', '.join(parts)}"
 
 
 def _check(job: PlannedJob) -> None:

@@ -45,9 +45,6 @@ class SweptJob(Frozen):
         Initial guess and true values of the sweep's parameters, as configured.
     P0, Q, R : number, (p,) or (p, p)
         Covariances of the filter, as configured.
-    overhead : float or None
-        Seconds between the end of the job before and the end of this one that were spent neither
-        simulating nor estimating; None where that was not measured.
     record : Record
         Its head, see `head_of`.
     """
@@ -60,7 +57,6 @@ class SweptJob(Frozen):
     P0: Any = None
     Q: Any = None
     R: Any = None
-    overhead: float | None = None
     record: Record
 
     @property

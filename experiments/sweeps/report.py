@@ -7,9 +7,10 @@ without running anything.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
-from experiments.common.records.writer import provenance_of, write_tables
+from experiments.common.records.writer import LONGEST, provenance_of, write_tables
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.runs import by_setting, runs_of, shortened
 from mvest.errors import InputError
@@ -20,6 +21,22 @@ CAPTIONS = {
     "paths": "Estimates after each iteration, from every start.",
 }
 """End of the file name of a figure -> its caption."""
+
+
+SHOWN = ("setting", "parameter", "runs", "failed", "estimate", "median error", "largest error")
+"""Columns of the table by settings that a terminal has room for."""
+
+
+def text_of(sweep: Sweep) -> str:
+    """The table of a sweep for a terminal: what was estimated in each setting, and how well."""
+    # Imports for a second.
+    from pandas import DataFrame
+
+    table = by_setting(sweep)
+    if len(table) > LONGEST:
+        return f"{len(table)} settings and parameters: too many for a terminal"
+    shown = {name: table.values[name] for name in (*SHOWN, "SD over runs")}
+    return str(DataFrame(replace(table, values=shown).readable()).to_string(index=False))
 
 
 def write_sweep(results: Path, sweep: Sweep) -> list[Path]:

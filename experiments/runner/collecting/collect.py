@@ -6,12 +6,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from experiments.common.records.record import here_and_now, stamp
+from experiments.common.records.record import Record, here_and_now, stamp
 from experiments.common.study import Result
-from experiments.runner.execution.engine import Ended
-from experiments.runner.jobs.folder import last_record
 from experiments.runner.planning.plan import Plan, PlannedJob
-from experiments.sweeps.collected import Sweep, SweptJob, head_of
+from experiments.sweeps.collected import Sweep, SweptJob
 from mvest.provenance import config_hash
 
 NOT_COMMON = ("factors", "paths", "tracking", "sweep")
@@ -21,17 +19,17 @@ NOT_RUN = "not run"
 """Reason of a job that never began or was interrupted."""
 
 
-def collect(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
+def collect(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     """What all jobs of a sweep gave, in their order, failed and missing ones included.
 
     Parameters
     ----------
     plan : Plan
     ended : mapping
-        Hash of a configuration -> how its job ended; other jobs are read from their folders.
+        Hash of a configuration -> head of the record of a job that has just been run.
     """
-    ends = [ended.get(job.request.config_hash) or _found(job) for job in plan.jobs]
-    sources = [end.record.provenance for end in ends if end.record.reason != NOT_RUN]
+    records = [ended.get(job.request.config_hash, job.before) for job in plan.jobs]
+    sources = [record.provenance for record in records if record is not None]
     first = plan.common
     return Sweep(
         name=str(plan.sweep.get("name", plan.name)),
@@ -46,22 +44,16 @@ def collect(plan: Plan, ended: Mapping[str, Ended]) -> Sweep:
         ),
         commits=tuple(sorted({str(one.git.sha) for one in sources})),
         settings={key: value for key, value in first.items() if key not in NOT_COMMON},
-        jobs=tuple(_swept(job, end) for job, end in zip(plan.jobs, ends, strict=True)),
+        jobs=tuple(_swept(job, one) for job, one in zip(plan.jobs, records, strict=True)),
     )
 
 
-def _found(job: PlannedJob) -> Ended:
-    """What a job's folder says of it."""
-    record = last_record(job.folder, job.request.config_hash)
-    if record is None:
-        result = Result(status="failed", reason=NOT_RUN)
-        record = stamp(job.values, job.request.config_hash, result, time.time())
-    return Ended(head_of(record))
-
-
-def _swept(job: PlannedJob, end: Ended) -> SweptJob:
+def _swept(job: PlannedJob, record: Record | None) -> SweptJob:
     values: dict[str, Any] = job.values
     settings = values["filter"]
+    if record is None:
+        result = Result(status="failed", reason=NOT_RUN)
+        record = stamp(values, job.request.config_hash, result, time.time())
     return SweptJob(
         hash=job.short_hash,
         seed=values["seed"],
@@ -71,7 +63,6 @@ def _swept(job: PlannedJob, end: Ended) -> SweptJob:
         P0=settings["P0"],
         Q=settings["method"].get("Q", 0.0),
         R=settings["R"],
-        overhead=end.overhead,
         # One that was computed for another sweep has the factors of that.
-        record=end.record.model_copy(update={"factors": values["factors"]}),
+        record=record.model_copy(update={"factors": values["factors"]}),
     )

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 from uuid import uuid4
 
 from experiments.common.records.record import Record, stamp
@@ -72,20 +72,10 @@ class EngineSettings:
         return any((self.address, self.scheduler_file, self.cluster))
 
 
-class Ended(NamedTuple):
-    """How a job ended: the head of its record, and seconds spent neither simulating nor estimating.
-
-    The seconds are None for a job that was done before, or began with the start of its process.
-    """
-
-    record: Record
-    overhead: float | None = None
-
-
 def run_jobs(
     requests: Sequence[Request], settings: EngineSettings, at_a_time: int, asked_ns: int | None
-) -> Generator[tuple[int, Ended]]:
-    """Run jobs; yields the position of each and how it ended, as they end.
+) -> Generator[tuple[int, Record]]:
+    """Run jobs; yields the position of each and the head of its record, as they end.
 
     Closing the iterator early, as an interrupt does, ends the jobs that run; nothing is recorded
     of them.
@@ -129,10 +119,10 @@ _idle: dict[str, list[WorkerProcess]] = {}
 _busy: set[WorkerProcess] = set()
 
 
-def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -> Ended:
+def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -> Record:
     """Run a job, unless it is done, in a process that this one keeps for its jobs.
 
-    Whatever becomes of the job is in what is returned.
+    Whatever becomes of the job is in the head of a record that is returned.
     """
     idle = _idle.setdefault(str(Path.cwd()), [])
     try:
@@ -140,7 +130,6 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
     except IndexError:
         worker = new_worker()
     _busy.add(worker)
-    began, starts = time.monotonic(), not worker.runs
     try:
         record = run_apart(request, worker, asked_ns, at_a_time)
     except (MvestError, OSError) as error:
@@ -150,9 +139,7 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
     finally:
         _busy.remove(worker)
     idle.append(worker)
-    spent = time.monotonic() - began
-    measured = record.converged and not starts and record.seconds_total <= spent
-    return Ended(head_of(record), spent - computing(record) if measured else None)
+    return head_of(record)
 
 
 def stop_jobs() -> None:
@@ -161,17 +148,9 @@ def stop_jobs() -> None:
         worker.stop()
 
 
-def computing(record: Record) -> float:
-    """Seconds of a job that were spent simulating or estimating."""
-    told = record.numbers.get("seconds_computing")
-    spent = [told, *(one.seconds for one in record.estimates[:1])]
-    found = [one for one in spent if isinstance(one, int | float) and one]
-    return float(found[0]) if found else record.seconds_total
-
-
 def _on_dask(
     requests: Sequence[Request], settings: EngineSettings, asked_ns: int | None
-) -> Generator[tuple[int, Ended]]:
+) -> Generator[tuple[int, Record]]:
     import dask
     from distributed import as_completed
 
@@ -196,19 +175,19 @@ def _on_dask(
             batch_size=AT_ONCE,
         )
         places = {future.key: k for k, future in enumerate(futures)}
-        for future, ended in as_completed(futures, with_results=True, raise_errors=False):
+        for future, record in as_completed(futures, with_results=True, raise_errors=False):
             k = places[future.key]
             if future.status in ("cancelled", "lost"):
                 raise OSError("dask's scheduler is gone")
             if future.status == "error":
-                ended = Ended(head_of(_lost(requests[k], future.exception())))
+                record = head_of(_lost(requests[k], future.exception()))
             future.release()
-            yield k, ended
+            yield k, record
 
 
 def _execute_there(
     request: Request, *, directory: str, asked_ns: int | None, at_a_time: int
-) -> Ended:
+) -> Record:
     """Run a job in a worker of dask, from the folder in which its relative paths mean something."""
     os.chdir(directory)
     return execute(request, asked_ns, at_a_time)

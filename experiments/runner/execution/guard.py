@@ -43,11 +43,6 @@ class WorkerProcess:
         self._stopped = False
         atexit.register(self.close)
 
-    @property
-    def runs(self) -> bool:
-        """Whether the process is there, with all that it has imported."""
-        return self._program is not None
-
     def run(self, request: Request, at_a_time: int = 1, *, aloud: bool = False) -> str | None:
         """Run one job; None if it wrote its record, otherwise the reason why it did not.
 

@@ -14,7 +14,8 @@ from experiments.common.records.record import Record, stamp
 from experiments.common.records.writer import words_of, write_results
 from experiments.common.schema import build
 from experiments.common.study import Job, Results, Study, load_study
-from experiments.results.keep import arrays_of, publish
+from experiments.results.keep import arrays_of
+from experiments.results.publish import publish_run
 from experiments.runner.execution.check import require_checks, require_room
 from experiments.runner.execution.guard import run_apart
 from experiments.runner.jobs.folder import (
@@ -58,34 +59,40 @@ def run_job(request: Request) -> None:
         for check in require_checks(study, values):
             print(check(values, folder), flush=True)
         return
-    if values["time_limit_s"] is not None and usable_record(request) is None:
+    record = usable_record(request)
+    if record is not None:
+        source = record.provenance
+        _tell(study, record, folder)
+        print(
+            f"Done on {source.finished} by commit {(source.git.sha or 'unknown')[:12]}; "
+            "force=true runs it again"
+        )
+        study.finish(_job(study, request), record)
+    elif values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
         record = run_apart(request, aloud=True)
-        _raise_failure(record, folder)
-        _tell(study, record, folder)
-        return
-    with lock(folder):
-        done = usable_record(request)
-        if done is None:
-            make_way(request)
-            started = time.time()
-            try:
-                compute(request, values["memory_limit_gb"] or default_memory_gb())
-            except MemoryError as error:
-                _raise_failure(write_failure(request, str(error), started), folder)
-            return
-    source = done.provenance
-    _tell(study, done, folder)
-    print(
-        f"Done on {source.finished} by commit {(source.git.sha or 'unknown')[:12]}; "
-        "force=true runs it again"
-    )
-    _publish(study, request, done)
-    study.finish(_job(study, request), done)
+        if record.converged:
+            _tell(study, record, folder)
+    else:
+        with lock(folder):
+            record = usable_record(request) or _run_here(request)
+    publish_run(values, record, folder, request.publish_as)
+    if not record.converged:
+        detail = f" ({record.detail})" if record.detail else ""
+        raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")
 
 
-def compute(request: Request, memory_gb: float) -> None:
-    """Run a job in its folder, which is locked; its record and figures are then on disk.
+def _run_here(request: Request) -> Record:
+    make_way(request)
+    started = time.time()
+    try:
+        return compute(request, request.values["memory_limit_gb"] or default_memory_gb())
+    except MemoryError as error:
+        return write_failure(request, str(error), started)
+
+
+def compute(request: Request, memory_gb: float) -> Record:
+    """Run a job in its folder, which is locked; returns its record, which is then on disk.
 
     The record comes first. Where something after it cannot be written, the next run of the job
     writes that, and computes nothing again.
@@ -94,8 +101,6 @@ def compute(request: Request, memory_gb: float) -> None:
     ------
     MvestError
         If a setting is inadmissible or a file cannot be written.
-    FailedRunError
-        If the computation found no estimate; the run is recorded all the same.
     MemoryError
         If it needs more memory; the message states the limit.
     """
@@ -118,7 +123,7 @@ def compute(request: Request, memory_gb: float) -> None:
             # Whatever a library for figures or texts raises: the numbers are not lost with it.
             missing = UNWRITTEN.format(request.folder)
             raise InputError(f"{reason_of(error)}; {missing}") from error
-        _raise_failure(record, request.folder)
+        return record
 
 
 def answer(request: Request, memory_gb: float) -> dict[str, Any]:
@@ -128,8 +133,6 @@ def answer(request: Request, memory_gb: float) -> dict[str, Any]:
     """
     try:
         compute(request, memory_gb)
-    except FailedRunError:
-        pass  # it is recorded
     except Exception as error:
         # Whatever it is costs its own job; the traceback is in the log.
         traceback.print_exception(error, file=sys.stdout)
@@ -170,7 +173,6 @@ def _write_out(study: Study[Any], request: Request, record: Record) -> None:
         if study.files is not None:
             study.files(folder, record)
     _tell(study, record, folder)
-    _publish(study, request, record)
     if record.converged:
         mark_done(folder)
 
@@ -186,23 +188,3 @@ def _tell(study: Study[Any], record: Record, folder: Path) -> None:
 def _job(study: Study[Any], request: Request) -> Job[Any]:
     settings = build(study.settings, request.values)
     return Job(request.values, settings, request.folder, request.config_hash)
-
-
-def _publish(study: Study[Any], request: Request, record: Record) -> None:
-    """Let the results take over a run of an experiment as it is configured."""
-    values = request.values
-    kept = record.converged or study.keeps_failures
-    if not values["publish"] or values["sweep"] or not kept:
-        return
-    results = Path(values["paths"]["results"])
-    if request.publish_as is None:
-        print(f"{results} left as it is: this run has overrides")
-        return
-    publish(study, results, {request.publish_as: (record, request.folder)})
-    print(f"Results in {results}")
-
-
-def _raise_failure(record: Record, folder: Path) -> None:
-    if not record.converged:
-        detail = f" ({record.detail})" if record.detail else ""
-        raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from experiments.common.config import hash_of, is_hashed, plain, require_in_range
+from experiments.common.config import hash_of, plain, require_in_range
+from experiments.results.publish import publish_as
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,28 +65,3 @@ class Request:
         """Plain data."""
         data = {field.name: getattr(self, field.name) for field in fields(self)}
         return {**data, "folder": str(self.folder)}
-
-
-def publish_as(
-    values: Mapping[str, Any], overrides: Sequence[str], swept: Mapping[str, Any] | None
-) -> str | None:
-    """Name of a run's record in the results; None where they are not to be touched.
-
-    ``swept`` is what the experiment itself varies (empty: nothing) if this is one run of several.
-    """
-    # A sweep is published as a whole.
-    published = values["publish"] and not values["sweep"]
-    if not published or not as_published(overrides, swept, values["study"]):
-        return None
-    if swept is None:
-        return str(values["name"])
-    return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
-
-
-def as_published(
-    overrides: Sequence[str], swept: Mapping[str, Any] | None, study: str | None
-) -> bool:
-    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
-    allowed = {"experiment", "hydra", *(swept or {})}
-    keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
-    return all({key, key.partition(".")[0]} & allowed or not is_hashed(key, study) for key in keys)

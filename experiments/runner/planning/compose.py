@@ -22,10 +22,10 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from experiments.common.config import hash_of, plain
-from experiments.runner.jobs.folder import last_record
+from experiments.results.publish import as_configured, publish_as
 from experiments.runner.jobs.limits import TIME_LIMIT_S
-from experiments.runner.jobs.request import Request, as_published, publish_as
-from experiments.runner.planning.plan import Attempt, Plan, PlannedJob
+from experiments.runner.jobs.request import Request
+from experiments.runner.planning.plan import Plan, PlannedJob
 from mvest.errors import ConfigurationError
 
 HASH_DIGITS = 16
@@ -116,7 +116,7 @@ def make_plan(
         folder = Path(str(composed.hydra.sweep.dir)) / subdir
         published = publish_as(values, overrides, swept)
         planned.append(
-            planned_job(Request(values, config_hash, folder, published, tuple(overrides)))
+            PlannedJob.of(Request(values, config_hash, folder, published, tuple(overrides)))
         )
     sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
@@ -125,18 +125,8 @@ def make_plan(
         sweep=sweep,
         jobs=tuple(planned),
         workers=_workers(config),
-        publish=_as_configured(config) if config.publish and sweep else None,
+        publish=as_configured(config) if config.publish and sweep else None,
     )
-
-
-def planned_job(request: Request) -> PlannedJob:
-    """A job with what its folder says of earlier attempts."""
-    record = last_record(request.folder, request.config_hash)
-    if record is None:
-        return PlannedJob(request)
-    # Of ten thousand records no more than is asked of them again.
-    attempt = Attempt(record.reason, record.provenance.git.sha, record.seconds_total)
-    return PlannedJob(request, attempt, record.converged)
 
 
 def _grids(config: DictConfig) -> list[dict[str, Any]]:
@@ -221,14 +211,6 @@ def _factor(override: Override) -> Any:
 def _same(one: Any, other: Any) -> bool:
     """Whether they are written alike; 1 and 1.0 are not."""
     return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
-
-
-def _as_configured(config: DictConfig) -> bool:
-    """Whether a sweep is run as it is published: nothing but its size is chosen."""
-    task = config.hydra.overrides.task
-    changed = [line for line in task if line.startswith("sweep.")]
-    sized = all(line.startswith("sweep.size=") for line in changed)
-    return sized and as_published(task, None, config.study)
 
 
 def _workers(config: DictConfig) -> int:

@@ -13,10 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 from experiments.common.progress import duration
+from experiments.common.records.record import Record
+from experiments.runner.jobs.folder import last_record
 from experiments.runner.jobs.request import Request
+from experiments.sweeps.collected import head_of
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import git_state, write_json
 from mvest.reading.documents import read_mapping
@@ -26,14 +29,6 @@ PLAN = "plan.json"
 """File in a sweep's folder with the jobs that it consists of."""
 
 
-class Attempt(NamedTuple):
-    """What an earlier attempt at a job ended with, the commit that computed it, and its seconds."""
-
-    reason: str
-    commit: str | None
-    seconds: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedJob:
     """One job of a sweep.
@@ -41,14 +36,23 @@ class PlannedJob:
     Attributes
     ----------
     request : Request
-    attempt : Attempt or None
-        An earlier one.
-    done : bool
+    before : Record or None
+        Head of the record of an earlier attempt.
     """
 
     request: Request
-    attempt: Attempt | None = None
-    done: bool = False
+    before: Record | None = None
+
+    @classmethod
+    def of(cls, request: Request) -> PlannedJob:
+        """A job with what its folder says of an earlier attempt."""
+        record = last_record(request.folder, request.config_hash)
+        return cls(request, None if record is None else head_of(record))
+
+    @property
+    def done(self) -> bool:
+        """Whether it has a result."""
+        return self.before is not None and self.before.converged
 
     @property
     def values(self) -> dict[str, Any]:
@@ -182,8 +186,8 @@ class Plan:
         return replace(self, written_ns=(self.folder / PLAN).stat().st_mtime_ns)
 
     @classmethod
-    def read(cls, folder: Path) -> Plan:
-        """The plan in a sweep's folder, its jobs as if none had been run.
+    def read(cls, folder: Path, *, look: bool = True) -> Plan:
+        """The plan in a sweep's folder; unless it is to ``look``, as if no job had been run.
 
         The process then works where the sweep was planned.
 
@@ -202,18 +206,17 @@ class Plan:
                 raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
             os.chdir(directory)
             first = data["values"]
-            jobs = tuple(
-                PlannedJob(
-                    Request(
-                        {k: v for k, v in first.items() if k not in job["without"]} | job["values"],
-                        job["config_hash"],
-                        place.parent / job["folder"],
-                        job["publish_as"],
-                        tuple(job["overrides"]),
-                    )
+            requests = [
+                Request(
+                    {k: v for k, v in first.items() if k not in job["without"]} | job["values"],
+                    job["config_hash"],
+                    place.parent / job["folder"],
+                    job["publish_as"],
+                    tuple(job["overrides"]),
                 )
                 for job in data["jobs"]
-            )
+            ]
+            jobs = tuple(map(PlannedJob.of if look else PlannedJob, requests))
             written = place.stat().st_mtime_ns
             settings, publish = data["settings"], data["publish"]
             return cls(data["name"], place.parent, settings, jobs, 1, publish, written)
@@ -241,7 +244,7 @@ class Plan:
     def summary(self) -> str:
         """How much is done and how much is left, in one line."""
         left, done = self.to_run, sum(job.done for job in self.jobs)
-        failed = sum(job.attempt is not None and not job.done for job in self.jobs)
+        failed = sum(job.before is not None and not job.done for job in self.jobs)
         size = f" ({self.sweep['size']})" if "size" in self.sweep else ""
         text = f"{self.name}{size}: {len(self.jobs)} jobs, {done} done, {failed} failed before, "
         return f"{text}{len(left)} to run{self._stale()}; {self.estimate()}"
@@ -251,14 +254,14 @@ class Plan:
         return "\n".join(
             f"  {'run ' if job.to_run else 'done'}  {job.short_hash}  "
             f"{job.label}"
-            + (f"  [failed before: {job.attempt.reason}]" if job.attempt and not job.done else "")
+            + (f"  [failed before: {job.before.reason}]" if job.before and not job.done else "")
             for job in self.jobs
         )
 
     def estimate(self) -> str:
         """How long the jobs that are left will take, from those that were done before."""
         left = len(self.to_run)
-        spent = [job.attempt.seconds for job in self.jobs if job.done and job.attempt]
+        spent = [job.before.seconds_total for job in self.jobs if job.before and job.done]
         if not left or not spent:
             return "time unknown: no job has finished yet" if left else "nothing left"
         total = duration(fmean(spent) * left / min(self.workers, left))
@@ -267,7 +270,7 @@ class Plan:
     def _stale(self) -> str:
         """A remark on results that other code than the present one computed."""
         present = git_state(Path(__file__).resolve().parent)["sha"]
-        commits = [job.attempt.commit for job in self.jobs if job.done and job.attempt]
+        commits = [job.before.provenance.git.sha for job in self.jobs if job.before and job.done]
         other = sum(sha != present for sha in commits)
         return f" ({other} of the done ones by another commit; force=true redoes)" if other else ""
 
