@@ -51,6 +51,14 @@ def test_one_module_starts_what_computes():
     assert found == MAY_START
 
 
+def test_one_helper_says_how_python_is_started():
+    # What is started otherwise would import from the folder where a command is typed. The mesher is
+    # a file that is started with -P, and a second model a file of the user's.
+    places = [*(ROOT / "mvest").rglob("*.py"), *(ROOT / "experiments").rglob("*.py")]
+    found = {path.name for path in places if "sys.executable" in path.read_text(encoding="utf-8")}
+    assert found == {"processes.py", "tetwild.py", "external.py"}
+
+
 @pytest.mark.parametrize(
     ("code", "status"),
     [("exit 0", 0), ("exit 7", 7), ("kill -SEGV $$", -11), ("kill -KILL $$", -9)],

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import ParamSpec
 
@@ -119,7 +119,8 @@ def interruptible(command: Callable[P, int]) -> Callable[P, int]:
                 return status
             except BrokenPipeError:
                 # Whoever reads the output has seen enough, as `head` does.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                with suppress(OSError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 return 128 + signal.SIGPIPE
             except (MvestError, OSError) as error:
                 if TRACEBACKS in os.environ:

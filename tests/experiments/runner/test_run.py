@@ -317,7 +317,7 @@ def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
     assert status == 0
     assert "force=true runs it again" in out
     overrides = (tmp_path / "here" / ".hydra" / "overrides.yaml").read_text()
-    assert yaml.safe_load(overrides) == [*usual[:3], "force=true"]
+    assert yaml.safe_load(overrides) == [*usual[:3]]
 
 
 FAILURES = {
@@ -325,7 +325,6 @@ FAILURES = {
     "table": ("pandas.DataFrame.to_csv", RuntimeError("quotes\nare open")),
     "page": ("mvest.reporting.tables.markdown_rows", KeyError("name")),
     "words": ("mvest.reporting.tables.Table.text", "a\ud800".encode),
-    "results": ("experiments.runner.execution.job._publish", InputError("records are damaged")),
     "marker": (
         "experiments.runner.execution.job.mark_done",
         OSError(28, "No space left on device"),
@@ -365,6 +364,25 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
     assert (tmp_path / "here" / "result.json").read_bytes() == computed
     assert (tmp_path / "here" / "done").exists()
     assert {"debug.csv", "debug.md", "debug.png"} <= {p.name for p in (tmp_path / "here").iterdir()}
+
+
+def test_results_that_could_not_be_renewed_are_renewed_by_the_same_command(
+    run, instead_of_closing, monkeypatch
+) -> None:
+    instead_of_closing(shrinking)
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false", "publish=true")
+
+    def damaged(*_):
+        raise InputError("records are damaged")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("experiments.results.publish.publish", damaged)
+        status, _, err = run(*usual)
+    assert (status, err.splitlines()[-1]) == (2, "error: records are damaged")
+    status, out, _ = run(*usual)
+    assert status == 0
+    assert "force=true runs it again" in out
+    assert Path("outputs/results/debug.csv").exists()
 
 
 def test_another_configurations_result_in_the_folder_is_not_taken(run, instead_of_closing) -> None:
