@@ -370,7 +370,7 @@ def test_results_that_could_not_be_renewed_are_renewed_by_the_same_command(
     run, instead_of_closing, monkeypatch
 ) -> None:
     instead_of_closing(shrinking)
-    usual = ("experiment=debug", "tracking.enabled=false", "measure=false", "publish=true")
+    usual = ("experiment=table1", "tracking.enabled=false", "mesh=quick", "hydra.run.dir=here")
 
     def damaged(*_):
         raise InputError("records are damaged")

@@ -169,7 +169,10 @@ def test_a_killed_shard_loses_the_job_in_flight_and_a_second_one_finishes(planne
     done = {path: path.stat().st_mtime_ns for path in FOLDER.glob("*/done")}
     assert len(done) == 3, "seeds 0, 2 and 4 are kept"
     assert cli.main(["collect", str(FOLDER)]) == 1
-    assert "3 of 12 jobs done (3 before), 0 without an estimate, 9 not finished" in capsys.readouterr().out
+    assert (
+        "3 of 12 jobs done (3 before), 0 without an estimate, 9 not finished"
+        in capsys.readouterr().out
+    )
 
     Path("wait-6").unlink()
     shards = [mvest("worker", str(FOLDER), "--shard", f"{k}/2") for k in (1, 2)]
