@@ -30,7 +30,7 @@ from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import THREAD_VARIABLES, sealed, write_json
 from tests.places import ROOT
-from tests.processes import until
+from tests.processes import alive, gone, until
 
 OBEDIENT = """
 import json, os, sys, time
@@ -338,15 +338,9 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     while not (place.exists() and place.read_text()):
         assert parent.poll() is None
         time.sleep(0.05)
-    child = Path("/proc") / place.read_text() / "stat"
     parent.kill()
     parent.wait()
-    for _ in range(600):
-        if not child.exists() or child.read_text().split(") ")[1][0] == "Z":
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("the process outlived the one that started it")
+    assert gone(tmp_path, 30.0), alive(tmp_path)
 
 
 @pytest.mark.parametrize(
