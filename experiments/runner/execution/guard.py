@@ -19,7 +19,7 @@ from experiments.common.records.record import Record
 from experiments.runner.jobs import folder as jobs
 from experiments.runner.jobs.limits import default_memory_gb
 from experiments.runner.jobs.request import Request
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.processes import Program, ending, environment, python
 from mvest.provenance import THREAD_VARIABLES
 
@@ -51,13 +51,13 @@ class WorkerProcess:
         """
         if self._program is not None and self._program.process.poll() is not None:
             self.close()
-        program = self._program = self._program or Program(
-            self._command,
-            stdin=PIPE,
-            stdout=PIPE,
-            encoding="utf-8",
-            env=environment(**dict.fromkeys(THREAD_VARIABLES, "1")),
-        )
+        streams = {"stdin": PIPE, "stdout": PIPE, "encoding": "utf-8"}
+        one_thread = environment(**dict.fromkeys(THREAD_VARIABLES, "1"))
+        try:
+            self._program = self._program or Program(self._command, env=one_thread, **streams)
+        except OSError as error:
+            raise InputError(f"no process for {request.folder}: {error.strerror}") from error
+        program = self._program
         if self._stopped:
             self.close()
             raise StoppedError

@@ -16,7 +16,7 @@ import pytest
 
 from experiments.common.records.record import VERSION, Record, stamp, write_record
 from experiments.common.study import Result
-from experiments.runner.execution import job
+from experiments.runner.execution import guard, job
 from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.jobs.folder import (
     FailedRunError,
@@ -30,7 +30,7 @@ from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import THREAD_VARIABLES, sealed, write_json
 from tests.places import ROOT
-from tests.processes import until
+from tests.processes import alive, gone, until
 
 OBEDIENT = """
 import json, os, sys, time
@@ -173,6 +173,16 @@ def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypa
         monkeypatch.setenv(name, "7")
     worker.run(request(tmp_path))
     assert said(tmp_path)["threads"] == "1"
+
+
+def test_a_process_that_cannot_be_started_is_one_clear_line(worker, tmp_path, monkeypatch):
+    def fails(*_, **__):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(guard, "Program", fails)
+    with pytest.raises(InputError) as refused:
+        run_apart(request(tmp_path), worker)
+    assert str(refused.value) == f"no process for {tmp_path}: Too many open files"
 
 
 def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
@@ -328,15 +338,9 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     while not (place.exists() and place.read_text()):
         assert parent.poll() is None
         time.sleep(0.05)
-    child = Path("/proc") / place.read_text() / "stat"
     parent.kill()
     parent.wait()
-    for _ in range(600):
-        if not child.exists() or child.read_text().split(") ")[1][0] == "Z":
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("the process outlived the one that started it")
+    assert gone(tmp_path, 30.0), alive(tmp_path)
 
 
 @pytest.mark.parametrize(
