@@ -370,7 +370,8 @@ def test_results_that_could_not_be_renewed_are_renewed_by_the_same_command(
     run, instead_of_closing, monkeypatch
 ) -> None:
     instead_of_closing(shrinking)
-    usual = ("experiment=table1", "tracking.enabled=false", "mesh=quick", "hydra.run.dir=here")
+    elsewhere = ("tracking.enabled=false", "paths.results=published", "hydra.run.dir=here")
+    usual = ("experiment=table1", *elsewhere)
 
     def damaged(*_):
         raise InputError("records are damaged")
@@ -382,7 +383,7 @@ def test_results_that_could_not_be_renewed_are_renewed_by_the_same_command(
     status, out, _ = run(*usual)
     assert status == 0
     assert "force=true runs it again" in out
-    assert Path("outputs/results/debug.csv").exists()
+    assert Path("published/table1.csv").exists()
 
 
 def test_another_configurations_result_in_the_folder_is_not_taken(run, instead_of_closing) -> None:
