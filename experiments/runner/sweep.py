@@ -22,7 +22,8 @@ from experiments.results.estimates import sweep_table
 from experiments.results.publish import publish_runs, publish_sweep
 from experiments.runner.collecting.collect import NOT_RUN, collect
 from experiments.runner.execution.check import require_admissible
-from experiments.runner.execution.engine import EngineSettings, require_engine, run_jobs
+from experiments.runner.execution.cluster import EngineSettings, require_engine
+from experiments.runner.execution.engine import run_jobs
 from experiments.runner.jobs.folder import (
     FailedRunError,
     last_record,
@@ -88,7 +89,8 @@ class SweepRun:
         settings = build(EngineSettings, launcher)
         require_engine(settings)
         batch = make_plan(config, self._loader, overrides, first)
-        if str(config.hydra.runtime.choices["hydra/sweeper"]) in GIVEN_ONCE:
+        all_at_once = str(config.hydra.runtime.choices["hydra/sweeper"]) in GIVEN_ONCE
+        if all_at_once:
             batch.require_different()
         for job in batch.jobs:
             _check(job)
@@ -112,8 +114,9 @@ class SweepRun:
         self._run(plan, batch, settings)
         found = {job.hash: job.record for job in finish(plan, self._ended).jobs}
         returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
-        # Of ten thousand jobs not kept while they are logged.
-        self._ended, found = {}, {}
+        if all_at_once:
+            # Ten thousand records are not kept while they are logged.
+            self._ended, found = {}, {}
         log_sweep(plan.folder, plan.common)
         return returned
 

@@ -1,0 +1,252 @@
+"""Dask clusters as places for jobs: one that runs already, or one made for a sweep.
+
+Dask places jobs, waits, adds and removes workers, and runs the job of a lost worker again on
+another one. What a job does to its own process is not dask's business: `engine.execute` sees to it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from uuid import uuid4
+
+from experiments.common.records.record import Record
+from experiments.runner.jobs.folder import require_writable, write_failure
+from experiments.runner.jobs.request import Request
+from mvest.errors import ConfigurationError
+from mvest.processes import environment
+from mvest.quantities import within
+from mvest.reading.text import one_line
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Execute = Callable[[Request, int | None, int], Record]
+
+LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
+"""Dask's cluster of this machine, and where it listens."""
+
+DASK = {
+    # Jobs take minutes: none waits at a worker that is busy.
+    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.comm.timeouts.connect": "60s",
+    # The memory of a job is held where the job runs.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+}
+"""Settings of dask for jobs in processes of their own."""
+
+AT_ONCE = 500
+"""Jobs that are sent to dask's scheduler in one message."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineSettings:
+    """Who runs the jobs of a sweep; ``conf/hydra/launcher/jobs.yaml`` says what each means."""
+
+    n_jobs: Annotated[int, within(-1024, 1024, "", "jobs; -1: one for each core")] = -1
+    address: str | None = None
+    scheduler_file: str | None = None
+    tls: dict[str, str] | None = None
+    cluster: str | None = None
+    options: dict[str, Any] | None = None
+    jobs: Annotated[int, within(1, 100_000, "", "workers")] = 1
+    adapt: bool = False
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether dask runs the jobs."""
+        return any((self.address, self.scheduler_file, self.cluster))
+
+
+def run_on_dask(
+    execute: Execute,
+    stop: Callable[[], None],
+    requests: Sequence[Request],
+    settings: EngineSettings,
+    asked_ns: int | None,
+) -> Generator[tuple[int, Record]]:
+    """Run jobs as `engine.run_jobs` does, by ``execute`` on the workers of a cluster.
+
+    What ``stop`` does on each worker of a cluster of its own ends the jobs that run there.
+    """
+    import dask
+    from distributed import as_completed
+
+    for name in list(logging.root.manager.loggerDict):
+        if name.startswith(("distributed", "asyncio", "tornado")):
+            # What matters of what they have to say is said here, in a line.
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    own = requests[0].folder.resolve().parent / "dask"
+    with dask.config.set(DASK), _client(settings, own, stop) as client:
+        # One call and keys of one group: only then do jobs wait at the scheduler, and not at a
+        # worker that may be lost. Other sweeps at the same scheduler have other keys.
+        group = f"job-{uuid4().hex}"
+        futures = client.map(
+            _there,
+            requests,
+            execute=execute,
+            directory=str(Path.cwd()),
+            asked_ns=asked_ns,
+            at_a_time=settings.jobs if settings.cluster == LOCAL else 1,
+            key=[(group, k) for k in range(len(requests))],
+            pure=False,
+            batch_size=AT_ONCE,
+        )
+        places = {future.key: k for k, future in enumerate(futures)}
+        for future, record in as_completed(futures, with_results=True, raise_errors=False):
+            k = places[future.key]
+            if future.status in ("cancelled", "lost"):
+                raise OSError("dask's scheduler is gone")
+            if future.status == "error":
+                record = _lost(requests[k], future.exception())
+            future.release()
+            yield k, record
+
+
+def _there(
+    request: Request, *, execute: Execute, directory: str, asked_ns: int | None, at_a_time: int
+) -> Record:
+    """Run a job in a worker of dask, from the folder in which its relative paths mean something."""
+    os.chdir(directory)
+    return execute(request, asked_ns, at_a_time)
+
+
+def _lost(request: Request, error: BaseException) -> Record:
+    """The record of a job whose workers were lost again and again."""
+    reason = f"dask gave the job up: {type(error).__name__}: {error}"
+    require_writable(request.folder)
+    return write_failure(request, reason, time.time())
+
+
+@contextmanager
+def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) -> Iterator[Client]:
+    """A client of the scheduler that is named, or of a cluster that ends with it.
+
+    The cluster's logs and certificates are in ``folder``.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none.
+    """
+    from distributed import Client, Security
+
+    with ExitStack() as stack:
+        try:
+            where: Any = settings.address
+            secure = None
+            if settings.tls:
+                secure = Security(
+                    require_encryption=True,
+                    tls_ca_file=settings.tls["ca_file"],
+                    tls_client_cert=settings.tls["cert"],
+                    tls_client_key=settings.tls["key"],
+                )
+            if settings.cluster is not None:
+                where = _cluster(settings.cluster, settings.options or {}, folder)
+                stack.callback(_close, where)
+                where.scale(1 if settings.adapt else settings.jobs)
+                where.sync(where._correct_state)
+                for worker in where.workers.values():
+                    if worker.status.name == "created":
+                        # It could not be submitted; asked again, its queue says why.
+                        where.sync(worker.start)
+                if settings.adapt:
+                    where.adapt(minimum=0, maximum=settings.jobs)
+            client = stack.enter_context(
+                Client(where, scheduler_file=settings.scheduler_file, security=secure)
+            )
+        except (OSError, RuntimeError, ValueError, TypeError, KeyError, ImportError) as error:
+            name = settings.cluster or settings.address or settings.scheduler_file
+            why = one_line(error, 300)
+            raise ConfigurationError(f"hydra.launcher: no cluster {name}: {why}") from error
+        try:
+            yield client
+        except BaseException:
+            if settings.cluster is not None:
+                # Its workers would wait for their jobs.
+                client.run(stop)
+            raise
+
+
+def _close(cluster: Any) -> None:
+    # Of workers that were never submitted it finds that they are not closed, last of all.
+    with suppress(AssertionError):
+        cluster.close()
+    cluster.shutdown_on_close = False
+
+
+def require_engine(settings: EngineSettings) -> None:
+    """Refuse a cluster of which nobody knows, or for which nothing is installed.
+
+    Raises
+    ------
+    ConfigurationError
+        One line.
+    """
+    if settings.elsewhere:
+        try:
+            import distributed  # noqa: F401
+
+            kinds = _kinds() if settings.cluster not in (None, LOCAL) else {}
+        except ImportError as error:
+            raise ConfigurationError(
+                f"hydra.launcher: a cluster needs dask ({error}): pip install 'mvest[cluster]'"
+            ) from error
+        if kinds and settings.cluster not in kinds:
+            raise ConfigurationError(
+                f"hydra.launcher.cluster = {settings.cluster}, expected {LOCAL}, "
+                f"{', '.join(sorted(kinds))}"
+            )
+
+
+def _kinds() -> dict[str, Any]:
+    """Name -> class of each cluster that dask_jobqueue knows."""
+    import dask_jobqueue
+
+    return {name: kind for name, kind in vars(dask_jobqueue).items() if name.endswith("Cluster")}
+
+
+def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
+    """A cluster whose connections are encrypted, or stay on this machine."""
+    if name == LOCAL:
+        from distributed import LocalCluster
+
+        own = {
+            "n_workers": 0,
+            "threads_per_worker": 1,
+            "host": LOOPBACK,
+            "dashboard_address": f"{LOOPBACK}:0",
+            "worker_dashboard_address": f"{LOOPBACK}:0",
+            "memory_limit": None,
+        }
+        return LocalCluster(**{**own, **options})
+    own = {
+        "cores": 1,
+        "processes": 1,
+        "memory": "4GB",
+        "python": f"{shlex.quote(sys.executable)} -P",
+        "nanny": False,
+        # Certificates for this one cluster, in a folder that its nodes share.
+        "security": True,
+        "shared_temp_directory": str(folder),
+        "log_directory": str(folder),
+        "protocol": "tls://",
+        "scheduler_options": {"dashboard_address": f"{LOOPBACK}:0"},
+        "worker_extra_args": ["--no-dashboard", "--dashboard-address", f"{LOOPBACK}:0"],
+    }
+    folder.mkdir(mode=0o700, exist_ok=True)
+    prologue = [f"export PYTHONPATH={shlex.quote(environment()['PYTHONPATH'])}"]
+    prologue += options.get("job_script_prologue", ())
+    return _kinds()[name](**{**own, **options, "job_script_prologue": prologue})
