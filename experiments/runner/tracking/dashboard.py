@@ -102,7 +102,7 @@ def serving(
     command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     hosts = allowed_hosts(port)
     command += ["--allowed-hosts", ",".join(hosts)]
-    command += ["--cors-allowed-origins", ",".join(f"http://{host}" for host in hosts)]
+    command += ["--cors-allowed-origins", ",".join("http://" + host for host in hosts)]
     # Whatever the login shell has set: nobody else is let in.
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
     out = subprocess.DEVNULL if quiet else None
@@ -120,7 +120,7 @@ def serving(
             time.sleep(0.2)
         else:
             raise InputError(f"MLflow's server at port {port} did not start")
-        yield f"http://{HOST}:{port}", server.process
+        yield "http://" + f"{HOST}:{port}", server.process
 
 
 def allowed_hosts(port: int) -> list[str]:

@@ -6,13 +6,12 @@ another result is replaced, a missing one is added, at any time.
 
 from __future__ import annotations
 
-import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
@@ -29,9 +28,6 @@ from mvest.errors import MvestError
 from mvest.files import sha256_of
 from mvest.reading.documents import read_mapping
 
-if TYPE_CHECKING:
-    from mlflow.entities import Run
-
 Values = Mapping[str, Any]
 
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
@@ -45,9 +41,6 @@ MANY = 1000
 
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
-
-NAMED_ELSEWHERE = {"experiment", "hydra", "launcher", "name", "sweep"}
-"""Typed words that choose what is run and by whom."""
 
 HANDFUL = (
     "study", "valve.folder_sha256", "mesh.source", "mechanics.element", "filter.mode",
@@ -116,31 +109,28 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     else:
         plan = {"jobs": [{"folder": "", "overrides": _typed(folder), "factors": {}}]}
     each = len(plan["jobs"]) <= MANY if tracking.get("runs") is None else tracking["runs"]
-    words = {word.partition("=")[0]: "" for job in plan["jobs"] for word in job["overrides"]}
-    entries, settings, rows, factors = [], [], [], []
+    typed = [
+        word.lstrip("+~").partition("=")[0] for job in plan["jobs"] for word in job["overrides"]
+    ]
+    words = dict.fromkeys(word for word in typed if word != "name")
+    entries, rows, factors = [], [], []
     for job in plan["jobs"]:
         place = folder / job["folder"]
         try:
             if (place / RESULT).is_file():
                 own = read_mapping(place / CONFIG)
                 entries.append(_job(place, job.get("name")) if each else None)
-                settings.append(typed([*words, *job["overrides"], *HANDFUL], own))
-                rows.append(columns(settings[-1], own["parameters"]))
-                factors.append(columns(job["factors"], own["parameters"]))
+                rows.append(columns(own, words))
+                factors.append(leaves(job["factors"], own["parameters"]))
         except MvestError as error:
             counts["left"] += _left_out(place, error)
     with opened(tracking["uri"], outputs, name):
         known = runs_of(name, "" if is_sweep else f"tags.folder = '{folder.resolve().name}'")
-        parent = None
+        parent, shown = None, zip(entries, varied(rows, factors), strict=True)
         if is_sweep:
-            texts = [(key, _text(value)) for row in settings for key, value in row.items()]
-            swept = {key: dict.fromkeys(v for k, v in texts if k == key) for key, _ in texts}
-            whole = {key: ",".join(values) for key, values in swept.items()}
-            parent, done = _put(_sweep(folder, plan), whole, known)
+            parent, done = _put(_sweep(folder, plan), _together(rows, words), known)
             counts[done] += 1
-        for entry, row in zip(
-            tqdm(entries, disable=None, leave=False), varied(rows, factors), strict=True
-        ):
+        for entry, row in tqdm(list(shown), "to MLflow", disable=None, leave=False):
             if entry is not None:
                 counts[_put(entry, row, known, parent)[1]] += 1
     return counts
@@ -154,41 +144,35 @@ def _typed(folder: Path) -> list[str]:
     return list(known.overrides.task) if known and known.runtime.output_dir == str(folder) else []
 
 
-def typed(words: Iterable[str], config: Values) -> dict[str, Any]:
-    """Typed settings (``NAME=VALUE``) that can change a result, with their values in a run.
+def columns(config: Values, words: Iterable[str]) -> dict[str, Any]:
+    """The settings of a run that were typed, and the handful: a column for each value.
 
-    Values are those of the configuration beside the result, where no file is named: such a name
-    must not reach a store. Of a group (``mesh=coarse``) the value is what was chosen.
+    Parameters
+    ----------
+    config : mapping
+        As it lies beside the result: without a name of a file, which must not reach a store.
+    words : iterable of str
+        Dotted names; of one that has settings below it all are meant.
     """
+    chosen = tuple(f"{word.replace('/', '.')}." for word in (*words, *HANDFUL))
+    return {
+        name: value
+        for name, value in leaves(config, config["parameters"]).items()
+        if f"{name}.".startswith(chosen) and is_hashed(name, config["study"])
+    }
+
+
+def leaves(value: Any, parameters: Sequence[str], name: str = "") -> dict[str, Any]:
+    """Single values by dotted names; of a list by its parameters, of a matrix the diagonal."""
+    if isinstance(value, list):
+        names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
+        diagonal = (item[k] if isinstance(item, list) else item for k, item in enumerate(value))
+        value = dict(zip(names, diagonal, strict=True))
+    if not isinstance(value, Mapping):
+        return {} if value in (None, "") else {name: value}
     found: dict[str, Any] = {}
-    for word in words:
-        name, _, text = word.lstrip("+~").partition("=")
-        first, *rest = re.split(r"[./]", name)
-        value: Any = config.get(first)
-        for key in rest:
-            value = value.get(key) if isinstance(value, Mapping) else None
-        if isinstance(value, Mapping):
-            value = text if re.fullmatch(r"[\w -]+", text) else None
-        if value not in (None, "") and first not in NAMED_ELSEWHERE:
-            found |= {name: value} if is_hashed(name, config["study"]) else {}
-    return found
-
-
-def columns(settings: Values, parameters: Sequence[str]) -> dict[str, Any]:
-    """Settings by dotted names; a list has a column for each value, of a matrix the diagonal.
-
-    Where it has a value for each parameter they name its columns (``filter.initial.anterior``).
-    """
-    found: dict[str, Any] = {}
-    for name, value in settings.items():
-        if isinstance(value, list):
-            names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
-            diagonal = (item[k] if isinstance(item, list) else item for k, item in enumerate(value))
-            value = dict(zip(names, diagonal, strict=True))
-        if isinstance(value, Mapping):
-            found |= columns({f"{name}.{key}": item for key, item in value.items()}, parameters)
-        elif value not in (None, ""):
-            found[name] = value
+    for key, item in value.items():
+        found |= leaves(item, parameters, f"{name}.{key}" if name else str(key))
     return found
 
 
@@ -202,6 +186,18 @@ def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, 
             if shown and (source is rows or values not in kept.values()):
                 kept[name] = values
     return [{name: values[k] for name, values in kept.items()} for k in range(len(rows))]
+
+
+def _together(rows: Sequence[Values], words: Iterable[str]) -> dict[str, str]:
+    """The values that typed settings have in a sweep, as they are typed: ``[5,3],[4,2]``."""
+    found: dict[str, dict[str, None]] = {}
+    for row in rows:
+        for word in (*words, *HANDFUL):
+            own = [_text(value) for name, value in row.items() if f"{name}.".startswith(f"{word}.")]
+            if own:
+                text = own[0] if word in row else f"[{','.join(own)}]"
+                found.setdefault(word, {})[text] = None
+    return {word: ",".join(texts) for word, texts in found.items()}
 
 
 def _job(folder: Path, name: str | None) -> _Entry | None:
@@ -223,10 +219,7 @@ def _job(folder: Path, name: str | None) -> _Entry | None:
 def _sweep(folder: Path, plan: Values) -> _Entry:
     """A whole sweep, with its totals."""
     result, totals = folder / PLAN, {"jobs": float(len(plan["jobs"]))}
-    tags, name = (
-        {"sweep_id": plan["sweep_id"], "kind": "sweep"},
-        f"sweep of {len(plan['jobs'])} jobs",
-    )
+    name, tags = f"sweep of {len(plan['jobs'])} jobs", {"sweep_id": plan["sweep_id"]}
     if (folder / SWEEP).is_file():
         result, sweep = folder / SWEEP, read_sweep(folder / SWEEP)
         means = [one for record in sweep.records if (one := metrics(record)[0].get("error.mean"))]
@@ -238,7 +231,7 @@ def _sweep(folder: Path, plan: Values) -> _Entry:
 
 
 def _put(
-    entry: _Entry, parameters: Values, known: Sequence[Run], parent: str | None = None
+    entry: _Entry, parameters: Values, known: Sequence[Any], parent: str | None = None
 ) -> tuple[str, str]:
     """Bring one run to the state of an entry; its id, and whether it was added."""
     import mlflow
@@ -266,9 +259,8 @@ def _put(
                     mlflow.log_artifact(str(path))
         # Its duration is that of the computation; the hash comes last and says that it is whole.
         run_id, end = run.info.run_id, run.info.start_time + int(1000 * seconds)
-        client.set_terminated(
-            run_id, "FAILED" if tags.get("status") == "failed" else "FINISHED", end
-        )
+        ended = "FAILED" if tags.get("status") == "failed" else "FINISHED"
+        client.set_terminated(run_id, ended, end)
         client.set_tag(run_id, WHOLE, digest)
     for old in before:
         if old.info.run_id != run_id:
@@ -276,16 +268,13 @@ def _put(
     return str(run_id), "there" if same else "added"
 
 
-def runs_of(experiment: str, chosen: str) -> list[Run]:
+def runs_of(experiment: str, chosen: str) -> list[Any]:
     """The runs of an experiment in the open store that MLflow's filter chooses."""
     import mlflow
 
-    names = [experiment]
-    return mlflow.search_runs(experiment_names=names, filter_string=chosen, output_format="list")
+    found = {"experiment_names": [experiment], "filter_string": chosen}
+    return list(mlflow.search_runs(**found, output_format="list"))
 
 
 def _text(value: Any) -> str:
-    """A value as it is typed."""
-    if isinstance(value, list):
-        return f"[{','.join(map(_text, value))}]"
     return f"{value:.12g}" if isinstance(value, float) else str(value)

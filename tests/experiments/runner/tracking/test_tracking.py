@@ -137,7 +137,7 @@ def jobs_in(outputs: Path, uri: str | None = None) -> dict:
 
 def whole_of(outputs: Path):
     """The one run of a sweep."""
-    (whole,) = stored(outputs, chosen="tags.kind = 'sweep'")
+    (whole,) = stored(outputs, chosen="tags.sweep_id != ''")
     return whole
 
 
@@ -169,23 +169,18 @@ def started(*initial: float, seed: int = 1, **factors) -> dict:
 
 
 def test_settings_are_named_as_typed_and_read_as_numbers(tmp_path) -> None:
-    config = make_config(tmp_path)
+    config = make_config(tmp_path, case="the content's hash")
     config["filter"]["method"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
-    words = [
-        "filter.initial=[5,3]", "filter.P0=0.01", "filter.method.Q=x", "mesh=coarse", "seed=1",
-        "+truth.source=null", "tracking.uri=u", "hydra.run.dir=here", "experiment=debug",
-    ]  # fmt: skip
-    assert log.columns(log.typed(words, config), NAMES) == {
-        "filter.initial.anterior": 5.0, "filter.initial.posterior": 3.0, "filter.P0": 0.01,
-        "filter.method.Q.anterior": 0.1, "filter.method.Q.posterior": 0.2, "mesh": "coarse",
-        "seed": 1,
+    words = ["filter.initial", "filter.method.Q", "case", "truth.source", "tracking.uri", "hydra"]
+    alike = {"study", "mesh.source", "mechanics.element", "filter.mode", "seed"}
+    found = log.columns(config, words)
+    assert {name: value for name, value in found.items() if name not in alike} == {
+        "filter.initial.anterior": 5.0, "filter.initial.posterior": 3.0,
+        "filter.method.Q.anterior": 0.1, "filter.method.Q.posterior": 0.2,
+        "observation.noise_mm": 0.5, "case": "the content's hash",
     }  # fmt: skip
-
-
-def test_no_typed_name_of_a_file_is_shown(tmp_path) -> None:
-    config = make_config(tmp_path, case="0123abc")
-    words = ["case=/home/DOE_JANE", "truth={source:/home/DOE_JANE}"]
-    assert log.typed(words, config) == {"case": "0123abc"}
+    # What is chosen together is shown one by one.
+    assert log.columns(config, ["mesh"])["mesh.columns"] == 24
 
 
 def test_jobs_show_what_differs_once_and_the_handful() -> None:
