@@ -166,8 +166,9 @@ def leaves(value: Any, parameters: Sequence[str], name: str = "") -> dict[str, A
     """Single values by dotted names; of a list by its parameters, of a matrix the diagonal."""
     if isinstance(value, list):
         names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
-        diagonal = (item[k] if isinstance(item, list) else item for k, item in enumerate(value))
-        value = dict(zip(names, diagonal, strict=True))
+        square = all(isinstance(item, list) and len(item) == len(value) for item in value)
+        value = [row[k] for k, row in enumerate(value)] if square else value
+        value = dict(zip(names, value, strict=True))
     if not isinstance(value, Mapping):
         return {} if value in (None, "") else {name: value}
     found: dict[str, Any] = {}

@@ -55,7 +55,7 @@ def make_config(outputs: Path, **changes) -> dict:
         "seed": 1,
         "repeats": 1,
         "factors": {"noise": 0.5, "kind": "white"},
-        "valve": {"leaflets": {"edge_thinning": 0.75}},
+        "valve": {"chordae": {"basal": [[-60.0, 0.5], [50.0, 0.55], [75.0, 0.55]]}},
         "mesh": {"source": "structured", "columns": 24, "rows": 3, "layers": 1},
         "mechanics": {"element": "hex18"},
         "filter": {
@@ -181,6 +181,7 @@ def test_settings_are_named_as_typed_and_read_as_numbers(tmp_path) -> None:
     }  # fmt: skip
     # What is chosen together is shown one by one.
     assert log.columns(config, ["mesh"])["mesh.columns"] == 24
+    assert log.columns(config, ["valve"])["valve.chordae.basal.2.1"] == 0.55
 
 
 def test_jobs_show_what_differs_once_and_the_handful() -> None:
