@@ -1,25 +1,24 @@
 """Logging to MLflow what is on disk: a run, a sweep, or all outputs (``mvest sync``).
 
-The folders are the truth. A run of the store with the same result is left as it is, one with
-another result is replaced, a missing one is added, at any time.
+A run of the store with the same result is left, one with another is replaced, a missing one added.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from experiments.common.config import is_hashed
-from experiments.common.records.metrics import implausible, metrics, short_names
+from experiments.common.records.metrics import implausible, metrics
 from experiments.common.records.record import read_record
+from experiments.runner.collecting.compared import columns, leaves, text_of, together, typed, varied
 from experiments.runner.jobs.folder import CONFIG, RESULT, is_done
 from experiments.runner.planning.plan import PLAN
 from experiments.runner.tracking.store import ARTIFACTS, opened
@@ -39,24 +38,11 @@ FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 MANY = 1000
 """Jobs of a sweep above which each is a run of its own only where ``tracking.runs`` asks for it."""
 
+Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
+"""Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
+
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
-
-HANDFUL = (
-    "study", "valve.folder_sha256", "mesh.source", "mechanics.element", "filter.mode",
-    "truth.label", "observation.noise_mm", "seed",
-)  # fmt: skip
-"""Settings that every run shows, typed or not."""
-
-
-class _Entry(NamedTuple):
-    """What a run of MLflow holds; its first tag tells it from all others of its experiment."""
-
-    result: Path
-    name: str
-    tags: Values
-    numbers: Mapping[int, Mapping[str, float]]
-    seconds: float
 
 
 def log_run(folder: Path, config: Values) -> None:
@@ -76,18 +62,14 @@ def log_sweep(folder: Path, config: Values) -> None:
 
 
 def sync(outputs: Path) -> int:
-    """Bring the stores to the state of a folder of outputs; returns the exit status.
-
-    0: the stores have everything; 1: something was left out, as a line of warning says.
-    """
+    """Bring the stores to the state of a folder of outputs; 1 if something was left out, else 0."""
     counts, swept = Counter[str](), set[Path]()
     for path in [*sorted(outputs.rglob(PLAN)), *sorted(outputs.rglob(RESULT))]:
-        if ARTIFACTS in path.parts or path.parent in swept:
-            continue
         try:
-            read = read_mapping(path if path.name == PLAN else path.with_name(CONFIG))
-            swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
-            counts += _log(path.parent, outputs, read.get("values", read))
+            if ARTIFACTS not in path.parts and path.parent not in swept:
+                read = read_mapping(path if path.name == PLAN else path.with_name(CONFIG))
+                swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
+                counts += _log(path.parent, outputs, read.get("values", read))
         except (MvestError, OSError, KeyError) as error:
             counts["left"] += _left_out(path, error)
     print(f"{outputs}: {counts['added']} runs added to MLflow, {counts['there']} were there")
@@ -104,15 +86,11 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     counts, name, tracking = Counter[str](), str(config["name"]), config["tracking"]
     if not tracking["enabled"]:
         return counts
-    if is_sweep := (folder / PLAN).is_file():
-        plan = read_mapping(folder / PLAN)
-    else:
-        plan = {"jobs": [{"folder": "", "overrides": _typed(folder), "factors": {}}]}
+    is_sweep = (folder / PLAN).is_file()
+    alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
+    plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
     each = len(plan["jobs"]) <= MANY if tracking.get("runs") is None else tracking["runs"]
-    typed = [
-        word.lstrip("+~").partition("=")[0] for job in plan["jobs"] for word in job["overrides"]
-    ]
-    words = dict.fromkeys(word for word in typed if word != "name")
+    words = typed(word for job in plan["jobs"] for word in job["overrides"])
     entries, rows, factors = [], [], []
     for job in plan["jobs"]:
         place = folder / job["folder"]
@@ -128,7 +106,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
         known = runs_of(name, "" if is_sweep else f"tags.folder = '{folder.resolve().name}'")
         parent, shown = None, zip(entries, varied(rows, factors), strict=True)
         if is_sweep:
-            parent, done = _put(_sweep(folder, plan), _together(rows, words), known)
+            parent, done = _put(_sweep(folder, plan), together(rows, words), known, None)
             counts[done] += 1
         for entry, row in tqdm(list(shown), "to MLflow", disable=None, leave=False):
             if entry is not None:
@@ -139,69 +117,12 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
 def _typed(folder: Path) -> list[str]:
     """What was typed for a run by itself, as far as that is known."""
     if (folder / TYPED).is_file():
-        return list(yaml.safe_load((folder / TYPED).read_text(encoding="utf-8")))
+        return list(map(str, OmegaConf.load(folder / TYPED)))
     known = HydraConfig.get() if HydraConfig.initialized() else None
     return list(known.overrides.task) if known and known.runtime.output_dir == str(folder) else []
 
 
-def columns(config: Values, words: Iterable[str]) -> dict[str, Any]:
-    """The settings of a run that were typed, and the handful: a column for each value.
-
-    Parameters
-    ----------
-    config : mapping
-        As it lies beside the result: without a name of a file, which must not reach a store.
-    words : iterable of str
-        Dotted names; of one that has settings below it all are meant.
-    """
-    chosen = tuple(f"{word.replace('/', '.')}." for word in (*words, *HANDFUL))
-    return {
-        name: value
-        for name, value in leaves(config, config["parameters"]).items()
-        if f"{name}.".startswith(chosen) and is_hashed(name, config["study"])
-    }
-
-
-def leaves(value: Any, parameters: Sequence[str], name: str = "") -> dict[str, Any]:
-    """Single values by dotted names; of a list by its parameters, of a matrix the diagonal."""
-    if isinstance(value, list):
-        names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
-        square = all(isinstance(item, list) and len(item) == len(value) for item in value)
-        value = [row[k] for k, row in enumerate(value)] if square else value
-        value = dict(zip(names, value, strict=True))
-    if not isinstance(value, Mapping):
-        return {} if value in (None, "") else {name: value}
-    found: dict[str, Any] = {}
-    for key, item in value.items():
-        found |= leaves(item, parameters, f"{name}.{key}" if name else str(key))
-    return found
-
-
-def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, Any]]:
-    """Of the columns of jobs those that differ, and the handful; factors that no column repeats."""
-    kept: dict[str, list[Any]] = {}
-    for source in (rows, factors):
-        for name in dict.fromkeys(name for row in source for name in row):
-            values = [row.get(name) for row in source]
-            shown = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
-            if shown and (source is rows or values not in kept.values()):
-                kept[name] = values
-    return [{name: values[k] for name, values in kept.items()} for k in range(len(rows))]
-
-
-def _together(rows: Sequence[Values], words: Iterable[str]) -> dict[str, str]:
-    """The values that typed settings have in a sweep, as they are typed: ``[5,3],[4,2]``."""
-    found: dict[str, dict[str, None]] = {}
-    for row in rows:
-        for word in (*words, *HANDFUL):
-            own = [_text(value) for name, value in row.items() if f"{name}.".startswith(f"{word}.")]
-            if own:
-                text = own[0] if word in row else f"[{','.join(own)}]"
-                found.setdefault(word, {})[text] = None
-    return {word: ",".join(texts) for word, texts in found.items()}
-
-
-def _job(folder: Path, name: str | None) -> _Entry | None:
+def _job(folder: Path, name: str | None) -> Entry | None:
     """A job; None before all of it is on disk."""
     record = read_record(folder / RESULT)
     source, why = record.provenance, implausible(record)
@@ -213,11 +134,11 @@ def _job(folder: Path, name: str | None) -> _Entry | None:
         "plausible": f"no: {why}" if why else "yes",
         "mlflow.source.git.commit": source.git.sha,
     }
-    entry = _Entry(folder / RESULT, name or record.row, tags, metrics(record), record.seconds_total)
+    entry = folder / RESULT, name or record.row, tags, metrics(record), record.seconds_total
     return entry if is_done(folder) or not record.converged else None
 
 
-def _sweep(folder: Path, plan: Values) -> _Entry:
+def _sweep(folder: Path, plan: Values) -> Entry:
     """A whole sweep, with its totals."""
     result, totals = folder / PLAN, {"jobs": float(len(plan["jobs"]))}
     name, tags = f"sweep of {len(plan['jobs'])} jobs", {"sweep_id": plan["sweep_id"]}
@@ -228,12 +149,10 @@ def _sweep(folder: Path, plan: Values) -> _Entry:
         totals["failed"] = sum(not record.converged for record in sweep.records)
         totals["seconds"] = sum(record.seconds_total for record in sweep.records)
         tags["mlflow.source.git.commit"] = sweep.provenance.git.sha
-    return _Entry(result, name, tags, {0: totals}, totals.get("seconds", 0.0))
+    return result, name, tags, {0: totals}, totals.get("seconds", 0.0)
 
 
-def _put(
-    entry: _Entry, parameters: Values, known: Sequence[Any], parent: str | None = None
-) -> tuple[str, str]:
+def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tuple[str, str]:
     """Bring one run to the state of an entry; its id, and whether it was added."""
     import mlflow
 
@@ -241,7 +160,7 @@ def _put(
     key, digest, client = next(iter(tags)), sha256_of(result), mlflow.MlflowClient()
     before = [run for run in known if run.data.tags.get(key) == tags[key]]
     same = [run for run in before if run.data.tags.get(WHOLE) == digest]
-    texts = {key: _text(value) for key, value in parameters.items() if value is not None}
+    texts = {key: text_of(value) for key, value in row.items() if value is not None}
     if same:
         run_id, data = same[0].info.run_id, same[0].data
         mlflow.log_params({k: v for k, v in texts.items() if k not in data.params}, run_id=run_id)
@@ -271,11 +190,6 @@ def _put(
 
 def runs_of(experiment: str, chosen: str) -> list[Any]:
     """The runs of an experiment in the open store that MLflow's filter chooses."""
-    import mlflow
+    from mlflow import search_runs
 
-    found = {"experiment_names": [experiment], "filter_string": chosen}
-    return list(mlflow.search_runs(**found, output_format="list"))
-
-
-def _text(value: Any) -> str:
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
+    return list(search_runs(None, chosen, experiment_names=[experiment], output_format="list"))
