@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -500,11 +501,13 @@ def test_processes_that_open_a_fresh_store_at_once_do_not_break_it(tmp_path) -> 
 @pytest.mark.slow
 def test_a_server_killed_in_the_middle_loses_nothing(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setenv("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
-    uri = "http://127.0.0.1:50917"
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = str(probe.getsockname()[1])
+    uri = f"http://127.0.0.1:{port}"
 
     def serve() -> subprocess.Popen:
         command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1"]
-        command += ["--port", "50917", "--workers", "1"]
+        command += ["--port", port, "--workers", "1"]
         command += ["--backend-store-uri", f"sqlite:///{tmp_path}/server.db"]
         command += ["--artifacts-destination", f"{tmp_path}/kept"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
