@@ -21,15 +21,10 @@ from mvest.errors import InputError
 from mvest.processes import Program
 from mvest.reading.documents import read_mapping
 
-MOST = 100
-"""Runs that MLflow's page of comparison can show: it reads them one by one."""
-
-PATIENCE_S = 120.0
-"""Seconds within which the server must answer."""
+MOST = 100  # runs on MLflow's page of comparison, which reads them one by one
 
 SERVED = MANNERS | {
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
-    # If somebody asks the assistant all the same, it works in a container or not at all.
     "MLFLOW_ENABLE_ASSISTANT_SANDBOX": "true",
     "MLFLOW_ENABLE_REMOTE_ASSISTANT": "false",
     "PYTHONSAFEPATH": "1",
@@ -43,15 +38,13 @@ HOST = "mvest.localhost"
 def last_sweep(outputs: Path) -> tuple[str, str, str]:
     """Of the sweep that was planned last: its store, the path of its page, and a line on it.
 
-    The page compares the runs that finished with a plausible answer. Where they are too many it
-    lists them; where there are none it shows the sweep as a whole.
+    The page compares the runs with a plausible answer. It lists them where they are too many, and
+    shows the sweep as a whole where there are none.
 
     Raises
     ------
     InputError
         If there is no sweep, or it has not been logged.
-    TrackingError
-        If the store cannot be read.
     """
     plans = sorted(outputs.glob(f"*/{PLAN}"), key=lambda path: path.stat().st_mtime)
     if not plans:
@@ -74,12 +67,8 @@ def last_sweep(outputs: Path) -> tuple[str, str, str]:
     else:
         ids, experiments = (quote(json.dumps(some)) for some in (runs, [experiment]))
         page = f"/#/compare-runs?runs={ids}&experiments={experiments}&workflowType=machine_learning"
-    left = count - len(runs)
-    return (
-        place,
-        page,
-        f"{sweep}, {len(runs)} runs" + f" ({left} failed or implausible)" * bool(left),
-    )
+    left = f" ({count - len(runs)} failed or implausible)" if count > len(runs) else ""
+    return place, page, f"{sweep}, {len(runs)} runs{left}"
 
 
 @contextmanager
@@ -100,27 +89,22 @@ def serving(
         raise InputError(f"port {port} cannot be used ({error}); name one by --port") from error
     command = [sys.executable, "-P", "-m", "mlflow", "server", "--backend-store-uri", place]
     command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    hosts = allowed_hosts(port)
-    command += ["--allowed-hosts", ",".join(hosts)]
-    command += ["--cors-allowed-origins", ",".join(f"http://{host}" for host in hosts)]
+    command += ["--allowed-hosts", ",".join(hosts := allowed_hosts(port))]
+    command += ["--cors-allowed-origins", ",".join("http://" + host for host in hosts)]
     # Whatever the login shell has set: nobody else is let in.
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
-    out = subprocess.DEVNULL if quiet else None
+    streams = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL if quiet else None)
     # uvicorn looks for modules in the folder that it is started in.
-    with Program(
-        command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=kept, cwd="/"
-    ) as server:
-        until = time.monotonic() + PATIENCE_S
+    with Program(command, stdin=subprocess.DEVNULL, env=kept, cwd="/", **streams) as server:
+        until = time.monotonic() + 120.0  # s
         while server.process.poll() is None and time.monotonic() < until:
-            with (
-                suppress(OSError),
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=2.0),
-            ):
+            with suppress(OSError):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=2.0).close()
                 break
             time.sleep(0.2)
         else:
             raise InputError(f"MLflow's server at port {port} did not start")
-        yield f"http://{HOST}:{port}", server.process
+        yield "http://" + f"{HOST}:{port}", server.process
 
 
 def allowed_hosts(port: int) -> list[str]:

@@ -1,26 +1,24 @@
 """Logging to MLflow what is on disk: a run, a sweep, or all outputs (``mvest sync``).
 
-The folders are the truth. A run of the store with the same result is left as it is, one with
-another result is replaced, a missing one is added, at any time.
+A run of the store with the same result is left, one with another is replaced, a missing one added.
 """
 
 from __future__ import annotations
 
-import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, TypeAlias
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from experiments.common.config import is_hashed
-from experiments.common.records.metrics import implausible, metrics, short_names
+from experiments.common.records.metrics import implausible, metrics
 from experiments.common.records.record import read_record
+from experiments.runner.collecting.compared import columns, leaves, text_of, together, typed, varied
 from experiments.runner.jobs.folder import CONFIG, RESULT, is_done
 from experiments.runner.planning.plan import PLAN
 from experiments.runner.tracking.store import ARTIFACTS, opened
@@ -28,9 +26,6 @@ from experiments.sweeps.collected import read_sweep
 from mvest.errors import MvestError
 from mvest.files import sha256_of
 from mvest.reading.documents import read_mapping
-
-if TYPE_CHECKING:
-    from mlflow.entities import Run
 
 Values = Mapping[str, Any]
 
@@ -43,27 +38,11 @@ FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 MANY = 1000
 """Jobs of a sweep above which each is a run of its own only where ``tracking.runs`` asks for it."""
 
+Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
+"""Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
+
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
-
-NAMED_ELSEWHERE = {"experiment", "hydra", "launcher", "name", "sweep"}
-"""Typed words that choose what is run and by whom."""
-
-HANDFUL = (
-    "study", "valve.folder_sha256", "mesh.source", "mechanics.element", "filter.mode",
-    "truth.label", "observation.noise_mm", "seed",
-)  # fmt: skip
-"""Settings that every run shows, typed or not."""
-
-
-class _Entry(NamedTuple):
-    """What a run of MLflow holds; its first tag tells it from all others of its experiment."""
-
-    result: Path
-    name: str
-    tags: Values
-    numbers: Mapping[int, Mapping[str, float]]
-    seconds: float
 
 
 def log_run(folder: Path, config: Values) -> None:
@@ -83,18 +62,14 @@ def log_sweep(folder: Path, config: Values) -> None:
 
 
 def sync(outputs: Path) -> int:
-    """Bring the stores to the state of a folder of outputs; returns the exit status.
-
-    0: the stores have everything; 1: something was left out, as a line of warning says.
-    """
+    """Bring the stores to the state of a folder of outputs; 1 if something was left out, else 0."""
     counts, swept = Counter[str](), set[Path]()
     for path in [*sorted(outputs.rglob(PLAN)), *sorted(outputs.rglob(RESULT))]:
-        if ARTIFACTS in path.parts or path.parent in swept:
-            continue
         try:
-            read = read_mapping(path if path.name == PLAN else path.with_name(CONFIG))
-            swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
-            counts += _log(path.parent, outputs, read.get("values", read))
+            if ARTIFACTS not in path.parts and path.parent not in swept:
+                read = read_mapping(path if path.name == PLAN else path.with_name(CONFIG))
+                swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
+                counts += _log(path.parent, outputs, read.get("values", read))
         except (MvestError, OSError, KeyError) as error:
             counts["left"] += _left_out(path, error)
     print(f"{outputs}: {counts['added']} runs added to MLflow, {counts['there']} were there")
@@ -111,36 +86,29 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     counts, name, tracking = Counter[str](), str(config["name"]), config["tracking"]
     if not tracking["enabled"]:
         return counts
-    if is_sweep := (folder / PLAN).is_file():
-        plan = read_mapping(folder / PLAN)
-    else:
-        plan = {"jobs": [{"folder": "", "overrides": _typed(folder), "factors": {}}]}
+    is_sweep = (folder / PLAN).is_file()
+    alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
+    plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
     each = len(plan["jobs"]) <= MANY if tracking.get("runs") is None else tracking["runs"]
-    words = {word.partition("=")[0]: "" for job in plan["jobs"] for word in job["overrides"]}
-    entries, settings, rows, factors = [], [], [], []
+    words = typed(word for job in plan["jobs"] for word in job["overrides"])
+    entries, rows, factors = [], [], []
     for job in plan["jobs"]:
         place = folder / job["folder"]
         try:
             if (place / RESULT).is_file():
                 own = read_mapping(place / CONFIG)
                 entries.append(_job(place, job.get("name")) if each else None)
-                settings.append(typed([*words, *job["overrides"], *HANDFUL], own))
-                rows.append(columns(settings[-1], own["parameters"]))
-                factors.append(columns(job["factors"], own["parameters"]))
+                rows.append(columns(own, words))
+                factors.append(leaves(job["factors"], own["parameters"]))
         except MvestError as error:
             counts["left"] += _left_out(place, error)
     with opened(tracking["uri"], outputs, name):
         known = runs_of(name, "" if is_sweep else f"tags.folder = '{folder.resolve().name}'")
-        parent = None
+        parent, shown = None, zip(entries, varied(rows, factors), strict=True)
         if is_sweep:
-            texts = [(key, _text(value)) for row in settings for key, value in row.items()]
-            swept = {key: dict.fromkeys(v for k, v in texts if k == key) for key, _ in texts}
-            whole = {key: ",".join(values) for key, values in swept.items()}
-            parent, done = _put(_sweep(folder, plan), whole, known)
+            parent, done = _put(_sweep(folder, plan), together(rows, words), known, None)
             counts[done] += 1
-        for entry, row in zip(
-            tqdm(entries, disable=None, leave=False), varied(rows, factors), strict=True
-        ):
+        for entry, row in tqdm(list(shown), "to MLflow", disable=None, leave=False):
             if entry is not None:
                 counts[_put(entry, row, known, parent)[1]] += 1
     return counts
@@ -149,62 +117,12 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
 def _typed(folder: Path) -> list[str]:
     """What was typed for a run by itself, as far as that is known."""
     if (folder / TYPED).is_file():
-        return list(yaml.safe_load((folder / TYPED).read_text(encoding="utf-8")))
+        return list(map(str, OmegaConf.load(folder / TYPED)))
     known = HydraConfig.get() if HydraConfig.initialized() else None
     return list(known.overrides.task) if known and known.runtime.output_dir == str(folder) else []
 
 
-def typed(words: Iterable[str], config: Values) -> dict[str, Any]:
-    """Typed settings (``NAME=VALUE``) that can change a result, with their values in a run.
-
-    Values are those of the configuration beside the result, where no file is named: such a name
-    must not reach a store. Of a group (``mesh=coarse``) the value is what was chosen.
-    """
-    found: dict[str, Any] = {}
-    for word in words:
-        name, _, text = word.lstrip("+~").partition("=")
-        first, *rest = re.split(r"[./]", name)
-        value: Any = config.get(first)
-        for key in rest:
-            value = value.get(key) if isinstance(value, Mapping) else None
-        if isinstance(value, Mapping):
-            value = text if re.fullmatch(r"[\w -]+", text) else None
-        if value not in (None, "") and first not in NAMED_ELSEWHERE:
-            found |= {name: value} if is_hashed(name, config["study"]) else {}
-    return found
-
-
-def columns(settings: Values, parameters: Sequence[str]) -> dict[str, Any]:
-    """Settings by dotted names; a list has a column for each value, of a matrix the diagonal.
-
-    Where it has a value for each parameter they name its columns (``filter.initial.anterior``).
-    """
-    found: dict[str, Any] = {}
-    for name, value in settings.items():
-        if isinstance(value, list):
-            names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
-            diagonal = (item[k] if isinstance(item, list) else item for k, item in enumerate(value))
-            value = dict(zip(names, diagonal, strict=True))
-        if isinstance(value, Mapping):
-            found |= columns({f"{name}.{key}": item for key, item in value.items()}, parameters)
-        elif value not in (None, ""):
-            found[name] = value
-    return found
-
-
-def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, Any]]:
-    """Of the columns of jobs those that differ, and the handful; factors that no column repeats."""
-    kept: dict[str, list[Any]] = {}
-    for source in (rows, factors):
-        for name in dict.fromkeys(name for row in source for name in row):
-            values = [row.get(name) for row in source]
-            shown = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
-            if shown and (source is rows or values not in kept.values()):
-                kept[name] = values
-    return [{name: values[k] for name, values in kept.items()} for k in range(len(rows))]
-
-
-def _job(folder: Path, name: str | None) -> _Entry | None:
+def _job(folder: Path, name: str | None) -> Entry | None:
     """A job; None before all of it is on disk."""
     record = read_record(folder / RESULT)
     source, why = record.provenance, implausible(record)
@@ -216,17 +134,14 @@ def _job(folder: Path, name: str | None) -> _Entry | None:
         "plausible": f"no: {why}" if why else "yes",
         "mlflow.source.git.commit": source.git.sha,
     }
-    entry = _Entry(folder / RESULT, name or record.row, tags, metrics(record), record.seconds_total)
+    entry = folder / RESULT, name or record.row, tags, metrics(record), record.seconds_total
     return entry if is_done(folder) or not record.converged else None
 
 
-def _sweep(folder: Path, plan: Values) -> _Entry:
+def _sweep(folder: Path, plan: Values) -> Entry:
     """A whole sweep, with its totals."""
     result, totals = folder / PLAN, {"jobs": float(len(plan["jobs"]))}
-    tags, name = (
-        {"sweep_id": plan["sweep_id"], "kind": "sweep"},
-        f"sweep of {len(plan['jobs'])} jobs",
-    )
+    name, tags = f"sweep of {len(plan['jobs'])} jobs", {"sweep_id": plan["sweep_id"]}
     if (folder / SWEEP).is_file():
         result, sweep = folder / SWEEP, read_sweep(folder / SWEEP)
         means = [one for record in sweep.records if (one := metrics(record)[0].get("error.mean"))]
@@ -234,12 +149,10 @@ def _sweep(folder: Path, plan: Values) -> _Entry:
         totals["failed"] = sum(not record.converged for record in sweep.records)
         totals["seconds"] = sum(record.seconds_total for record in sweep.records)
         tags["mlflow.source.git.commit"] = sweep.provenance.git.sha
-    return _Entry(result, name, tags, {0: totals}, totals.get("seconds", 0.0))
+    return result, name, tags, {0: totals}, totals.get("seconds", 0.0)
 
 
-def _put(
-    entry: _Entry, parameters: Values, known: Sequence[Run], parent: str | None = None
-) -> tuple[str, str]:
+def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tuple[str, str]:
     """Bring one run to the state of an entry; its id, and whether it was added."""
     import mlflow
 
@@ -247,7 +160,7 @@ def _put(
     key, digest, client = next(iter(tags)), sha256_of(result), mlflow.MlflowClient()
     before = [run for run in known if run.data.tags.get(key) == tags[key]]
     same = [run for run in before if run.data.tags.get(WHOLE) == digest]
-    texts = {key: _text(value) for key, value in parameters.items() if value is not None}
+    texts = {key: text_of(value) for key, value in row.items() if value is not None}
     if same:
         run_id, data = same[0].info.run_id, same[0].data
         mlflow.log_params({k: v for k, v in texts.items() if k not in data.params}, run_id=run_id)
@@ -266,9 +179,8 @@ def _put(
                     mlflow.log_artifact(str(path))
         # Its duration is that of the computation; the hash comes last and says that it is whole.
         run_id, end = run.info.run_id, run.info.start_time + int(1000 * seconds)
-        client.set_terminated(
-            run_id, "FAILED" if tags.get("status") == "failed" else "FINISHED", end
-        )
+        ended = "FAILED" if tags.get("status") == "failed" else "FINISHED"
+        client.set_terminated(run_id, ended, end)
         client.set_tag(run_id, WHOLE, digest)
     for old in before:
         if old.info.run_id != run_id:
@@ -276,16 +188,8 @@ def _put(
     return str(run_id), "there" if same else "added"
 
 
-def runs_of(experiment: str, chosen: str) -> list[Run]:
+def runs_of(experiment: str, chosen: str) -> list[Any]:
     """The runs of an experiment in the open store that MLflow's filter chooses."""
-    import mlflow
+    from mlflow import search_runs
 
-    names = [experiment]
-    return mlflow.search_runs(experiment_names=names, filter_string=chosen, output_format="list")
-
-
-def _text(value: Any) -> str:
-    """A value as it is typed."""
-    if isinstance(value, list):
-        return f"[{','.join(map(_text, value))}]"
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
+    return list(search_runs(None, chosen, experiment_names=[experiment], output_format="list"))

@@ -48,19 +48,17 @@ def require_no_password(uri: str | None) -> None:
 def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
     """MLflow, pointed at a store and an experiment, both made if need be; gives the address.
 
-    Without an address it is the database ``mlflow.db`` in the outputs.
-
     Raises
     ------
     TrackingError
         If the store cannot be opened, or be written within: one line that names it.
-    ConfigurationError
-        If the address has a password.
     """
     require_no_password(uri)
     outputs = outputs.resolve()
     place = uri or f"{SQLITE}{outputs / 'mlflow.db'}"
     file = Path(place.removeprefix(SQLITE).partition("?")[0])
+    if is_local := place.startswith(SQLITE):  # also for a server that is started elsewhere
+        place = place.replace(str(file), str(file.resolve()))
     for name, value in MANNERS.items():
         os.environ.setdefault(name, value)
     try:
@@ -71,11 +69,10 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
         outputs.mkdir(parents=True, exist_ok=True)
         # Several processes that open a fresh SQLite database at once would break it.
         with FileLock(outputs / ".mlflow.lock"):
-            if place.startswith(SQLITE) and file.exists() and file.stat().st_size:
+            if is_local and file.exists() and file.stat().st_size:
                 # MLflow would ask a broken one again for minutes.
-                with closing(
-                    sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", 1.0, uri=True)
-                ) as database:
+                address = f"{file.resolve().as_uri()}?mode=ro"
+                with closing(sqlite3.connect(address, 1.0, uri=True)) as database:
                     database.execute("select * from alembic_version, experiments").fetchone()
             mlflow.set_tracking_uri(place)
             if mlflow.get_experiment_by_name(experiment) is None:
@@ -88,7 +85,7 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
         raise
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        if place.startswith(SQLITE) and BROKEN.search(str(error)):
+        if is_local and BROKEN.search(str(error)):
             raise TrackingError(f"{file} is broken ({reason}): remove it") from error
         reason = "database is locked" if "locked" in reason else reason
         raise TrackingError(f"tracking store {place}: {reason}") from error

@@ -15,7 +15,7 @@ import pytest
 
 from experiments.common.records.metrics import metrics
 from experiments.common.records.record import read_record
-from experiments.runner.tracking.log import HANDFUL
+from experiments.runner.collecting.compared import HANDFUL
 from tests.experiments.runner.tracking.test_tracking import make_config, make_job
 from tests.places import ROOT
 

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import pytest
 from experiments.cli import main
 from experiments.common.records.metrics import implausible, metrics
 from experiments.common.records.record import Record, write_record
+from experiments.runner.collecting import compared
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.tracking import log
 from experiments.runner.tracking.dashboard import last_sweep
@@ -55,7 +57,7 @@ def make_config(outputs: Path, **changes) -> dict:
         "seed": 1,
         "repeats": 1,
         "factors": {"noise": 0.5, "kind": "white"},
-        "valve": {"leaflets": {"edge_thinning": 0.75}},
+        "valve": {"chordae": {"basal": [[-60.0, 0.5], [50.0, 0.55], [75.0, 0.55]]}},
         "mesh": {"source": "structured", "columns": 24, "rows": 3, "layers": 1},
         "mechanics": {"element": "hex18"},
         "filter": {
@@ -137,7 +139,7 @@ def jobs_in(outputs: Path, uri: str | None = None) -> dict:
 
 def whole_of(outputs: Path):
     """The one run of a sweep."""
-    (whole,) = stored(outputs, chosen="tags.kind = 'sweep'")
+    (whole,) = stored(outputs, chosen="tags.sweep_id != ''")
     return whole
 
 
@@ -169,32 +171,28 @@ def started(*initial: float, seed: int = 1, **factors) -> dict:
 
 
 def test_settings_are_named_as_typed_and_read_as_numbers(tmp_path) -> None:
-    config = make_config(tmp_path)
+    config = make_config(tmp_path, case="the content's hash")
     config["filter"]["method"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
-    words = [
-        "filter.initial=[5,3]", "filter.P0=0.01", "filter.method.Q=x", "mesh=coarse", "seed=1",
-        "+truth.source=null", "tracking.uri=u", "hydra.run.dir=here", "experiment=debug",
-    ]  # fmt: skip
-    assert log.columns(log.typed(words, config), NAMES) == {
-        "filter.initial.anterior": 5.0, "filter.initial.posterior": 3.0, "filter.P0": 0.01,
-        "filter.method.Q.anterior": 0.1, "filter.method.Q.posterior": 0.2, "mesh": "coarse",
-        "seed": 1,
+    words = ["filter.initial", "filter.method.Q", "case", "truth.source", "tracking.uri", "hydra"]
+    alike = {"study", "mesh.source", "mechanics.element", "filter.mode", "seed"}
+    found = compared.columns(config, words)
+    assert {name: value for name, value in found.items() if name not in alike} == {
+        "filter.initial.anterior": 5.0, "filter.initial.posterior": 3.0,
+        "filter.method.Q.anterior": 0.1, "filter.method.Q.posterior": 0.2,
+        "observation.noise_mm": 0.5, "case": "the content's hash",
     }  # fmt: skip
-
-
-def test_no_typed_name_of_a_file_is_shown(tmp_path) -> None:
-    config = make_config(tmp_path, case="0123abc")
-    words = ["case=/home/DOE_JANE", "truth={source:/home/DOE_JANE}"]
-    assert log.typed(words, config) == {"case": "0123abc"}
+    # What is chosen together is shown one by one.
+    assert compared.columns(config, ["mesh"])["mesh.columns"] == 24
+    assert 0.55 in compared.columns(config, ["valve"]).values()
 
 
 def test_jobs_show_what_differs_once_and_the_handful() -> None:
     rows = [{"a": 1, "same": 5, "seed": 7}, {"a": 2, "same": 5, "seed": 7}]
     factors = [{"a again": 1.0, "kind": "x", "b": 0}, {"a again": 2.0, "kind": "y", "b": 0}]
-    assert log.varied(rows, factors) == [
+    assert compared.varied(rows, factors) == [
         {"a": 1, "seed": 7, "kind": "x"}, {"a": 2, "seed": 7, "kind": "y"},
     ]  # fmt: skip
-    assert log.varied(rows[:1], [{}]) == rows[:1], "a run by itself differs from none"
+    assert compared.varied(rows[:1], [{}]) == rows[:1], "a run by itself differs from none"
 
 
 def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
@@ -503,11 +501,13 @@ def test_processes_that_open_a_fresh_store_at_once_do_not_break_it(tmp_path) -> 
 @pytest.mark.slow
 def test_a_server_killed_in_the_middle_loses_nothing(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setenv("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
-    uri = "http://127.0.0.1:50917"
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = str(probe.getsockname()[1])
+    uri = f"http://127.0.0.1:{port}"
 
     def serve() -> subprocess.Popen:
         command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1"]
-        command += ["--port", "50917", "--workers", "1"]
+        command += ["--port", port, "--workers", "1"]
         command += ["--backend-store-uri", f"sqlite:///{tmp_path}/server.db"]
         command += ["--artifacts-destination", f"{tmp_path}/kept"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
