@@ -108,7 +108,7 @@ def make_plan(
         config_hash = hash_of(values)
         subdir = config_hash[:HASH_DIGITS]
         if named:
-            with read_write(composed), open_dict(composed):
+            with read_write(composed.hydra), open_dict(composed.hydra):
                 composed.hydra.job.id = composed.hydra.job.num = number
             subdir = str(composed.hydra.sweep.subdir)
         # Ten thousand configurations fit into memory where they share what is alike in them.
