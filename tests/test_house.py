@@ -149,8 +149,11 @@ IMPORT_NAME = {
     "scikit-fem": ("skfem",),
     "simpleitk": ("SimpleITK",),
 }
-OPTIONAL = ("viz", "postgres", "second-model")
+OPTIONAL = ("viz", "cluster", "postgres", "second-model")
 """Extras that mvest and experiments may use, within functions."""
+
+LOCKED = ("dev", "docs", "viz", "cluster")
+"""Extras that `make lock` pins."""
 
 
 class Import(NamedTuple):
@@ -515,7 +518,7 @@ def test_the_lock_file_fits_the_declared_dependencies(project: dict) -> None:
         for line in lines
         if (found := re.match(r"([A-Za-z0-9._-]+)==([^\s;]+)", line))
     }
-    for text in [*project["dependencies"], *extras["dev"], *extras["docs"], *extras["viz"]]:
+    for text in [*project["dependencies"], *(one for name in LOCKED for one in extras[name])]:
         requirement = Requirement(text)
         version = locked.get(canonicalize_name(requirement.name))
         assert version is not None, f"run `make lock`: {text} is missing"

@@ -19,7 +19,6 @@ MAY_START = {
     "mvest/processes.py",
     # Questions that are answered or given up within seconds, and compute nothing.
     "mvest/provenance.py",
-    "experiments/runner/execution/slurm.py",
 }
 STARTERS = {"joblib", "loky", "multiprocessing"}
 CALLS = {"Popen", "run", "check_call", "check_output", "call", "fork", "posix_spawn", "system"}

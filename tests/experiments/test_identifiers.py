@@ -78,12 +78,12 @@ def own_observation(folder: Path) -> list[str]:
 def leaks(folder: Path) -> list[tuple[str, str]]:
     """Files of a run, and what each of them says that it should not."""
     kept = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    # What was shown on the terminal is kept as it was shown.
+    # What was typed and what the terminal showed are kept as they were.
     return [
         (path.name, secret)
         for path, content in kept.items()
         for secret in SECRETS
-        if secret.encode() in content and path.name != "log.txt"
+        if secret.encode() in content and path.name != "log.txt" and path.parent.name != ".hydra"
     ]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import shlex
-import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -22,7 +21,7 @@ from experiments.common.records.record import Record
 from experiments.runner.jobs.folder import require_writable, write_failure
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
-from mvest.processes import environment
+from mvest.processes import environment, python
 from mvest.quantities import within
 from mvest.reading.text import one_line
 
@@ -236,7 +235,7 @@ def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
         "cores": 1,
         "processes": 1,
         "memory": "4GB",
-        "python": f"{shlex.quote(sys.executable)} -P",
+        "python": shlex.join(python("distributed")[:2]),
         "nanny": False,
         # Certificates for this one cluster, in a folder that its nodes share.
         "security": True,

@@ -106,6 +106,7 @@ def compute(request: Request, memory_gb: float) -> Record:
     """
     require_room(request.values, memory_gb)
     with held_memory(memory_gb):
+        write_hydra(request)
         study = load_study(request.values["study"])
         job = _job(study, request)
         record = None
@@ -131,7 +132,6 @@ def answer(request: Request, memory_gb: float) -> dict[str, Any]:
     ``refused`` says that the request is wrong, and that this process may run another one.
     """
     try:
-        write_hydra(request)
         compute(request, memory_gb)
     except Exception as error:
         # Whatever it is costs its own job; the traceback is in the log.

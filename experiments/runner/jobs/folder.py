@@ -184,7 +184,7 @@ def _adopt_arrays(folder: Path) -> None:
 
 
 def write_hydra(request: Request) -> None:
-    """Write a sweep's job's configuration and overrides where Hydra writes those of a single run.
+    """Write the resolved configuration and the overrides where Hydra's users expect them.
 
     Raises
     ------

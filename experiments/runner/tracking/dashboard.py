@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
 import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -18,7 +16,7 @@ from experiments.runner.planning.plan import PLAN
 from experiments.runner.tracking.log import PARENT, runs_of
 from experiments.runner.tracking.store import MANNERS, opened
 from mvest.errors import InputError
-from mvest.processes import Program
+from mvest.processes import Program, environment, python
 from mvest.reading.documents import read_mapping
 
 MOST = 100  # runs on MLflow's page of comparison, which reads them one by one
@@ -87,12 +85,12 @@ def serving(
             port = int(probe.getsockname()[1])
     except OSError as error:
         raise InputError(f"port {port} cannot be used ({error}); name one by --port") from error
-    command = [sys.executable, "-P", "-m", "mlflow", "server", "--backend-store-uri", place]
+    command = python("mlflow", "server", "--backend-store-uri", place)
     command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
     command += ["--allowed-hosts", ",".join(hosts := allowed_hosts(port))]
     command += ["--cors-allowed-origins", ",".join("http://" + host for host in hosts)]
     # Whatever the login shell has set: nobody else is let in.
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
+    kept = {k: v for k, v in environment().items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
     streams = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL if quiet else None)
     # uvicorn looks for modules in the folder that it is started in.
     with Program(command, stdin=subprocess.DEVNULL, env=kept, cwd="/", **streams) as server:

@@ -12,7 +12,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
@@ -115,11 +114,9 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
 
 
 def _typed(folder: Path) -> list[str]:
-    """What was typed for a run by itself, as far as that is known."""
-    if (folder / TYPED).is_file():
-        return list(map(str, OmegaConf.load(folder / TYPED)))
-    known = HydraConfig.get() if HydraConfig.initialized() else None
-    return list(known.overrides.task) if known and known.runtime.output_dir == str(folder) else []
+    """What was typed for a run by itself."""
+    place = folder / TYPED
+    return list(map(str, OmegaConf.load(place))) if place.is_file() else []
 
 
 def _job(folder: Path, name: str | None) -> Entry | None:

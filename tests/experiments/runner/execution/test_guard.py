@@ -19,7 +19,6 @@ from experiments.common.study import Result
 from experiments.runner.execution import guard, job
 from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.jobs.folder import (
-    FailedRunError,
     finished_record,
     is_done,
     last_record,
@@ -347,7 +346,6 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     ("error", "reason"),
     [
         (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0"),
-        (FailedRunError("it buckled"), None),
         (MemoryError(), "out of memory"),
         (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device"),
         (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
