@@ -274,6 +274,7 @@ def test_again_changes_nothing_and_another_result_takes_the_place(tmp_path) -> N
         job / "result.json",
         make_record(first.data.tags["config_hash"], estimates=(estimate((6.1, 2.1)),)),
     )
+    mark_done(job)
     log_run(job, make_config(tmp_path))
     (run,) = stored(tmp_path)
     assert run.info.run_id != first.info.run_id
