@@ -19,7 +19,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from experiments.common.config import hash_of, plain
 from experiments.results.publish import as_configured, publish_as
@@ -86,7 +86,8 @@ def make_plan(
         If a job cannot be composed.
     """
     swept = config.hydra.sweeper.get("params") or {}
-    named = any(line.partition("=")[0] == SUBDIR for line in config.hydra.overrides.hydra)
+    typed = OmegaConf.to_container(config.hydra.overrides.hydra)  # an interpolation as a text
+    named = any(str(line).partition("=")[0] == SUBDIR for line in typed)
     compose = _Composer(config, loader, reuse=not named)
     varied = _varied(config, jobs, loader)
     planned: list[PlannedJob] = []
@@ -104,7 +105,7 @@ def make_plan(
         config_hash = hash_of(values)
         subdir = config_hash[:HASH_DIGITS]
         if named:
-            with open_dict(composed):
+            with read_write(composed.hydra), open_dict(composed.hydra):
                 composed.hydra.job.id = composed.hydra.job.num = number
             subdir = str(composed.hydra.sweep.subdir)
         # Ten thousand configurations fit into memory where they share what is alike in them.

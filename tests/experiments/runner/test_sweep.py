@@ -175,6 +175,17 @@ def test_a_sweep_from_the_command_line_is_planned_as_well(run):
     assert "3 done, 0 failed before, 1 to run" in out
 
 
+def test_the_folders_of_jobs_may_be_named(run):
+    status, _, err = run(
+        "-m", "experiment=debug", "seed=1,2", "hydra.sweep.subdir=${hydra.job.num}"
+    )
+    assert status == 0, err
+    found = [
+        yaml.safe_load(Path(f"outputs/debug/{k}/.hydra/config.yaml").read_text()) for k in "01"
+    ]
+    assert [values["seed"] for values in found] == [1, 2]
+
+
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
     _, out, _ = run("sweep=debug", "publish=true", "filter.method.tolerance=1e-3")
     assert "left as it is" in out
