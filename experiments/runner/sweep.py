@@ -59,7 +59,6 @@ class SweepRun:
     def __init__(self, loader: ConfigLoader, config: DictConfig) -> None:
         self._loader, self._config = loader, config
         self._jobs: dict[str, PlannedJob] = {}
-        self._ended: dict[str, Record] = {}
 
     def launch(self, overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Find out what jobs mean, refuse a wrong one before anything is written, and run them.
@@ -98,6 +97,9 @@ class SweepRun:
         if config.check:
             _run_checks(batch)
             return []
+        # What became of the jobs of earlier batches is on disk.
+        for key, job in self._jobs.items():
+            self._jobs[key] = PlannedJob.of(job.request) if job.to_run else job
         self._jobs |= {job.request.config_hash: job for job in batch.jobs}
         plan = replace(batch, jobs=tuple(self._jobs.values()))
         with nothing_empty(plan.folder, Path(config.paths.outputs)):
@@ -109,40 +111,42 @@ class SweepRun:
             print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
             print(f"`mvest collect {plan.folder}` writes what became of them")
             return []
-        self._run(plan, batch, settings)
-        found = {job.hash: job.record for job in finish(plan, self._ended).jobs}
+        ended = _run(plan, batch, settings)
+        found = {job.hash: job.record for job in finish(plan, ended).jobs}
         returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
         # Of ten thousand jobs not kept while they are logged.
-        self._ended, found = {}, {}
+        del ended, found
         log_sweep(plan.folder, plan.common)
         return returned
 
-    def _run(self, plan: Plan, batch: Plan, settings: EngineSettings) -> None:
-        """Run the jobs of a batch that are not done."""
-        left = {job.request.config_hash: job for job in batch.to_run}
-        left = {key: job for key, job in left.items() if key not in self._ended}
-        if not left:
-            return
-        announce_compilation("the first jobs")
-        jobs = list(left.values())
-        ends = run_jobs(
-            [job.request for job in jobs], settings, min(plan.workers, len(jobs)), plan.written_ns
+
+def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]:
+    """Run the jobs of a batch that are not done; returns heads of their records, by hash."""
+    ended: dict[str, Record] = {}
+    left = {job.request.config_hash: job for job in batch.to_run}
+    if not left:
+        return ended
+    announce_compilation("the first jobs")
+    jobs = list(left.values())
+    ends = run_jobs(
+        [job.request for job in jobs], settings, min(plan.workers, len(jobs)), plan.written_ns
+    )
+    try:
+        with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
+            for k, record in ends:
+                ended[jobs[k].request.config_hash] = record
+                bar.ended(jobs[k], record)
+    except KeyboardInterrupt:
+        ends.close()
+        collected(plan, ended)
+        raise
+    except OSError as error:
+        # The jobs that ended are on disk.
+        print(
+            f"error: the sweep cannot go on ({error}); run the same command again to go on",
+            file=sys.stderr,
         )
-        try:
-            with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
-                for k, record in ends:
-                    self._ended[jobs[k].request.config_hash] = record
-                    bar.ended(jobs[k], record)
-        except KeyboardInterrupt:
-            ends.close()
-            collected(plan, self._ended)
-            raise
-        except OSError as error:
-            # The jobs that ended are on disk.
-            print(
-                f"error: the sweep cannot go on ({error}); run the same command again to go on",
-                file=sys.stderr,
-            )
+    return ended
 
 
 def collect_sweep(folder: Path) -> int:

@@ -186,6 +186,15 @@ def test_the_folders_of_jobs_may_be_named(run):
     assert [values["seed"] for values in found] == [1, 2]
 
 
+def test_jobs_of_earlier_batches_are_part_of_the_sweep(run):
+    asked = ("hydra/sweeper=basic", "hydra.sweeper.max_batch_size=1")
+    for forced, count in ((), 2), (("force=true",), 4):
+        status, _, err = run("-m", "experiment=debug", "seed=1,2", *asked, *forced)
+        assert status == 0, err
+        assert all(one.converged for one in read_sweep(Path("outputs/debug/sweep.json")).records)
+        assert len(runs()) == count
+
+
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
     _, out, _ = run("sweep=debug", "publish=true", "filter.method.tolerance=1e-3")
     assert "left as it is" in out
