@@ -205,6 +205,16 @@ def test_results_are_renewed_by_a_sweep_as_configured_only(run):
 
 
 WRONG = [
+    (("sweep=debug", "hydra.launcher.scheduler_file=nope.json"), "nope.json: no such file"),
+    (
+        ("sweep=debug", "hydra.launcher.tls={ca_file: file, cert: file, key: nope}"),
+        "hydra.launcher.tls.key = nope: no such file",
+    ),
+    (("sweep=debug", "hydra.launcher.tls={ca_file: file}"), "tls: expected ca_file, cert, key"),
+    (
+        ("sweep=debug", "hydra.launcher.cluster=LocalCluster", "hydra.launcher.address=tcp://a:1"),
+        "hydra.launcher: address and cluster, expected one of them",
+    ),
     (("sweep=nope",), "Could not find 'sweep/nope'; known: "),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
     (("sweep=debug", "sweep.sise=full"), "did you mean size?"),
