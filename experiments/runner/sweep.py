@@ -41,7 +41,10 @@ from mvest.files import write_atomically
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
 """Files in a sweep's folder: its configuration as Hydra writes it, and all its jobs as a table."""
 
-GIVEN_ONCE = ("planned", "basic")
+PLANNED = "planned"
+"""The sweeper that knows the grids of ``sweep=NAME``."""
+
+GIVEN_ONCE = (PLANNED, "basic")
 """Sweepers that know all their jobs beforehand; others may try a job twice."""
 
 
@@ -86,8 +89,16 @@ class SweepRun:
         require_admissible_values(EngineSettings, launcher, "hydra.launcher")
         settings = build(EngineSettings, launcher)
         require_engine(settings)
+        sweeper = str(config.hydra.runtime.choices["hydra/sweeper"])
+        if config.sweep and sweeper != PLANNED:
+            raise ConfigurationError(f"hydra/sweeper={sweeper} knows no grid of sweep=NAME")
+        later = [name for name in ("dry_run", "check", "detach") if config[name]]
+        if later and sweeper not in GIVEN_ONCE:
+            raise ConfigurationError(
+                f"{later[0]}=true: hydra/sweeper={sweeper} finds its jobs by running"
+            )
         batch = make_plan(config, self._loader, overrides, first)
-        if str(config.hydra.runtime.choices["hydra/sweeper"]) in GIVEN_ONCE:
+        if sweeper in GIVEN_ONCE:
             batch.require_different()
         for job in batch.jobs:
             _check(job)
@@ -217,7 +228,7 @@ def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:
     returned.return_value = (
         objective_of(record, objective)
         if record.converged
-        else FailedRunError(record.reason, job.folder)
+        else FailedRunError(f"{record.reason} (recorded in {job.folder})")
     )
     return returned
 

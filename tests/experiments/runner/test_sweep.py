@@ -186,6 +186,12 @@ def test_the_folders_of_jobs_may_be_named(run):
     assert [values["seed"] for values in found] == [1, 2]
 
 
+def test_a_sweep_s_own_grids_are_not_left_out_by_another_sweeper(run):
+    status, _, err = run("sweep=debug", "hydra/sweeper=basic", "publish=true")
+    assert (status, err.count("\n"), runs()) == (2, 1, [])
+    assert "hydra/sweeper=basic" in err
+
+
 def test_jobs_of_earlier_batches_are_part_of_the_sweep(run):
     asked = ("hydra/sweeper=basic", "hydra.sweeper.max_batch_size=1")
     for forced, count in ((), 2), (("force=true",), 4):
