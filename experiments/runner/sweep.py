@@ -42,7 +42,10 @@ from mvest.files import write_atomically
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
 """Files in a sweep's folder: its configuration as Hydra writes it, and all its jobs as a table."""
 
-GIVEN_ONCE = ("planned", "basic")
+PLANNED = "planned"
+"""The sweeper that knows the grids of ``sweep=NAME``."""
+
+GIVEN_ONCE = (PLANNED, "basic")
 """Sweepers that know all their jobs beforehand; others may try a job twice."""
 
 
@@ -60,7 +63,6 @@ class SweepRun:
     def __init__(self, loader: ConfigLoader, config: DictConfig) -> None:
         self._loader, self._config = loader, config
         self._jobs: dict[str, PlannedJob] = {}
-        self._ended: dict[str, Record] = {}
 
     def launch(self, overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         """Find out what jobs mean, refuse a wrong one before anything is written, and run them.
@@ -88,9 +90,16 @@ class SweepRun:
         require_admissible_values(EngineSettings, launcher, "hydra.launcher")
         settings = build(EngineSettings, launcher)
         require_engine(settings)
+        sweeper = str(config.hydra.runtime.choices["hydra/sweeper"])
+        if config.sweep and sweeper != PLANNED:
+            raise ConfigurationError(f"hydra/sweeper={sweeper} knows no grid of sweep=NAME")
+        later = [name for name in ("dry_run", "check", "detach") if config[name]]
+        if later and sweeper not in GIVEN_ONCE:
+            raise ConfigurationError(
+                f"{later[0]}=true: hydra/sweeper={sweeper} finds its jobs by running"
+            )
         batch = make_plan(config, self._loader, overrides, first)
-        all_at_once = str(config.hydra.runtime.choices["hydra/sweeper"]) in GIVEN_ONCE
-        if all_at_once:
+        if sweeper in GIVEN_ONCE:
             batch.require_different()
         for job in batch.jobs:
             _check(job)
@@ -100,6 +109,8 @@ class SweepRun:
         if config.check:
             _run_checks(batch)
             return []
+        # What became of the jobs of earlier batches is on disk.
+        self._jobs = {key: PlannedJob.of(job.request) for key, job in self._jobs.items()}
         self._jobs |= {job.request.config_hash: job for job in batch.jobs}
         plan = replace(batch, jobs=tuple(self._jobs.values()))
         with nothing_empty(plan.folder, Path(config.paths.outputs)):
@@ -111,44 +122,44 @@ class SweepRun:
             print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
             print(f"`mvest collect {plan.folder}` writes what became of them")
             return []
-        self._run(plan, batch, settings)
-        found = {job.hash: job.record for job in finish(plan, self._ended).jobs}
+        ended = _run(plan, batch, settings)
+        found = {job.hash: job.record for job in finish(plan, ended).jobs}
         returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+        # Ten thousand records are not kept while they are logged.
         folder, common = plan.folder, plan.common
-        if all_at_once:
-            # Ten thousand records are not kept while they are logged.
-            self._ended.clear()
-            self._jobs.clear()
-            del plan, batch, found
+        self._jobs = {key: PlannedJob(job.request) for key, job in self._jobs.items()}
+        del ended, found, plan, batch
         log_sweep(folder, common)
         return returned
 
-    def _run(self, plan: Plan, batch: Plan, settings: EngineSettings) -> None:
-        """Run the jobs of a batch that are not done."""
-        left = {job.request.config_hash: job for job in batch.to_run}
-        left = {key: job for key, job in left.items() if key not in self._ended}
-        if not left:
-            return
-        announce_compilation("the first jobs")
-        jobs = list(left.values())
-        ends = run_jobs(
-            [job.request for job in jobs], settings, min(plan.workers, len(jobs)), plan.written_ns
+
+def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]:
+    """Run the jobs of a batch that are not done; returns heads of their records, by hash."""
+    ended: dict[str, Record] = {}
+    left = {job.request.config_hash: job for job in batch.to_run}
+    if not left:
+        return ended
+    announce_compilation("the first jobs")
+    jobs = list(left.values())
+    ends = run_jobs(
+        [job.request for job in jobs], settings, min(plan.workers, len(jobs)), plan.written_ns
+    )
+    try:
+        with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
+            for k, record in ends:
+                ended[jobs[k].request.config_hash] = record
+                bar.ended(jobs[k], record)
+    except KeyboardInterrupt:
+        ends.close()
+        collected(plan, ended)
+        raise
+    except OSError as error:
+        # The jobs that ended are on disk.
+        print(
+            f"error: the sweep cannot go on ({error}); run the same command again to go on",
+            file=sys.stderr,
         )
-        try:
-            with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
-                for k, record in ends:
-                    self._ended[jobs[k].request.config_hash] = record
-                    bar.ended(jobs[k], record)
-        except KeyboardInterrupt:
-            ends.close()
-            collected(plan, self._ended)
-            raise
-        except OSError as error:
-            # The jobs that ended are on disk.
-            print(
-                f"error: the sweep cannot go on ({error}); run the same command again to go on",
-                file=sys.stderr,
-            )
+    return ended
 
 
 def collect_sweep(folder: Path) -> int:

@@ -33,6 +33,12 @@ Execute = Callable[[Request, int | None, int], Record]
 LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
 """Dask's cluster of this machine, and where it listens."""
 
+WHERE, TLS = ("address", "scheduler_file", "cluster"), ("ca_file", "cert", "key")
+"""Settings that name a cluster; files of a ``tls://`` address."""
+
+START_S = 60
+"""Seconds within which the first worker on this machine must be there."""
+
 DASK = {
     # Jobs take minutes: none waits at a worker that is busy.
     "distributed.scheduler.worker-saturation": 1.0,
@@ -65,7 +71,7 @@ class EngineSettings:
     @property
     def elsewhere(self) -> bool:
         """Whether dask runs the jobs."""
-        return any((self.address, self.scheduler_file, self.cluster))
+        return any(getattr(self, name) for name in WHERE)
 
 
 def run_on_dask(
@@ -166,6 +172,9 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
             client = stack.enter_context(
                 Client(where, scheduler_file=settings.scheduler_file, security=secure)
             )
+            if settings.cluster == LOCAL:
+                # With wrong options it would start workers without end.
+                client.wait_for_workers(1, START_S)
         except (OSError, RuntimeError, ValueError, TypeError, KeyError, ImportError) as error:
             name = settings.cluster or settings.address or settings.scheduler_file
             why = one_line(error, 300)
@@ -187,13 +196,25 @@ def _close(cluster: Any) -> None:
 
 
 def require_engine(settings: EngineSettings) -> None:
-    """Refuse a cluster of which nobody knows, or for which nothing is installed.
+    """Refuse a cluster that is not there, or for which nothing is installed.
 
     Raises
     ------
     ConfigurationError
         One line.
     """
+    if settings.n_jobs == 0:
+        raise ConfigurationError("hydra.launcher.n_jobs = 0, expected 1 or more; -1: one each core")
+    named = [name for name in WHERE if getattr(settings, name)]
+    if len(named) > 1:
+        raise ConfigurationError(f"hydra.launcher: {' and '.join(named)}, expected one of them")
+    if settings.tls is not None and set(settings.tls) != set(TLS):
+        raise ConfigurationError(f"hydra.launcher.tls: expected {', '.join(TLS)}")
+    files = {f"tls.{name}": file for name, file in (settings.tls or {}).items()}
+    for name, file in {"scheduler_file": settings.scheduler_file, **files}.items():
+        # Dask would wait for the one without end, and name none of the others.
+        if file and not Path(file).is_file():
+            raise ConfigurationError(f"hydra.launcher.{name} = {file}: no such file")
     if settings.elsewhere:
         try:
             import distributed  # noqa: F401
@@ -229,6 +250,7 @@ def _cluster(name: str, options: Mapping[str, Any], folder: Path) -> Any:
             "dashboard_address": f"{LOOPBACK}:0",
             "worker_dashboard_address": f"{LOOPBACK}:0",
             "memory_limit": None,
+            "silence_logs": logging.CRITICAL,
         }
         return LocalCluster(**{**own, **options})
     own = {

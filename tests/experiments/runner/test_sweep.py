@@ -250,6 +250,21 @@ def test_the_folders_of_jobs_may_be_named_otherwise(run):
     assert len(runs()) == 2
 
 
+def test_a_sweep_s_own_grids_are_not_left_out_by_another_sweeper(run):
+    status, _, err = run("sweep=debug", "hydra/sweeper=basic", "publish=true")
+    assert (status, err.count("\n"), runs()) == (2, 1, [])
+    assert "hydra/sweeper=basic" in err
+
+
+def test_jobs_of_earlier_batches_are_part_of_the_sweep(run):
+    asked = ("hydra/sweeper=basic", "hydra.sweeper.max_batch_size=1")
+    for forced, count in ((), 2), (("force=true",), 4):
+        status, _, err = run("-m", "experiment=debug", "seed=1,2", *asked, *forced)
+        assert status == 0, err
+        assert all(one.converged for one in read_sweep(Path("outputs/debug/sweep.json")).records)
+        assert len(runs()) == count
+
+
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
     _, out, _ = run("sweep=debug", "publish=true", "filter.method.tolerance=1e-3")
     assert "left as it is" in out
@@ -260,6 +275,16 @@ def test_results_are_renewed_by_a_sweep_as_configured_only(run):
 
 
 WRONG = [
+    (("sweep=debug", "hydra.launcher.scheduler_file=nope.json"), "nope.json: no such file"),
+    (
+        ("sweep=debug", "hydra.launcher.tls={ca_file: file, cert: file, key: nope}"),
+        "hydra.launcher.tls.key = nope: no such file",
+    ),
+    (("sweep=debug", "hydra.launcher.tls={ca_file: file}"), "tls: expected ca_file, cert, key"),
+    (
+        ("sweep=debug", "hydra.launcher.cluster=LocalCluster", "hydra.launcher.address=tcp://a:1"),
+        "hydra.launcher: address and cluster, expected one of them",
+    ),
     (("sweep=nope",), "Could not find 'sweep/nope'; known: "),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
     (("sweep=debug", "sweep.sise=full"), "did you mean size?"),
