@@ -41,7 +41,11 @@ def run(run, monkeypatch):
         monkeypatch.setenv(name, "1")
     guard.own_worker.cache_clear()
 
-    yield lambda *arguments: run(*QUICK, *arguments)
+    def call(*arguments):
+        options = [one for one in arguments if one.startswith("-")]
+        return run(*options, *QUICK, *(one for one in arguments if one not in options))
+
+    yield call
     guard.own_worker().close()
     guard.own_worker.cache_clear()
     for worker in engine._idle.pop(str(Path.cwd()), ()):
