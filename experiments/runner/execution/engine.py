@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import shlex
+import signal
 import sys
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -24,6 +25,7 @@ from experiments.common.records.record import Record, stamp
 from experiments.common.study import Result
 from experiments.runner.execution.guard import WorkerProcess, new_worker, run_apart
 from experiments.runner.jobs.folder import require_writable, write_failure
+from experiments.runner.jobs.interruption import ASKING
 from experiments.runner.jobs.request import Request
 from experiments.sweeps.collected import head_of
 from mvest.errors import ConfigurationError, MvestError
@@ -307,8 +309,12 @@ def require_engine(settings: EngineSettings) -> None:
 
 def _kinds() -> dict[str, Any]:
     """Name -> class of each cluster that dask_jobqueue knows."""
+    before = {number: signal.getsignal(number) for number in ASKING}
     import dask_jobqueue
 
+    # On import it has them end the process with status 0.
+    for number, handler in before.items():
+        signal.signal(number, handler)
     return {name: kind for name, kind in vars(dask_jobqueue).items() if name.endswith("Cluster")}
 
 
