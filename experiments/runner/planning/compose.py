@@ -86,7 +86,7 @@ def make_plan(
         If a job cannot be composed.
     """
     swept = config.hydra.sweeper.get("params") or {}
-    typed = OmegaConf.to_container(config.hydra.overrides.hydra)  # an interpolation as a text
+    typed: Any = OmegaConf.to_container(config.hydra.overrides.hydra)  # interpolations as texts
     named = any(str(line).partition("=")[0] == SUBDIR for line in typed)
     compose = _Composer(config, loader, reuse=not named)
     varied = _varied(config, jobs, loader)
