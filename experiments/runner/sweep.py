@@ -98,7 +98,7 @@ class SweepRun:
             raise ConfigurationError(
                 f"{later[0]}=true: hydra/sweeper={sweeper} finds its jobs by running"
             )
-        batch = make_plan(config, self._loader, overrides, first)
+        batch = make_plan(config, self._loader, overrides, first, settings.at_a_time)
         if sweeper in GIVEN_ONCE:
             batch.require_different()
         for job in batch.jobs:
@@ -130,6 +130,12 @@ class SweepRun:
         self._jobs = {key: PlannedJob(job.request) for key, job in self._jobs.items()}
         del ended, found, plan, batch
         log_sweep(folder, common)
+        if sweeper not in GIVEN_ONCE and any(
+            one._return_value != one._return_value for one in returned
+        ):
+            raise ConfigurationError(
+                f"objective = {config.objective}: a job has no such number (MLflow shows all names)"
+            )
         return returned
 
 

@@ -108,6 +108,7 @@ def test_the_queue_is_empty_after_the_command_was_ended_and_it_goes_on(tmp_path,
     until(lambda: results(tmp_path))
     os.kill(sweep.pid, number)
     end(sweep)
+    assert sweep.returncode == (130 if number == signal.SIGINT else -number)
     done = results(tmp_path)
     until(lambda: not asked("squeue", "--noheader"))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import shlex
+import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -19,6 +20,7 @@ from uuid import uuid4
 
 from experiments.common.records.record import Record
 from experiments.runner.jobs.folder import require_writable, write_failure
+from experiments.runner.jobs.interruption import ASKING
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
 from mvest.processes import environment, python
@@ -36,8 +38,8 @@ LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
 WHERE, TLS = ("address", "scheduler_file", "cluster"), ("ca_file", "cert", "key")
 """Settings that name a cluster; files of a ``tls://`` address."""
 
-START_S = 60
-"""Seconds within which the first worker on this machine must be there."""
+CONNECT_S, START_S = 15, 60
+"""Seconds within which a scheduler answers, and the first worker on this machine is there."""
 
 DASK = {
     # Jobs take minutes: none waits at a worker that is busy.
@@ -67,6 +69,13 @@ class EngineSettings:
     options: dict[str, Any] | None = None
     jobs: Annotated[int, within(1, 100_000, "", "workers")] = 1
     adapt: bool = False
+
+    @property
+    def at_a_time(self) -> int:
+        """Jobs that run at a time, as far as it is known."""
+        if self.elsewhere:
+            return self.jobs
+        return max(1, self.n_jobs if self.n_jobs > 0 else (os.cpu_count() or 1) + 1 + self.n_jobs)
 
     @property
     def elsewhere(self) -> bool:
@@ -170,7 +179,12 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
                 if settings.adapt:
                     where.adapt(minimum=0, maximum=settings.jobs)
             client = stack.enter_context(
-                Client(where, scheduler_file=settings.scheduler_file, security=secure)
+                Client(
+                    where,
+                    scheduler_file=settings.scheduler_file,
+                    security=secure,
+                    timeout=CONNECT_S,
+                )
             )
             if settings.cluster == LOCAL:
                 # With wrong options it would start workers without end.
@@ -233,8 +247,12 @@ def require_engine(settings: EngineSettings) -> None:
 
 def _kinds() -> dict[str, Any]:
     """Name -> class of each cluster that dask_jobqueue knows."""
+    before = {number: signal.getsignal(number) for number in ASKING}
     import dask_jobqueue
 
+    # On import it has them end the process with status 0.
+    for number, handler in before.items():
+        signal.signal(number, handler)
     return {name: kind for name, kind in vars(dask_jobqueue).items() if name.endswith("Cluster")}
 
 

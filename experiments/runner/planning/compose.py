@@ -8,7 +8,6 @@ grid and takes the place of a grid's own choices.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -66,7 +65,11 @@ def expand(config: DictConfig, arguments: Sequence[str], loader: ConfigLoader) -
 
 
 def make_plan(
-    config: DictConfig, loader: ConfigLoader, jobs: Sequence[Sequence[str]], first: int = 0
+    config: DictConfig,
+    loader: ConfigLoader,
+    jobs: Sequence[Sequence[str]],
+    first: int = 0,
+    workers: int = 1,
 ) -> Plan:
     """Compose jobs.
 
@@ -79,6 +82,8 @@ def make_plan(
         The overrides of each.
     first : int
         Number of the first of them in the sweep.
+    workers : int
+        Jobs that will run at a time.
 
     Raises
     ------
@@ -128,7 +133,7 @@ def make_plan(
         folder=Path(str(config.hydra.sweep.dir)),
         sweep=sweep,
         jobs=tuple(planned),
-        workers=_workers(config),
+        workers=workers,
         publish=as_configured(config) if config.publish and sweep else None,
     )
 
@@ -194,9 +199,9 @@ class _Composer:
 def _varied(
     config: DictConfig, typed: list[str], jobs: Sequence[Sequence[str]], loader: ConfigLoader
 ) -> set[str]:
-    """Settings that are varied, and of which the factors of the configuration say nothing.
+    """Settings that are varied and that become factors of the jobs.
 
-    Those of a sweep's own grid are the factors that its configuration names.
+    What a sweep's own grid varies is left out: its configuration names factors itself.
     """
     parser = OverridesParser.create(config_loader=loader)
     swept = parser.parse_overrides(typed)
@@ -217,12 +222,3 @@ def _factor(override: Override) -> Any:
 def _same(one: Any, other: Any) -> bool:
     """Whether they are written alike; 1 and 1.0 are not."""
     return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
-
-
-def _workers(config: DictConfig) -> int:
-    """Jobs that run at a time, as far as it is known."""
-    launcher = config.hydra.launcher
-    if any(launcher.get(name) for name in ("address", "scheduler_file", "cluster")):
-        return int(launcher.jobs)
-    jobs = int(launcher.get("n_jobs") or 1)
-    return max(1, jobs if jobs > 0 else (os.cpu_count() or 1) + 1 + jobs)

@@ -71,7 +71,7 @@ class PlannedJob:
 
     @property
     def short_hash(self) -> str:
-        """What files call it."""
+        """First digits of the hash of its configuration, by which files name it."""
         return self.request.config_hash[:16]
 
     @property
@@ -187,7 +187,7 @@ class Plan:
 
     @classmethod
     def read(cls, folder: Path, *, look: bool = True) -> Plan:
-        """The plan in a sweep's folder; unless it is to ``look``, as if no job had been run.
+        """The plan in a sweep's folder; ``look`` reads what earlier attempts ended with.
 
         The process then works where the sweep was planned.
 

@@ -260,6 +260,17 @@ def test_a_sweep_s_own_grids_are_not_left_out_by_another_sweeper(run):
     assert "hydra/sweeper=basic" in err
 
 
+def test_a_cluster_s_package_takes_no_signals_away():
+    code = """
+import signal
+from experiments.runner.execution.cluster import EngineSettings, require_engine
+before = signal.getsignal(signal.SIGINT)
+require_engine(EngineSettings(cluster="SLURMCluster"))
+assert signal.getsignal(signal.SIGINT) is before
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
 def test_jobs_of_earlier_batches_are_part_of_the_sweep(run):
     asked = ("hydra/sweeper=basic", "hydra.sweeper.max_batch_size=1")
     for forced, count in ((), 2), (("force=true",), 4):
