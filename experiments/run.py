@@ -27,8 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.config import register
 from experiments.common.places import CONF
+from experiments.interruption import TRACEBACKS, interruptible
 from experiments.runner.jobs.folder import FailedRunError, nothing_empty
-from experiments.runner.jobs.interruption import TRACEBACKS, interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from mvest.errors import ConfigurationError, MvestError

@@ -12,9 +12,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from experiments.interruption import raised
 from experiments.runner.execution.job import answer
 from experiments.runner.jobs.folder import LOG
-from experiments.runner.jobs.interruption import raised
 from experiments.runner.jobs.request import Request
 
 
