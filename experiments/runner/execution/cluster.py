@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import uuid4
 
 from experiments.common.records.record import Record
-from experiments.runner.jobs.folder import require_writable, write_failure
+from experiments.runner.jobs.folder import write_failure
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
+from mvest.files import require_writable
 from mvest.processes import environment
 from mvest.quantities import within
 from mvest.reading.text import one_line
