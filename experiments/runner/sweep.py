@@ -211,7 +211,7 @@ def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:
     returned.return_value = (
         objective_of(record, objective)
         if record.converged
-        else FailedRunError(record.reason, job.folder)
+        else FailedRunError(f"{record.reason} (recorded in {job.folder})")
     )
     return returned
 

@@ -19,7 +19,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from experiments.common.config import hash_of, plain
 from experiments.results.publish import as_configured, publish_as
@@ -86,9 +86,11 @@ def make_plan(
         If a job cannot be composed.
     """
     swept = config.hydra.sweeper.get("params") or {}
-    named = any(line.partition("=")[0] == SUBDIR for line in config.hydra.overrides.hydra)
+    # As they were typed: an interpolation in them means something in a job only.
+    typed: Any = OmegaConf.to_container(config.hydra.overrides)
+    named = any(line.partition("=")[0] == SUBDIR for line in typed["hydra"])
     compose = _Composer(config, loader, reuse=not named)
-    varied = _varied(config, jobs, loader)
+    varied = _varied(config, typed["task"], jobs, loader)
     planned: list[PlannedJob] = []
     common: dict[str, Any] = {}
     for number, overrides in enumerate(jobs, first):
@@ -99,12 +101,14 @@ def make_plan(
             line.partition("=")[0] == "time_limit_s" for line in overrides
         ):
             values["time_limit_s"] = TIME_LIMIT_S
-        typed = {key: value for key, value in compose.values.items() if key in varied}
-        values["factors"] = {**typed, **values["factors"]}
+        values["factors"] = {
+            **{key: value for key, value in compose.values.items() if key in varied},
+            **values["factors"],
+        }
         config_hash = hash_of(values)
         subdir = config_hash[:HASH_DIGITS]
         if named:
-            with open_dict(composed):
+            with read_write(composed.hydra), open_dict(composed.hydra):
                 composed.hydra.job.id = composed.hydra.job.num = number
             subdir = str(composed.hydra.sweep.subdir)
         # Ten thousand configurations fit into memory where they share what is alike in them.
@@ -187,13 +191,15 @@ class _Composer:
         )
 
 
-def _varied(config: DictConfig, jobs: Sequence[Sequence[str]], loader: ConfigLoader) -> set[str]:
+def _varied(
+    config: DictConfig, typed: list[str], jobs: Sequence[Sequence[str]], loader: ConfigLoader
+) -> set[str]:
     """Settings that are varied, and of which the factors of the configuration say nothing.
 
     Those of a sweep's own grid are the factors that its configuration names.
     """
     parser = OverridesParser.create(config_loader=loader)
-    swept = parser.parse_overrides(list(config.hydra.overrides.task))
+    swept = parser.parse_overrides(typed)
     first = set(jobs[0]) if jobs else set()
     lines = {line for overrides in jobs for line in first.symmetric_difference(overrides)}
     found = {line.lstrip("+~").partition("=")[0] for line in lines}

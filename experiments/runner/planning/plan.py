@@ -227,19 +227,11 @@ class Plan:
             raise InputError(f"{place} is no plan of this version: {why}") from error
 
     def names(self) -> list[str]:
-        """What sets each job apart from all others, in a few words."""
+        """What sets each job apart, in a few words: the factors in which jobs differ."""
         factors = [_texts(job.values["factors"]) for job in self.jobs]
-        shared = set(factors[0]).intersection(*factors)
+        shared = set(factors[0]).intersection(*factors) if len(factors) > 1 else set()
         found = [", ".join(text for text in texts if text not in shared) for texts in factors]
-        lines = [job.request.overrides for job in self.jobs]
-        common: dict[str, set[str]] = {}
-        for name, typed in zip(found, lines, strict=True):
-            common[name] = common.get(name, set(typed)).intersection(typed)
-        names = []
-        for name, job in zip(found, self.jobs, strict=True):
-            own = [line for line in job.request.overrides if line not in common[name]]
-            names.append(", ".join(filter(None, [name, *own])) or str(job.values["row"]))
-        return names
+        return [name or str(job.values["row"]) for name, job in zip(found, self.jobs, strict=True)]
 
     def summary(self) -> str:
         """How much is done and how much is left, in one line."""

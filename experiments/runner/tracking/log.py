@@ -129,7 +129,7 @@ def _job(folder: Path, name: str | None) -> Entry | None:
     tags = {
         "config_hash": source.config_hash,
         "status": record.status,
-        "reason": record.reason,
+        "reason": record.reason[:5000],  # as many letters as MLflow takes
         "verdict": next((one.verdict.trust for one in record.estimates if one.verdict), None),
         "plausible": f"no: {why}" if why else "yes",
         "mlflow.source.git.commit": source.git.sha,

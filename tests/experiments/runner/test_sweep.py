@@ -3,6 +3,7 @@
 import errno
 import io
 import json
+import math
 import os
 import re
 import resource
@@ -15,7 +16,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from experiments.runner import sweep
+from experiments.runner import plugins, sweep
 from experiments.runner.execution import engine, guard
 from experiments.runner.jobs import limits
 from experiments.runner.jobs.request import Request
@@ -173,6 +174,68 @@ def test_a_sweep_from_the_command_line_is_planned_as_well(run):
     assert [record.estimates[0].seed for record in found.records] == [1, 2, 3]
     _, out, _ = run("-m", "experiment=debug", "seed=1,2,3,4")
     assert "3 done, 0 failed before, 1 to run" in out
+
+
+def test_a_job_returns_its_objective(run, monkeypatch):
+    returned = []
+    launch = plugins.JobLauncher.launch
+
+    def kept(*given, **named):
+        returned.append(launch(*given, **named))
+        return returned[-1]
+
+    monkeypatch.setattr(plugins.JobLauncher, "launch", kept)
+    Path("raise-2").touch()
+    # Hydra's own sweeper stops with the first job that failed.
+    status, _, err = run("-m", "hydra/sweeper=basic", "experiment=debug", "seed=1,2")
+    assert status == 1
+    assert "no estimate: RuntimeError: it broke" in err
+    status, _, err = run("-m", "hydra/sweeper=basic", "experiment=debug", "seed=1,2")
+    assert status == 0, err
+    run("-m", "experiment=debug", "seed=1,2", "objective=std.anterior")
+    run("-m", "experiment=debug", "seed=1,2", "objective=no_such_number")
+    (first, failed), done, std, none = returned
+    # Percent of the truths, 6.23 and 2.09: the estimates are 6.1 and 2.0, then 6.2 and 2.0.
+    assert first.return_value == pytest.approx(100 * (0.13 / 6.23 + 0.09 / 2.09) / 2)
+    assert failed.status.name == "FAILED"
+    assert done[1].return_value == pytest.approx(100 * (0.03 / 6.23 + 0.09 / 2.09) / 2)
+    assert [one.return_value for one in std] == [0.1, 0.1]
+    assert all(math.isnan(one.return_value) for one in none)
+    assert len(runs()) == 3
+    assert yaml.safe_load(Path("outputs/debug/multirun.yaml").read_text())["seed"] == 1
+
+
+def test_jobs_may_come_in_several_batches(run, monkeypatch):
+    def sweep_twice(self, arguments):
+        launcher = self._parts[2]
+        plain = [line for line in arguments if "seed" not in line]
+        first = launcher.launch([[*plain, "seed=1"], [*plain, "seed=2"]], 0)
+        # One of them is tried once more.
+        return [*first, *launcher.launch([[*plain, "seed=2"], [*plain, "seed=3"]], 2)]
+
+    monkeypatch.setattr(plugins.GridSweeper, "sweep", sweep_twice)
+    monkeypatch.setattr(sweep, "GIVEN_ONCE", ())
+    status, out, err = run("-m", "experiment=debug", "seed=1,2,3")
+    assert status == 0, err
+    assert runs() == ["1", "2", "3"]
+    found = read_sweep(Path("outputs/debug/sweep.json")).records
+    assert [record.factors for record in found] == [{"seed": 1}, {"seed": 2}, {"seed": 3}]
+    assert "debug: 3 of 3 jobs done" in out
+
+
+def test_the_folders_of_jobs_may_be_named_otherwise(run):
+    named = ("-m", "experiment=debug", "seed=1,2", "hydra.sweep.subdir=job-${hydra.job.num}")
+    assert run(*named)[0] == 0
+    assert {path.parent.name for path in Path("outputs").rglob("done")} == {"job-0", "job-1"}
+    status, out, _ = run(*named)
+    assert status == 0
+    assert "nothing left" in out
+    overrides = Path("outputs/debug/job-1/.hydra/overrides.yaml").read_text()
+    assert "seed=2" in yaml.safe_load(overrides)
+    status, _, err = run(*named[:3], "hydra.sweep.subdir=one")
+    assert status == 2
+    assert "two jobs have one folder, outputs/debug/one: " in err
+    assert len(runs()) == 2
 
 
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
