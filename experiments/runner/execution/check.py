@@ -19,10 +19,9 @@ def require_admissible(values: Mapping[str, Any]) -> None:
     MvestError
         If a setting is inadmissible; the message names it.
     """
-    study = load_study(values["study"])
     require_no_password(values["tracking"]["uri"])
     mechanics_of(values)
-    study.require(values)
+    load_study(values["study"]).require(values)
 
 
 def require_checks(values: Mapping[str, Any]) -> tuple[Check, ...]:

@@ -48,14 +48,14 @@ def run_job(request: Request) -> Record:
             "force=true runs it again"
         )
         study.finish(_job(study, request), record)
-    elif values["time_limit_s"] is None:
+        return record
+    if values["time_limit_s"] is None:
         memory_gb = values["memory_limit_gb"] or default_memory_gb()
-        record = attempt(request, partial(compute, request, memory_gb))
-    else:
-        # Only another process can be stopped at any moment.
-        record = run_apart(request, aloud=True)
-        if record.converged:
-            _tell(record, folder)
+        return attempt(request, partial(compute, request, memory_gb))
+    # Only another process can be stopped at any moment.
+    record = run_apart(request, aloud=True)
+    if record.converged:
+        _tell(record, folder)
     return record
 
 

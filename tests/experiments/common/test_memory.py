@@ -1,4 +1,4 @@
-"""What is refused before anything is built."""
+"""Memory that is foreseen: what needs too much of it is refused before anything is built."""
 
 import sys
 from pathlib import Path
