@@ -20,6 +20,8 @@ from experiments.cli import main
 from experiments.common.records.metrics import implausible, metrics
 from experiments.common.records.record import Record, write_record
 from experiments.runner.collecting import compared
+from experiments.runner.jobs.folder import mark_done
+from experiments.runner.jobs.request import Request
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.tracking import log
 from experiments.runner.tracking.dashboard import last_sweep
@@ -122,7 +124,7 @@ def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
     write_record(folder / "result.json", record)
     (folder / "iterates.png").write_bytes(b"picture")
     if record.converged:
-        (folder / "done").touch()
+        mark_done(folder)
     return folder
 
 
@@ -152,7 +154,8 @@ def make_sweep(outputs: Path, **jobs: dict) -> Path:
             make_job(outputs, name, config, **changes)
         start = f"[{','.join(f'{value:g}' for value in config['filter']['initial'])}]"
         words = (f"filter.initial={start}", f"seed={config['seed']}", "+experiment=debug")
-        planned.append(PlannedJob((name * 64)[:64], folder / name, words, config, None, done=False))
+        request = Request(config, (name * 64)[:64], folder / name, None, words)
+        planned.append(PlannedJob(request))
         record = make_record((name * 64)[:64], seconds_total=3.0, **changes)
         swept.append(SweptJob(hash=(name * 64)[:16], seed=1, record=record))
     Plan("debug", folder, {}, tuple(planned), 1).write()
@@ -271,6 +274,7 @@ def test_again_changes_nothing_and_another_result_takes_the_place(tmp_path) -> N
         job / "result.json",
         make_record(first.data.tags["config_hash"], estimates=(estimate((6.1, 2.1)),)),
     )
+    mark_done(job)
     log_run(job, make_config(tmp_path))
     (run,) = stored(tmp_path)
     assert run.info.run_id != first.info.run_id
