@@ -109,10 +109,13 @@ class SweepRun:
         self._run(plan, batch, settings)
         found = {job.hash: job.record for job in finish(plan, self._ended).jobs}
         returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+        folder, common = plan.folder, plan.common
         if all_at_once:
             # Ten thousand records are not kept while they are logged.
-            self._ended, found = {}, {}
-        log_sweep(plan.folder, plan.common)
+            self._ended.clear()
+            self._jobs.clear()
+            del plan, batch, found
+        log_sweep(folder, common)
         return returned
 
     def _run(self, plan: Plan, batch: Plan, settings: EngineSettings) -> None:

@@ -41,7 +41,7 @@ def run(run, monkeypatch):
         monkeypatch.setenv(name, "1")
     guard.own_worker.cache_clear()
 
-    yield lambda *arguments: run(*arguments, *QUICK)
+    yield lambda *arguments: run(*QUICK, *arguments)
     guard.own_worker().close()
     guard.own_worker.cache_clear()
     for worker in engine._idle.pop(str(Path.cwd()), ()):
@@ -174,6 +174,18 @@ def test_a_sweep_from_the_command_line_is_planned_as_well(run):
     assert [record.estimates[0].seed for record in found.records] == [1, 2, 3]
     _, out, _ = run("-m", "experiment=debug", "seed=1,2,3,4")
     assert "3 done, 0 failed before, 1 to run" in out
+
+
+def test_any_number_of_workers_gives_the_same_files(run):
+    for workers in ("1", "3"):
+        outputs = (f"paths.outputs=with-{workers}", f"hydra.launcher.n_jobs={workers}")
+        assert run("sweep=debug", "publish=true", *outputs)[0] == 0
+    one, three = (
+        {path.name: path.read_bytes() for path in Path(f"with-{n}/results").glob("*.*")}
+        for n in (1, 3)
+    )
+    assert one == three
+    assert {"sweep_debug.csv", "sweep_debug.md", "sweep_debug.png"} <= one.keys()
 
 
 def test_a_job_returns_its_objective(run, monkeypatch):

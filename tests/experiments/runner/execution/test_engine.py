@@ -104,7 +104,8 @@ def test_the_job_of_a_killed_worker_is_run_again_by_itself(sweep, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_nothing_runs_on_when_the_command_is_ended(sweep, tmp_path, number):
-    Path("wait-3").touch()
+    # In compiled code, which holds the interpreter's lock.
+    Path("hold-3").touch()
     running = sweep()
     until(lambda: 3 in runs())
     os.kill(running.pid, number)
