@@ -18,7 +18,7 @@ from pathlib import Path
 
 from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser
-from experiments.runner.jobs.interruption import interruptible
+from experiments.interruption import interruptible
 from mvest import __version__
 from mvest.errors import ConfigurationError, InputError, MvestError
 

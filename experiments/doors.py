@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.schema import build, schema
 from experiments.console import Parser
-from experiments.runner.jobs.interruption import interruptible
+from experiments.interruption import interruptible
 from mvest.cases import exporting, importing
 from mvest.cases.writer import require_new, write_case
 from mvest.errors import ConfigurationError

@@ -27,8 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.config import register
 from experiments.common.places import CONF
-from experiments.runner.jobs.folder import FailedRunError, nothing_empty
-from experiments.runner.jobs.interruption import TRACEBACKS, interruptible
+from experiments.interruption import TRACEBACKS, interruptible
+from experiments.runner.jobs.folder import RESULT, FailedRunError, nothing_empty
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from mvest.errors import ConfigurationError, MvestError
@@ -81,7 +81,7 @@ def main() -> int:
 
 
 def run_alone(config: DictConfig) -> float:
-    """One run by itself: what it means, if that is all that is asked; otherwise run and log it.
+    """One run by itself: plan or check it, if that is all that is asked; otherwise run and log it.
 
     Returns its objective; NaN where there is none.
 
@@ -93,31 +93,32 @@ def run_alone(config: DictConfig) -> float:
         If the computation found no estimate; the run is recorded all the same.
     """
     # Imports every study, for seconds: not where only help is asked for.
-    from experiments.runner.execution.check import require_admissible
+    from experiments.results.publish import publish_run
+    from experiments.runner.execution.check import require_admissible, require_checks
     from experiments.runner.execution.job import run_job
-    from experiments.runner.jobs.folder import read_result
     from experiments.runner.planning.plan import Plan, PlannedJob
     from experiments.runner.sweep import objective_of
     from experiments.runner.tracking.log import log_run
 
     with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
         request = Request.of(config)
+        values, folder = request.values, request.folder
+        require_admissible(values)
         if config.dry_run:
-            name, folder = str(request.values["name"]), request.folder.parent
-            plan = Plan(name, folder, {}, (PlannedJob.of(request),), 1)
-            require_admissible(request.values)
+            plan = Plan(str(values["name"]), folder.parent, {}, (PlannedJob.of(request),), 1)
             print(plan.summary(), plan.listing(), sep="\n")
             return math.nan
-        try:
-            run_job(request)
-        except FailedRunError:
-            log_run(request.folder, request.values)
-            raise
         if config.check:
+            for check in require_checks(values):
+                print(check(values, folder), flush=True)
             return math.nan
-        log_run(request.folder, request.values)
-        record = read_result(request.folder, request.config_hash)
-        return math.nan if record is None else objective_of(record, config.objective)
+        record = run_job(request)
+        publish_run(values, record, folder, request.publish_as)
+        log_run(folder, values)
+        if not record.converged:
+            detail = f" ({record.detail})" if record.detail else ""
+            raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")
+        return objective_of(record, config.objective)
 
 
 def _require_options(arguments: Sequence[str]) -> None:

@@ -6,9 +6,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.interruption import interruptible
 from experiments.results.keep import RECORDS, regenerate
 from experiments.results.page import write_report
-from experiments.runner.jobs.interruption import interruptible
 from experiments.sweeps.collected import read_sweeps
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError

@@ -33,6 +33,16 @@ class MeshingError(MvestError):
     """An admissible surface could not be filled with an admissible mesh."""
 
 
+def message_of(error: BaseException) -> str:
+    """What an error says: one of a file with its name, one that nobody foresaw with its type."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    text, kind = str(error).strip(), type(error).__name__
+    if isinstance(error, MvestError | OSError | MemoryError):
+        return text or kind
+    return f"{kind}: {text}"
+
+
 def require_numbers(owner: object, what: str, *names: str, least: float | None = None) -> None:
     """Raise InputError where an attribute is no finite number above 0, or of at least ``least``.
 

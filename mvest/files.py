@@ -68,6 +68,23 @@ def write_atomically(
     return target
 
 
+def require_writable(folder: Path) -> None:
+    """Make a folder if need be, and refuse one that cannot be written before anything is computed.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f"{PREFIX}{uuid.uuid4().hex}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}") from error
+
+
 def sha256_of(path: Path) -> str:
     """SHA-256 (64 hexadecimal digits) of the bytes of a file, or of all that lies in a folder.
 

@@ -24,12 +24,7 @@ from experiments.runner.collecting.collect import NOT_RUN, collect
 from experiments.runner.execution.check import require_admissible
 from experiments.runner.execution.cluster import EngineSettings, require_engine
 from experiments.runner.execution.engine import run_jobs
-from experiments.runner.jobs.folder import (
-    FailedRunError,
-    last_record,
-    nothing_empty,
-    require_writable,
-)
+from experiments.runner.jobs.folder import FailedRunError, last_record, nothing_empty
 from experiments.runner.planning.compose import make_plan
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.planning.progress import SweepBar
@@ -37,7 +32,7 @@ from experiments.runner.tracking.log import SWEEP, log_sweep
 from experiments.sweeps.collected import Sweep, write_sweep_file
 from experiments.sweeps.report import text_of, write_sweep
 from mvest.errors import ConfigurationError, MvestError
-from mvest.files import write_atomically
+from mvest.files import require_writable, write_atomically
 
 MULTIRUN, TABLE = "multirun.yaml", "jobs.parquet"
 """Files in a sweep's folder: its configuration as Hydra writes it, and all its jobs as a table."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.common.config import hash_of, without_places
-from experiments.common.records.record import FIELDS, stamp, write_record
+from experiments.common.records.record import stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.case import STUDY, Settings
@@ -108,9 +108,8 @@ def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypa
     values = plain(composed(*own_case(patient), f"paths.outputs={out}"))
     result = STUDY.run(Job(values, build(Settings, values), out))
     record = stamp(values, hash_of(values), result, 0.0)
-    np.savez(out / FIELDS, **result.arrays)
     write_json(out / "config.json", without_places(values))
-    write_record(out / "result.json", record)
+    write_record(out / "result.json", record, result.arrays)
     names = {path.name for path in STUDY.files(out, record)}
     assert "report.html" in names
     assert leaks(out) == []

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from functools import cache
+from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mvest.errors import InputError
-from mvest.files import sha256_of
+from mvest.files import PREFIX, sha256_of, write_atomically
 from mvest.problem.record import EstimateRecord
 from mvest.provenance import provenance, require_sealed, sealed, write_json
 from mvest.reading.documents import read_mapping
@@ -309,21 +311,40 @@ def _source() -> dict[str, Any]:
     return provenance()
 
 
-def write_record(path: Path, record: Record, arrays: Path | None = None) -> None:
-    """Write a record as JSON, whole or not at all, with digests of itself and of its arrays.
+ARRAYS = "arrays_sha256"
+"""In a record's file, the digest of its arrays."""
 
-    The arrays are those beside it if not given.
+NEW_FIELDS = f"{PREFIX}{FIELDS}"
+"""Arrays that belong to the next record."""
+
+
+def write_record(path: Path, record: Record, arrays: Mapping[str, Any] | None = None) -> None:
+    """Write a record as JSON, and its arrays beside it, with digests of both.
+
+    A former record and its arrays are replaced only when their successors are on disk.
 
     Raises
     ------
     InputError
-        If it cannot be written.
+        If they cannot be written; the former ones are then still there.
     """
-    write_json(path, sealed_record(record, arrays or path.with_name(FIELDS)))
+    new = path.with_name(NEW_FIELDS)
+    new.unlink(missing_ok=True)
+    if arrays:
+        write_atomically(new, partial(np.savez_compressed, **arrays))
+    write_json(path, sealed_record(record, new))
+    adopt_arrays(path)
 
 
-ARRAYS = "arrays_sha256"
-"""In a record's file, the digest of its arrays."""
+def adopt_arrays(path: Path) -> None:
+    """Give the arrays that a record was written with their name, also after a kill."""
+    new, fields = path.with_name(NEW_FIELDS), path.with_name(FIELDS)
+    with suppress(InputError, KeyError):
+        digest = read_mapping(path)[ARRAYS]
+        if digest is None:
+            fields.unlink(missing_ok=True)
+        elif new.is_file() and sha256_of(new) == digest:
+            new.replace(fields)
 
 
 def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:

@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import uuid4
 
 from experiments.common.records.record import Record
-from experiments.runner.jobs.folder import require_writable, write_failure
-from experiments.runner.jobs.interruption import ASKING
+from experiments.interruption import ASKING
+from experiments.runner.jobs.folder import write_failure
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
+from mvest.files import require_writable
 from mvest.processes import environment, python
 from mvest.quantities import within
 from mvest.reading.text import one_line

@@ -14,7 +14,7 @@ from pathlib import Path
 from experiments.common.records.record import Record, stamp
 from experiments.common.study import Result
 from experiments.runner.execution.cluster import EngineSettings, run_on_dask
-from experiments.runner.execution.guard import WorkerProcess, new_worker, run_apart
+from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.jobs.request import Request
 from experiments.sweeps.collected import head_of
 from mvest.errors import MvestError
@@ -76,7 +76,7 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
     try:
         worker = idle.pop()
     except IndexError:
-        worker = new_worker()
+        worker = WorkerProcess()
     _busy.add(worker)
     try:
         record = run_apart(request, worker, asked_ns, at_a_time)

@@ -11,12 +11,12 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from subprocess import PIPE, TimeoutExpired
 from typing import Any
 
 from experiments.common.records.record import Record
-from experiments.runner.jobs import folder as jobs
+from experiments.runner.jobs.folder import attempt
 from experiments.runner.jobs.limits import default_memory_gb
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError, InputError
@@ -37,8 +37,8 @@ class StoppedError(Exception):
 class WorkerProcess:
     """A process that runs jobs; started for the first one, and again after it ended."""
 
-    def __init__(self, command: Sequence[str]) -> None:
-        self._command = command
+    def __init__(self, command: Sequence[str] = ()) -> None:
+        self._command = command or WORKER
         self._program: Program | None = None
         self._stopped = False
         atexit.register(self.close)
@@ -117,12 +117,7 @@ class WorkerProcess:
             program.end()
 
 
-def new_worker() -> WorkerProcess:
-    """One that runs the jobs of studies."""
-    return WorkerProcess(WORKER)
-
-
-own_worker = cache(new_worker)
+own_worker = cache(WorkerProcess)
 """The one that this process keeps for a run by itself."""
 
 
@@ -134,21 +129,10 @@ def run_apart(
     *,
     aloud: bool = False,
 ) -> Record:
-    """Run a job in a worker unless it is done already; returns its record, whatever happened.
+    """Run a job in a worker as `attempt` does; by default in the one kept by this process.
 
-    The worker is by default the one kept by this process. A job that was requested at ``asked_ns``
-    with ``force`` is not repeated if it was done since. ``at_a_time`` jobs share the memory of this
-    machine. ``aloud`` is that of `WorkerProcess.run`. Raises a `MvestError` if nothing can be
-    recorded, or a job that runs aloud is refused.
+    ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
+    Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
     """
-    jobs.require_writable(request.folder)
-    with jobs.lock(request.folder):
-        record = jobs.usable_record(request, asked_ns)
-        if record is None:
-            started = time.time()
-            jobs.make_way(request)
-            reason = (worker or own_worker()).run(request, at_a_time, aloud=aloud)
-            if reason is None:
-                record = jobs.read_result(request.folder, request.config_hash)
-            record = record or jobs.write_failure(request, reason or "it left no record", started)
-        return record
+    run = partial((worker or own_worker()).run, request, at_a_time, aloud=aloud)
+    return attempt(request, run, asked_ns)

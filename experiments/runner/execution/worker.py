@@ -9,13 +9,17 @@ import gc
 import json
 import os
 import sys
+import traceback
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from experiments.runner.execution.job import answer
+from experiments.interruption import raised
+from experiments.runner.execution.job import compute
 from experiments.runner.jobs.folder import LOG
-from experiments.runner.jobs.interruption import raised
 from experiments.runner.jobs.request import Request
+from mvest.errors import MvestError, message_of
+from mvest.reading.text import one_line
 
 
 def main() -> None:
@@ -47,6 +51,21 @@ def main() -> None:
             # What a job leaves behind goes before the next; what stays is not looked through again.
             gc.collect()
             gc.freeze()
+
+
+def answer(request: Request, memory_gb: float) -> dict[str, Any]:
+    """Run a job; the ``reason`` is None if it wrote its record.
+
+    ``refused`` says that the request is wrong, and that this process may run another one.
+    """
+    try:
+        compute(request, memory_gb)
+    except Exception as error:
+        # Whatever it is costs its own job; the traceback is in the log.
+        traceback.print_exception(error, file=sys.stdout)
+        reason = one_line(message_of(error))
+        return {"reason": reason, "refused": isinstance(error, MvestError)}
+    return {"reason": None, "refused": False}
 
 
 if __name__ == "__main__":

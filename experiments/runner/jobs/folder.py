@@ -9,47 +9,105 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import yaml
 from filelock import AcquireReturnProxy, FileLock, Timeout
 
 from experiments.common.config import without_places
-from experiments.common.records.record import (
-    ARRAYS,
-    FIELDS,
-    Record,
-    read_record,
-    stamp,
-    write_record,
-)
+from experiments.common.records.record import Record, adopt_arrays, read_record, stamp, write_record
 from experiments.common.study import Result
 from experiments.runner.jobs.request import Request
-from mvest.errors import InputError
-from mvest.files import PREFIX, remove_parts, sha256_of, write_atomically
+from mvest.errors import InputError, message_of
+from mvest.files import remove_parts, require_writable, sha256_of, write_atomically
 from mvest.provenance import write_json
-from mvest.reading.documents import read_mapping
 
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
-"""Files of a job: its marker, record, configuration, output, and lock."""
+HYDRA = ".hydra"
+"""Of a job: its marker, record, configuration, output, lock, and settings as Hydra writes them."""
 
 UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
 """What to say where the numbers of a job are on disk and something else could not be written."""
 
-HYDRA = ".hydra"
-"""Folder of the configuration as Hydra's users know it."""
-
-NEW_FIELDS = f"{PREFIX}{FIELDS}"
-"""Arrays that belong to the next record."""
-
 
 class FailedRunError(Exception):
     """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
+
+
+def is_done(folder: Path) -> bool:
+    """Whether everything that belongs to the present record is on disk."""
+    try:
+        return (folder / DONE).read_text(encoding="ascii") == sha256_of(folder / RESULT)
+    except (OSError, ValueError):
+        return False
+
+
+def mark_done(folder: Path) -> None:
+    """Say that everything that belongs to the present record is on disk."""
+    write_atomically(folder / DONE, sha256_of(folder / RESULT))
+
+
+def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Record | None:
+    """The record of the last attempt; None if there is none of this version and configuration.
+
+    Unless ``cut_off`` it is a failure, or a success that is done. With it, it is a success that is
+    not: something that follows from it could not be written.
+    """
+    try:
+        record = read_record(folder / RESULT)
+    except InputError:
+        return None
+    matches = record.provenance.config_hash == config_hash
+    return record if matches and cut_off == (record.converged > is_done(folder)) else None
+
+
+def usable_record(request: Request, asked_ns: int | None = None) -> Record | None:
+    """The record that makes a run superfluous; None if the job has to be run.
+
+    With ``force`` it must have been written after ``asked_ns``, when the job was requested.
+    """
+    record = last_record(request.folder, request.config_hash)
+    if record is None or not record.converged:
+        return None
+    if request.values["force"]:
+        written_ns = (request.folder / RESULT).stat().st_mtime_ns
+        return record if asked_ns is not None and written_ns > asked_ns else None
+    return record
+
+
+def attempt(request: Request, run: Callable[[], str | None], asked_ns: int | None = None) -> Record:
+    """Run a job unless it is done; returns its record, whatever happened.
+
+    Parameters
+    ----------
+    request : Request
+    run : callable
+        () -> why it wrote no record of the job; None if it did.
+    asked_ns : int, optional
+        As in `usable_record`.
+
+    Raises
+    ------
+    MvestError
+        If nothing can be recorded, or ``run`` raises one.
+    """
+    folder, config_hash = request.folder, request.config_hash
+    require_writable(folder)
+    with lock(folder):
+        record = usable_record(request, asked_ns)
+        if record is None:
+            started = time.time()
+            make_way(request)
+            try:
+                reason = run()
+            except MemoryError as error:
+                reason = message_of(error)
+            record = None if reason else last_record(folder, config_hash)
+            record = record or write_failure(request, reason or "it left no record", started)
+        return record
 
 
 def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
@@ -73,65 +131,6 @@ def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
         raise InputError(f"cannot lock {folder / LOCK}: {error.strerror or error}") from error
 
 
-def read_result(folder: Path, config_hash: str) -> Record | None:
-    """The record in a folder if it is of this version and configuration, and as it was written."""
-    try:
-        record = read_record(folder / RESULT)
-    except InputError:
-        return None
-    return record if record.provenance.config_hash == config_hash else None
-
-
-def is_done(folder: Path) -> bool:
-    """Whether everything that belongs to the present record is on disk."""
-    try:
-        return (folder / DONE).read_text(encoding="ascii") == sha256_of(folder / RESULT)
-    except (OSError, ValueError):
-        return False
-
-
-def result_time(folder: Path) -> int | None:
-    """When the record in a folder was written, in ns; None if there is none."""
-    try:
-        return (folder / RESULT).stat().st_mtime_ns
-    except OSError:
-        return None
-
-
-def finished_record(folder: Path, config_hash: str) -> Record | None:
-    """The record of a job that is done; None if it has to be run."""
-    return read_result(folder, config_hash) if is_done(folder) else None
-
-
-def usable_record(request: Request, asked_ns: int | None = None) -> Record | None:
-    """The record that makes a run superfluous; None if the job has to be run.
-
-    With ``force`` it must have been written after ``asked_ns``, when the job was requested.
-    """
-    written = result_time(request.folder) or 0
-    if request.values["force"] and (asked_ns is None or written <= asked_ns):
-        return None
-    return finished_record(request.folder, request.config_hash)
-
-
-def last_record(folder: Path, config_hash: str) -> Record | None:
-    """The record of the last attempt; None if that was cut off before everything was on disk."""
-    record = read_result(folder, config_hash)
-    cut_off = record is not None and is_done(folder) != record.converged
-    return None if cut_off else record
-
-
-def computed_record(folder: Path, config_hash: str) -> Record | None:
-    """A record of success that is not done: what follows from it could not all be written."""
-    record = None if is_done(folder) else read_result(folder, config_hash)
-    return record if record is not None and record.converged else None
-
-
-def mark_done(folder: Path) -> None:
-    """Say that everything that belongs to the present record is on disk."""
-    write_atomically(folder / DONE, sha256_of(folder / RESULT))
-
-
 def make_way(request: Request) -> None:
     """Remove what an unfinished attempt left, except a record whose outputs are missing.
 
@@ -139,48 +138,49 @@ def make_way(request: Request) -> None:
     was written.
     """
     folder = request.folder
-    _adopt_arrays(folder)
+    adopt_arrays(folder / RESULT)
     remove_parts(folder)
     if is_done(folder):
         return
-    if (folder / DONE).exists() and (folder / RESULT).exists():
+    if (folder / DONE).exists():
         try:
             read_record(folder / RESULT)
         except InputError as error:
             print(f"note: {error}; it is computed again", file=sys.stderr)
-    if request.values["force"] or computed_record(folder, request.config_hash) is None:
+    if request.values["force"] or not last_record(folder, request.config_hash, cut_off=True):
         for name in (DONE, RESULT):
             (folder / name).unlink(missing_ok=True)
 
 
-def replace_record(folder: Path, record: Record, arrays: Mapping[str, Any] | None = None) -> None:
-    """Replace the record of a job, and its arrays.
+def replace_record(request: Request, result: Result, started: float) -> Record:
+    """Replace the record of a job, its arrays and its configuration; returns the new record.
+
+    The job ``started`` so many seconds after the epoch.
 
     Raises
     ------
     InputError
-        If they cannot be written; the former ones are then still there.
+        If they cannot be written; the former record and arrays are then still there.
     """
-    new = folder / NEW_FIELDS
-    new.unlink(missing_ok=True)
-    if arrays:
-        write_atomically(new, partial(np.savez_compressed, **arrays))
-    write_record(folder / RESULT, record, new)
-    _adopt_arrays(folder)
+    folder = request.folder
+    record = stamp(request.values, request.config_hash, result, started)
+    write_json(folder / CONFIG, without_places(request.values))
+    write_record(folder / RESULT, record, result.arrays)
     (folder / DONE).unlink(missing_ok=True)
+    return record
 
 
-def _adopt_arrays(folder: Path) -> None:
-    """Give the arrays that the record was written with their name, also after a kill."""
-    try:
-        digest = read_mapping(folder / RESULT)[ARRAYS]
-    except (InputError, KeyError):
-        return
-    new = folder / NEW_FIELDS
-    if digest is None:
-        (folder / FIELDS).unlink(missing_ok=True)
-    elif new.is_file() and sha256_of(new) == digest:
-        new.replace(folder / FIELDS)
+def write_failure(request: Request, reason: str, started: float) -> Record:
+    """Record why a job has no estimate, as `replace_record` does.
+
+    If it had already computed its estimate, that record stays, and a warning says so.
+    """
+    computed = last_record(request.folder, request.config_hash, cut_off=True)
+    if computed is not None:
+        told = UNWRITTEN.format(request.folder)
+        print(f"warning: {reason if told in reason else f'{reason}; {told}'}", file=sys.stderr)
+        return computed
+    return replace_record(request, Result(status="failed", reason=reason), started)
 
 
 def write_hydra(request: Request) -> None:
@@ -198,23 +198,6 @@ def write_hydra(request: Request) -> None:
         write_atomically(place / f"{name}.yaml", text)
 
 
-def require_writable(folder: Path) -> None:
-    """Refuse a folder that cannot be written, before anything is computed.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made or written to.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"cannot write to {folder}: {error.strerror}") from error
-
-
 @contextmanager
 def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
     """Remove a job's folder, and those of the outputs above it, if nothing was written there.
@@ -224,8 +207,7 @@ def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        outputs = outputs.resolve()
-        above = [place for place in folder.resolve().parents if outputs in (place, *place.parents)]
+        above = [p for p in folder.resolve().parents if p.is_relative_to(outputs.resolve())]
         with suppress(OSError):  # something else is there
             if {path.name for path in folder.iterdir()} <= {LOCK, HYDRA}:
                 # Whoever holds the lock is at work there.
@@ -234,24 +216,3 @@ def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
                     (folder / LOCK).unlink()
                 for place in (folder, *above):
                     place.rmdir()
-
-
-def write_failure(request: Request, reason: str, started: float) -> Record:
-    """Record why a job that ``started`` (s since the epoch) ended, and return that record.
-
-    If it had already computed its estimate, that record stays, and a warning says so.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    computed = computed_record(request.folder, request.config_hash)
-    if computed is not None:
-        print(f"warning: {reason}; {UNWRITTEN.format(request.folder)}", file=sys.stderr)
-        return computed
-    failure = Result(status="failed", reason=reason)
-    record = stamp(request.values, request.config_hash, failure, started)
-    replace_record(request.folder, record)
-    write_json(request.folder / CONFIG, without_places(request.values))
-    return record

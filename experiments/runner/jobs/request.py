@@ -52,14 +52,13 @@ class Request:
         hydra, values = HydraConfig.get(), plain(config)
         overrides = tuple(hydra.overrides.task)
         published = publish_as(values, overrides, None)
-        folder = Path(hydra.runtime.output_dir)
-        return cls(values, hash_of(values), folder, published, overrides)
+        return cls(values, hash_of(values), Path(hydra.runtime.output_dir), published, overrides)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Request:
         """The request that :meth:`to_json` wrote."""
-        made = {"folder": Path(data["folder"]), "overrides": tuple(data["overrides"])}
-        return cls(**{**data, **made})
+        typed = tuple(data["overrides"])
+        return cls(**{**data, "folder": Path(data["folder"]), "overrides": typed})
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""

@@ -97,8 +97,7 @@ def test_a_run_is_recorded_and_reported(config, monkeypatch, tmp_path, unmeasure
     assert (result.model.filter, result.model.noise_mm) == ("iterated", 0.3)
     record = stamp({**config, "parameters": ["E_f.somewhere"]}, "hash", result, 0.0)
     assert record.parameters == ("E_f.anterior", "E_f.posterior")
-    np.savez(tmp_path / "fields.npz", **result.arrays)
-    write_record(tmp_path / "record.json", record)
+    write_record(tmp_path / "record.json", record, result.arrays)
     back = read_record(tmp_path / "record.json")
     assert back.estimates == result.estimates
     assert ONE_STATE in back.estimates[0].verdict.missing

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.common.records.record import FIELDS, stamp
+from experiments.common.records import record as records
+from experiments.common.records.record import FIELDS
 from experiments.common.study import Result
 from experiments.runner.jobs import folder as jobs
 from experiments.runner.jobs.request import Request
@@ -23,17 +24,16 @@ def request(folder: Path, force: bool = False) -> Request:
 
 def finish(asked: Request, number: float, mark: bool = True) -> None:
     """A record of success with one number and arrays of it."""
-    result = Result(numbers={"a_mm": number})
-    record = stamp(asked.values, asked.config_hash, result, 0.0)
-    jobs.replace_record(asked.folder, record, {"x": np.full(3, number)})
+    result = Result(numbers={"a_mm": number}, arrays={"x": np.full(3, number)})
+    jobs.replace_record(asked, result, 0.0)
     if mark:
         jobs.mark_done(asked.folder)
 
 
 def number(asked: Request) -> float | None:
     """The number of the finished record; None if the job has to be run."""
-    record = jobs.finished_record(asked.folder, asked.config_hash)
-    if record is None:
+    record = jobs.last_record(asked.folder, asked.config_hash)
+    if record is None or not record.converged:
         return None
     found = record.numbers["a_mm"]
     assert (np.load(asked.folder / FIELDS)["x"] == found).all()
@@ -59,7 +59,7 @@ def test_a_finished_result_stays_until_its_replacement_is_whole(tmp_path):
     assert number(asked) == 1.0, "where the attempt is interrupted"
     finish(asked, 2.0, mark=False)
     assert number(asked) is None, "what follows from it is not written"
-    assert jobs.computed_record(tmp_path, asked.config_hash) is not None
+    assert jobs.last_record(tmp_path, asked.config_hash, cut_off=True) is not None
     jobs.mark_done(tmp_path)
     assert number(asked) == 2.0
     assert jobs.usable_record(request(tmp_path)) is not None
@@ -68,7 +68,7 @@ def test_a_finished_result_stays_until_its_replacement_is_whole(tmp_path):
     assert not (tmp_path / FIELDS).exists()
 
 
-@pytest.mark.parametrize("step", ["write_atomically", "write_record", "_adopt_arrays"])
+@pytest.mark.parametrize("step", ["write_atomically", "write_json", "adopt_arrays"])
 def test_a_kill_while_arrays_and_record_are_replaced_loses_neither(tmp_path, monkeypatch, step):
     def killed(*_):
         raise KeyboardInterrupt
@@ -76,14 +76,24 @@ def test_a_kill_while_arrays_and_record_are_replaced_loses_neither(tmp_path, mon
     asked = request(tmp_path)
     finish(asked, 1.0)
     with monkeypatch.context() as patched:
-        patched.setattr(jobs, step, killed)
+        patched.setattr(records, step, killed)
         with pytest.raises(KeyboardInterrupt):
             finish(asked, 2.0)
-    if step == "_adopt_arrays":
+    if step == "adopt_arrays":
         jobs.make_way(asked)
-        assert jobs.computed_record(tmp_path, asked.config_hash).numbers == {"a_mm": 2.0}
+        computed = jobs.last_record(tmp_path, asked.config_hash, cut_off=True)
+        assert computed.numbers == {"a_mm": 2.0}
         jobs.mark_done(tmp_path)
-    assert number(asked) == (2.0 if step == "_adopt_arrays" else 1.0)
+    assert number(asked) == (2.0 if step == "adopt_arrays" else 1.0)
+
+
+def test_what_could_not_be_written_is_said_once(tmp_path, capsys):
+    asked = request(tmp_path)
+    finish(asked, 1.0, mark=False)
+    told = jobs.UNWRITTEN.format(tmp_path)
+    for reason in ("no space left", f"no space left; {told}"):
+        assert jobs.write_failure(asked, reason, 0.0).numbers == {"a_mm": 1.0}
+    assert capsys.readouterr().err == 2 * f"warning: no space left; {told}\n"
 
 
 def test_another_configurations_result_stays_until_it_is_replaced(tmp_path):

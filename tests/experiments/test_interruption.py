@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from experiments.runner.jobs.interruption import ASKING, Interruption, interruptible, raised
+from experiments.interruption import ASKING, Interruption, interruptible, raised
 from tests.processes import linux
 
 

@@ -1,12 +1,12 @@
-"""What is refused before anything is built."""
+"""Memory that is foreseen: what needs too much of it is refused before anything is built."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
+from experiments.common.building.memory import expected_memory_gb
 from experiments.run import main
-from experiments.runner.execution.check import expected_memory_gb
 
 MEASURED = {(36, 4): 0.29, (72, 8): 0.37, (100, 12): 0.55, (150, 20): 0.99}
 """Cells of hex18 -> peak in GB of a closure with derivatives, without what records and draws."""

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import ParamSpec
 
-from mvest.errors import MvestError
+from mvest.errors import MvestError, message_of
 
 P = ParamSpec("P")
 
@@ -95,12 +95,6 @@ def raised() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
-def _in_one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return str(error).strip().partition("\n")[0]
-
-
 def _ignore() -> None:
     """Let no signal change the exit status of an interpreter that takes itself apart."""
     for number in ASKING:
@@ -125,7 +119,7 @@ def interruptible(command: Callable[P, int]) -> Callable[P, int]:
             except (MvestError, OSError) as error:
                 if TRACEBACKS in os.environ:
                     raise
-                print(f"error: {_in_one_line(error)}", file=sys.stderr)
+                print(f"error: {message_of(error).splitlines()[0]}", file=sys.stderr)
                 return 2
             except KeyboardInterrupt as error:
                 print(
