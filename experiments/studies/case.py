@@ -21,8 +21,7 @@ from experiments.common.schema import build
 from experiments.common.study import Job, Result, Study
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts, require_plausible
-from mvest.personalisation.gate import gate_case, gate_lines
-from mvest.personalisation.model import build_model
+from mvest.personalisation.model import build_model, gate_case, gate_lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""A synthetic study: what estimates, and apart from it what makes the observation."""
+"""A synthetic study: the estimator's model, and apart from it the errors of its observation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from experiments.common.building.anatomy import anatomy_of, guide_of
 from experiments.common.building.closure import closure_model, mechanics_of
-from experiments.common.building.errors import Correlations, observation_errors
 from experiments.common.building.filters import as_numbers, build_filter, require_one_each
 from experiments.common.building.truth import build_truth, truth_mechanics
 from mvest.closure.anchors import Anchors
@@ -24,17 +23,50 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.valve_system import check_parameters
 from mvest.observation.errors import (
+    AnnulusOffset,
+    CoaptationDropout,
+    CorrelatedNoise,
     ObservationError,
     SpatialCorrelation,
+    WhiteNoise,
 )
 from mvest.observation.vertices import require_frames
 from mvest.problem.problem import Problem
 from mvest.problem.stored import Extrapolated, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.valve import Valve
+from mvest.valve.anatomy.valve import LeafletSurface, Valve
 
 Values = Mapping[str, Any]
+
+
+class Correlations:
+    """Correlations between the vertices of a surface, each length factorised once."""
+
+    def __init__(self, surface: LeafletSurface) -> None:
+        self.surface = surface
+        self._made: dict[float, SpatialCorrelation] = {}
+
+    def __call__(self, length: float) -> SpatialCorrelation:
+        """The correlation of one length, mm."""
+        if length not in self._made:
+            self._made[length] = SpatialCorrelation(self.surface.vertices, length)
+        return self._made[length]
+
+
+def observation_errors(
+    settings: Values, correlations: Correlations
+) -> tuple[ObservationError, ...]:
+    """The configured errors that are not zero, in the order in which they arise."""
+    offset = settings["annulus_offset_mm"]
+    made: list[ObservationError] = [AnnulusOffset(tuple(offset))] if np.any(offset) else []
+    made.append(WhiteNoise(settings["noise_mm"]))
+    if settings["correlated_mm"]:
+        correlation = correlations(settings["correlation_length_mm"])
+        made.append(CorrelatedNoise(settings["correlated_mm"], correlation))
+    if settings["dropout_mm"]:
+        made.append(CoaptationDropout(settings["dropout_mm"], correlations.surface))
+    return tuple(made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
