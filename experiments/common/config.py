@@ -18,7 +18,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from experiments.common.building.anatomy import ValveFolder, folder_hash
+from experiments.common.building.closure import ValveFolder, folder_hash
 from experiments.common.schema import (
     BY_PARAMETER,
     NOT_HASHED,

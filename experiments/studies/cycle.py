@@ -16,7 +16,7 @@ import numpy as np
 from experiments.common.building.closure import closure_model
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import gate_of
-from experiments.common.expectation import noise_words
+from experiments.common.building.twin import noise_words
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number
 from experiments.common.schema import build

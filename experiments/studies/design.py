@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import closure_model, mechanics_of
+from experiments.common.building.closure import closure_model, mechanics_of, template_of
 from experiments.common.building.filters import require_one_each
 from experiments.common.cases.own_case import settings_of
 from experiments.common.cases.settings import PersonalSettings

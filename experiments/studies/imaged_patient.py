@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import linregress, sem
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import mechanics_of
+from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words, write_report
 from experiments.common.cases.settings import ImagedInput, PersonalSettings

@@ -18,9 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from experiments.common.building.anatomy import anatomy_of, build_mesh, folder_hash
 from experiments.common.building.closing import close_valve, draw_closing
-from experiments.common.building.closure import closure_model, mechanics_of
+from experiments.common.building.closure import (
+    anatomy_of,
+    build_mesh,
+    closure_model,
+    folder_hash,
+    mechanics_of,
+)
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import anatomy_digest, gate_cases, gate_rows
 from experiments.common.building.twin import build_twin

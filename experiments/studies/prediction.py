@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import anatomy_of, build_mesh
-from experiments.common.building.closure import mesh_store
+from experiments.common.building.closure import anatomy_of, build_mesh, mesh_store
 from experiments.common.building.filters import require_one_each
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin

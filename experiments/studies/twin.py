@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import gate_of
-from experiments.common.building.twin import Twin, build_twin
-from experiments.common.expectation import TwinExpectation
+from experiments.common.building.twin import Twin, TwinExpectation, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number, model_of_values
 from experiments.common.study import Job, Result, Results, Study

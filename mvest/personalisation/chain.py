@@ -24,8 +24,7 @@ from mvest.observation.surfaces import surface_distance
 from mvest.personalisation.considered_geometry import ConsideredGeometry
 from mvest.personalisation.error_budget import BudgetRow, budget_rows, sample_parts
 from mvest.personalisation.estimation import CaseEstimation, OnStep
-from mvest.personalisation.expected import geometry_shifts, law_share
-from mvest.personalisation.result import FrameDistance, Personalised
+from mvest.personalisation.result import FrameDistance, Personalised, geometry_shifts, law_share
 from mvest.personalisation.settings import (
     PersonaliseSettings,
     PressureErrors,

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from experiments.common.building.anatomy import anatomy_of
-from experiments.common.building.closure import closure_model
+from experiments.common.building.closure import anatomy_of, closure_model
 from experiments.common.progress import SolveBar
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.errors import InputError

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import mechanics_of
+from experiments.common.building.closure import mechanics_of, template_of
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.problem.stored import Store

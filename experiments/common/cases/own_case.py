@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.building.closure import mechanics_of, mesh_store
+from experiments.common.building.twin import noise_words
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
-from experiments.common.expectation import noise_words
 from experiments.common.progress import PartBar, SolveBar
 from experiments.common.records.record import (
     FIELDS,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from experiments.common.building.closure import mechanics_of
-from experiments.common.building.truth import truth_mesh
+from experiments.common.building.twin import truth_mesh
 from experiments.common.study import Check, Study, load_study, study_names
 from experiments.runner.tracking.store import require_no_password
 from mvest.errors import ConfigurationError

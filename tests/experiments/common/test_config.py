@@ -1,8 +1,7 @@
 import pytest
 
 from experiments.common.building.filters import build_filter
-from experiments.common.building.truth import truth_mesh
-from experiments.common.building.twin import build_twin
+from experiments.common.building.twin import build_twin, truth_mesh
 from experiments.common.config import hash_of
 from experiments.common.schema import build
 from experiments.runner.jobs.request import as_published

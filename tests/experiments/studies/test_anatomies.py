@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import template_of
 from experiments.common.config import plain
 from experiments.common.places import ANATOMIES
 from mvest.valve.anatomy.template import Template

@@ -13,7 +13,7 @@ import experiments
 import mvest.closure.model
 import mvest.files
 import mvest.source
-from experiments.common.building.truth import MADE_BY
+from experiments.common.building.twin import MADE_BY
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
