@@ -1,154 +1,26 @@
 """The console command ``mvest``: short words for what people do most.
 
 Every word is the one application (``experiments.run``), or a page of it, with the overrides that it
-takes. ``mvest import`` and ``mvest export`` read and write other programs' files: whatever lies in
-`mvest.cases.importing` and `mvest.cases.exporting`. Exit status as in ``experiments.run``: 0 done;
-1 no estimate; 2 the request is wrong (one line says how); 130, 143 or 129 stopped by Ctrl-C,
-SIGTERM or SIGHUP.
+takes. Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is wrong (one
+line says how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
 """
 
 from __future__ import annotations
 
 import difflib
-import importlib
-import inspect
-import pkgutil
 import re
 import resource
 import shutil
 import sys
 import textwrap
-import typing
-from argparse import RawDescriptionHelpFormatter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
-from typing import Any
-
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.places import EXPERIMENTS
-from experiments.common.schema import build, schema
 from experiments.console import Parser
 from experiments.runner.jobs.interruption import interruptible
 from mvest import __version__
-from mvest.cases import exporting, importing
-from mvest.cases.writer import require_new, write_case
-from mvest.errors import ConfigurationError, InputError, MvestError
-
-
-@dataclass(frozen=True, slots=True)
-class Door:
-    """One kind of source or target.
-
-    Attributes
-    ----------
-    name, sentence : str
-    pass_through : callable
-        ``import_NAME`` or ``export_NAME``.
-    options : type
-        Frozen dataclass of its last argument.
-    """
-
-    name: str
-    sentence: str
-    pass_through: Callable[..., Any]
-    options: type
-
-    def settings(self, given: Sequence[str]) -> Any:
-        """The options from NAME=VALUE words, values as in YAML.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown name or a value of another type.
-        """
-        defaults = OmegaConf.structured(schema(self.options))
-        try:
-            merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(given)))
-        except OmegaConfBaseException as error:
-            said = str(error).partition("\n")[0]
-            known = ", ".join(map(str, defaults))
-            raise ConfigurationError(f"{self.name}: {said}; known are {known}") from error
-        plain = OmegaConf.to_container(merged)
-        return build(self.options, typing.cast("dict[str, Any]", plain))
-
-    @property
-    def help(self) -> str:
-        """What it does and what its options mean."""
-        return "\n\n".join(filter(None, map(inspect.getdoc, (self.pass_through, self.options))))
-
-
-def doors(package: ModuleType, verb: str) -> dict[str, Door]:
-    """The doors of a package, by the functions ``VERB_MODULE`` of its modules."""
-    result = {}
-    for found in pkgutil.iter_modules(package.__path__):
-        module = importlib.import_module(f"{package.__name__}.{found.name}")
-        function = getattr(module, f"{verb}_{found.name}", None)
-        if function is not None:
-            options = typing.get_type_hints(function)["options"]
-            sentence = (module.__doc__ or "").partition("\n")[0]
-            result[found.name] = Door(found.name, sentence, function, options)
-    return result
-
-
-def import_command(given: Sequence[str]) -> int:
-    """``mvest import NAME SOURCE CASE [option=value ...]``: write a case folder; exit status."""
-
-    def write(door: Door, source: Path, target: Path, options: Any) -> None:
-        # Reading may take a minute.
-        require_new(target)
-        case = door.pass_through(source, options)
-        write_case(target, case)
-        print(case)
-        for sentence in case.derived:
-            print(f"* {sentence}")
-        print(f"wrote {target}; next: mvest own-valve {target} --check")
-
-    return _pass("import", importing, "CASE", write, given)
-
-
-def export_command(given: Sequence[str]) -> int:
-    """``mvest export NAME SOURCE TARGET [option=value ...]``; exit status."""
-
-    def write(door: Door, source: Path, target: Path, options: Any) -> None:
-        print(f"wrote {door.pass_through(source, target, options)}")
-
-    return _pass("export", exporting, "TARGET", write, given)
-
-
-@interruptible
-def _pass(
-    verb: str,
-    package: ModuleType,
-    metavar: str,
-    write: Callable[[Door, Path, Path, Any], None],
-    given: Sequence[str],
-) -> int:
-    available = doors(package, verb)
-    kinds = "\n".join(f"  {door.name:<12} {door.sentence}" for door in available.values())
-    name = given[0] if given else "--help"
-    door = available.get(name)
-    parser = Parser(
-        prog=f"mvest {verb} {name if door else 'NAME'}",
-        description=door.help if door else kinds,
-        formatter_class=RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("source", type=Path, metavar="SOURCE")
-    parser.add_argument("target", type=Path, metavar=metavar)
-    parser.add_argument("options", nargs="*", metavar="OPTION=VALUE")
-    if door is None and not name.startswith("-"):
-        parser.error(f"{name}: nothing to {verb} by this name; known: {', '.join(available)}")
-    parsed = parser.parse_intermixed_args(list(given[1:]) if door else ["--help"])
-    assert door is not None
-    for option in parsed.options:
-        if "=" not in option:
-            parser.error(f"{option}: expected OPTION=VALUE; one source and one target at a time")
-    write(door, parsed.source, parsed.target, door.settings(parsed.options))
-    return 0
-
+from mvest.errors import ConfigurationError, InputError
 
 COMMANDS = {
     "list": "the experiments, one sentence each",
@@ -203,11 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             return simulate_command(rest)
         case "import":
-            from experiments.cli import import_command
+            from experiments.doors import import_command
 
             return import_command(rest)
         case "export":
-            from experiments.cli import export_command
+            from experiments.doors import export_command
 
             return export_command(rest)
         case "tables":
@@ -221,9 +93,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         case "worker":
             return _worker(rest)
         case "collect":
+            from experiments.runner.sweep import collect_sweep
+
             parser = Parser("mvest collect", description=COMMANDS[command])
             parser.add_argument("folder", type=Path, metavar="FOLDER")
-            return _collect(parser.parse_args(rest).folder)
+            return collect_sweep(parser.parse_args(rest).folder)
         case "sync":
             return _sync(rest)
         case "dashboard":
@@ -249,11 +123,7 @@ def _table(rest: list[str]) -> int:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of runs, or results/")
     parser.add_argument("target", type=Path, metavar="FILE", help="NAME.csv or NAME.parquet")
     parsed = parser.parse_args(rest)
-    try:
-        print(*write_estimates(parsed.folder, parsed.target), sep="\n")
-    except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    print(*write_estimates(parsed.folder, parsed.target), sep="\n")
     return 0
 
 
@@ -282,16 +152,13 @@ def _dashboard(rest: list[str]) -> int:
     parser.add_argument("outputs", nargs="?", default="outputs", type=Path, metavar="FOLDER")
     parser.add_argument("--port", default=5000, type=int, help="5000 if not given; 0: a free one")
     parsed = parser.parse_args(rest)
+    require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
     try:
-        require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
         place, page, said = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):
             print(f"{said}: {address}{page}", flush=True)
             webbrowser.open(address + page)
             return server.wait()
-    except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         return 0
 
@@ -309,27 +176,13 @@ def _worker(rest: list[str]) -> int:
     first, step = (int(found[1]), int(found[2])) if found else (0, 0)
     if not 1 <= first <= step:
         parser.error(f"shard {parsed.shard}, expected I/N with I from 1 to N, for example 2/8")
-    try:
-        plan = Plan.read(parsed.folder, look=False)
-        # Every N-th job of the list, whatever is done: no two shards share one.
-        jobs = plan.jobs[first - 1 :: step]
-        ended = [execute(job.request, plan.written_ns) for job in jobs]
-    except (MvestError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    plan = Plan.read(parsed.folder, look=False)
+    # Every N-th job of the list, whatever is done: no two shards share one.
+    jobs = plan.jobs[first - 1 :: step]
+    ended = [execute(job.request, plan.written_ns) for job in jobs]
     failed = sum(not record.converged for record in ended)
     print(f"shard {parsed.shard}: {len(jobs)} jobs, {failed} without an estimate")
     return 0
-
-
-def _collect(folder: Path) -> int:
-    from experiments.runner.sweep import collect_sweep
-
-    try:
-        return collect_sweep(folder)
-    except (MvestError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
 
 
 def _application(overrides: list[str]) -> int:

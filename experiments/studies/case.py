@@ -40,13 +40,7 @@ def run(job: Job[Settings]) -> Result:
 
 
 def check_case(values: Mapping[str, Any], folder: Path) -> str:
-    """Read, check and draw a case without simulating anything, and describe it.
-
-    Raises
-    ------
-    MvestError
-        If the case is not in order.
-    """
+    """Read, check and draw a case without simulating anything, and describe it."""
     from mvest.reporting.case.figures import frames_figure
     from mvest.reporting.figures import save_figure_with
 

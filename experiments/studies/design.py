@@ -22,6 +22,7 @@ from experiments.common.cases.own_case import settings_of
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import NOT_GATED, Mesh
+from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol
 from mvest.closure.model import ClosureModel
@@ -62,7 +63,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-Values = Mapping[str, Any]
 Row = dict[str, Any]
 
 

@@ -31,7 +31,7 @@ from experiments.common.building.gate import anatomy_digest, gate_cases, gate_ro
 from experiments.common.building.twin import build_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
-from experiments.common.schema import Reads, contents
+from experiments.common.schema import Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.importing.reference_heart import (
@@ -72,8 +72,6 @@ from mvest.valve.mesh.structured import layered_wedges
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Values = Mapping[str, Any]
 
 DATA_VARIABLE = "MVEST_TRIVALVE"
 """Environment variable that names a checkout of the donor's data."""

@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 
-from experiments import cli
+from experiments import cli, doors
 from mvest.cases.folder import read_case
 from tests.made_up_closure import made_up_case
 
@@ -55,8 +55,8 @@ def package(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     module = importlib.import_module("made_up_doors")
-    monkeypatch.setattr(cli, "importing", module)
-    monkeypatch.setattr(cli, "exporting", module)
+    monkeypatch.setattr(doors, "importing", module)
+    monkeypatch.setattr(doors, "exporting", module)
     yield
     for name in [name for name in sys.modules if name.startswith("made_up_doors")]:
         del sys.modules[name]

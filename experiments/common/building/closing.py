@@ -115,11 +115,6 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
         The resolved configuration.
     name : str
         Of the progress bar.
-
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible.
     """
     model = closure_model(values)
     truth = np.array(values["truth"]["values"], dtype=float)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import numpy as np
 
-from experiments.common.schema import NOT_HASHED, build, contents
+from experiments.common.schema import NOT_HASHED, Values, build, contents
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import REFERENCE, GateCase, vary
 from mvest.errors import ConfigurationError
@@ -27,8 +26,6 @@ from mvest.valve.mesh.structured import structured_mesh
 if TYPE_CHECKING:
     from mvest.valve.mesh.given import GivenValve
 
-
-Values = Mapping[str, Any]
 Anatomy: TypeAlias = "Template | GivenValve"
 
 COARSEST = (24, 3)
@@ -193,11 +190,6 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
     """The configured model of the closure, with one variation.
 
     It closes the open valve each time; whoever continues from closed states says so.
-
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible; the message names it.
     """
     anatomy, settings = anatomy_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]

@@ -21,12 +21,12 @@ from experiments.common.building.closure import (
     mechanics_of,
     mesh_store,
 )
-from experiments.common.building.filters import as_numbers, build_filter, require_one_each
+from experiments.common.building.filters import build_filter, observation_variance, require_one_each
 from experiments.common.progress import SolveBar
+from experiments.common.schema import Values
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.noise import observation_noise
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.parameters import kind_of
@@ -50,8 +50,6 @@ from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface, Valve
-
-Values = Mapping[str, Any]
 
 
 def build_truth(
@@ -239,11 +237,7 @@ def build_twin(config: Values) -> Twin:
     settings = mechanics_of(config)
     # What is cheap to refuse is refused before anything is meshed.
     filter_, transform, prior = build_filter(config["filter"], parameters)
-    variance = as_numbers("filter.R", config["filter"]["R"])
-    try:
-        observation_noise(np.atleast_1d(variance), np.size(variance))
-    except InputError as error:
-        raise ConfigurationError(f"filter.R = {config['filter']['R']}: {error}") from error
+    variance = observation_variance(config["filter"]["R"])
     frames = tuple(config["observation"]["frames"])
     require_frames(frames)
     if np.size(variance) not in (1, len(frames)):
@@ -330,13 +324,7 @@ class TwinExpectation:
     _known: dict[str, Prediction] = field(default_factory=dict)
 
     def __call__(self, config: Mapping[str, Any], _folder: Path | None = None) -> str:
-        """The answer for one configuration.
-
-        Raises
-        ------
-        MvestError
-            If a setting is inadmissible.
-        """
+        """The answer for one configuration."""
         twin = build_twin(config)
         start = twin.problem.start
         observed = config["observation"]

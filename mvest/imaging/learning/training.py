@@ -359,13 +359,7 @@ MAX_CUT = 70.0
 
 
 def degrade(volume: VolumeSequence, rng: np.random.Generator) -> VolumeSequence:
-    """A volume of grey values from 0 to 255 (uint8), changed at random; 0 stays 0.
-
-    Parameters
-    ----------
-    volume : VolumeSequence
-    rng : numpy.random.Generator
-    """
+    """A volume of grey values from 0 to 255 (uint8), changed at random; 0 stays 0."""
     if rng.random() >= SHARE:
         return volume
     blurs, noises, cuts = rng.random(3) < SHARE

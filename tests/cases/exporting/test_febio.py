@@ -6,7 +6,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 
-from experiments.cli import export_command
+from experiments.doors import export_command
 from mvest.cases.exporting.febio import FebioOptions, export_febio
 from mvest.cases.writer import write_case
 from mvest.errors import InputError

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.cli import import_command
+from experiments.doors import import_command
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.cases.importing.abaqus import AbaqusOptions, import_abaqus

@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.sweeps.report import figures_of
+from experiments.sweeps.figures import figures_of
 from mvest.reporting.style import plain_number
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,

@@ -256,7 +256,7 @@ def test_a_truth_outlives_what_has_no_part_in_it(truth):
     code = truth.code
     edit(code / "mvest" / "estimation" / "filters" / "iterated.py", "max_iterations", "max_loops")
     edit(code / "mvest" / "reporting" / "style.py", "import", "X = 1\nimport")
-    edit(code / "experiments" / "common" / "building" / "truth.py", "fewer cells", "less")
+    edit(code / "experiments" / "common" / "building" / "twin.py", "fewer cells", "less")
     (code / "mvest" / "mechanics" / "another.py").write_text("VISCOSITY = 1.0\n")
     assert not truth()
     # That is, until it is used.
