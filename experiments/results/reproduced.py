@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.results.keep import records_of
-from experiments.runner.jobs.interruption import interruptible
-from mvest.errors import InputError
+from mvest.errors import InputError, MvestError
 from mvest.problem.record import EstimateRecord
 from mvest.reporting.markup import number
 
@@ -55,11 +54,14 @@ def _differences(one: EstimateRecord, other: EstimateRecord) -> list[float]:
     return [abs(a / b - 1.0) for a, b in pairs if a is not None and b]
 
 
-@interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare a table of outputs/results with results; returns the exit status."""
     table, *_ = [*(sys.argv[1:] if arguments is None else arguments), "table1"]
-    print(compared(table, Path("outputs/results"), Path("results")))
+    try:
+        print(compared(table, Path("outputs/results"), Path("results")))
+    except MvestError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

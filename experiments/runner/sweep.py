@@ -14,7 +14,8 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
-from experiments.common.records.record import Record, metrics
+from experiments.common.records.metrics import metrics
+from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
 from experiments.common.study import load_study
 from experiments.results.estimates import sweep_table

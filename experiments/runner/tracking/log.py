@@ -19,7 +19,8 @@ from hydra.core.hydra_config import HydraConfig
 from tqdm import tqdm
 
 from experiments.common.config import is_hashed
-from experiments.common.records.record import implausible, metrics, read_record, short_names
+from experiments.common.records.metrics import implausible, metrics, short_names
+from experiments.common.records.record import read_record
 from experiments.runner.jobs.folder import CONFIG, RESULT, is_done
 from experiments.runner.planning.plan import PLAN
 from experiments.runner.tracking.store import ARTIFACTS, opened

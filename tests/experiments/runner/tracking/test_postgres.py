@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.records.record import metrics, read_record
+from experiments.common.records.metrics import metrics
+from experiments.common.records.record import read_record
 from experiments.runner.tracking.log import HANDFUL
 from tests.experiments.runner.tracking.test_tracking import make_config, make_job
 from tests.places import ROOT

@@ -16,7 +16,8 @@ import mlflow
 import pytest
 
 from experiments.cli import main
-from experiments.common.records.record import Record, implausible, metrics, write_record
+from experiments.common.records.metrics import implausible, metrics
+from experiments.common.records.record import Record, write_record
 from experiments.runner.planning.plan import Plan, PlannedJob
 from experiments.runner.tracking import log
 from experiments.runner.tracking.dashboard import last_sweep
