@@ -20,7 +20,7 @@ from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser
 from experiments.interruption import interruptible
 from mvest import __version__
-from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.errors import ConfigurationError, InputError
 
 COMMANDS = {
     "list": "the experiments, one sentence each",
@@ -93,9 +93,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         case "worker":
             return _worker(rest)
         case "collect":
+            from experiments.runner.sweep import collect_sweep
+
             parser = Parser("mvest collect", description=COMMANDS[command])
             parser.add_argument("folder", type=Path, metavar="FOLDER")
-            return _collect(parser.parse_args(rest).folder)
+            return collect_sweep(parser.parse_args(rest).folder)
         case "sync":
             return _sync(rest)
         case "dashboard":
@@ -121,11 +123,7 @@ def _table(rest: list[str]) -> int:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of runs, or results/")
     parser.add_argument("target", type=Path, metavar="FILE", help="NAME.csv or NAME.parquet")
     parsed = parser.parse_args(rest)
-    try:
-        print(*write_estimates(parsed.folder, parsed.target), sep="\n")
-    except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    print(*write_estimates(parsed.folder, parsed.target), sep="\n")
     return 0
 
 
@@ -154,16 +152,13 @@ def _dashboard(rest: list[str]) -> int:
     parser.add_argument("outputs", nargs="?", default="outputs", type=Path, metavar="FOLDER")
     parser.add_argument("--port", default=5000, type=int, help="5000 if not given; 0: a free one")
     parsed = parser.parse_args(rest)
+    require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
     try:
-        require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
         place, page, said = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):
             print(f"{said}: {address}{page}", flush=True)
             webbrowser.open(address + page)
             return server.wait()
-    except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         return 0
 
@@ -181,27 +176,13 @@ def _worker(rest: list[str]) -> int:
     first, step = (int(found[1]), int(found[2])) if found else (0, 0)
     if not 1 <= first <= step:
         parser.error(f"shard {parsed.shard}, expected I/N with I from 1 to N, for example 2/8")
-    try:
-        plan = Plan.read(parsed.folder, look=False)
-        # Every N-th job of the list, whatever is done: no two shards share one.
-        jobs = plan.jobs[first - 1 :: step]
-        ended = [execute(job.request, plan.written_ns) for job in jobs]
-    except (MvestError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    plan = Plan.read(parsed.folder, look=False)
+    # Every N-th job of the list, whatever is done: no two shards share one.
+    jobs = plan.jobs[first - 1 :: step]
+    ended = [execute(job.request, plan.written_ns) for job in jobs]
     failed = sum(not record.converged for record in ended)
     print(f"shard {parsed.shard}: {len(jobs)} jobs, {failed} without an estimate")
     return 0
-
-
-def _collect(folder: Path) -> int:
-    from experiments.runner.sweep import collect_sweep
-
-    try:
-        return collect_sweep(folder)
-    except (MvestError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
 
 
 def _application(overrides: list[str]) -> int:

@@ -18,8 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import mechanics_of
+from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.config import plain, register
 from experiments.common.places import CONF
 from experiments.common.progress import PartBar, announce_compilation

@@ -7,8 +7,8 @@ import pytest
 
 import experiments
 import mvest
-from experiments.common.building import anatomy, closure, patient_store
-from experiments.common.building.truth import MADE_BY
+from experiments.common.building import closure, patient_store
+from experiments.common.building.twin import MADE_BY
 from experiments.studies import imaged_patient
 from experiments.studies.imaging.detectors import SAMPLED_BY
 from mvest.errors import InputError
@@ -239,8 +239,8 @@ def test_a_process_has_the_code_with_which_it_began(code):
 
 
 def test_only_what_is_ours_has_a_key():
-    assert source_key(closure, anatomy.build_mesh) == source_key(closure, anatomy.build_mesh)
-    assert source_key(anatomy.build_mesh) != source_key(closure.closure_model)
+    assert source_key(closure, closure.build_mesh) == source_key(closure, closure.build_mesh)
+    assert source_key(closure.build_mesh) != source_key(closure.closure_model)
     with pytest.raises(InputError, match="pathlib is no module of mvest or experiments"):
         source_key(Path)
 

@@ -6,7 +6,7 @@ its own `Settings`. Everything else is declared here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
 from pathlib import PurePath
@@ -18,7 +18,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from experiments.common.building.anatomy import ValveFolder, folder_hash
+from experiments.common.building.closure import ValveFolder, folder_hash
 from experiments.common.schema import (
     BY_PARAMETER,
     NOT_HASHED,
@@ -232,8 +232,8 @@ PARTS: Mapping[str, tuple[type, ...]] = {
 """Parts of a configuration that join settings of the library with those of the experiments."""
 
 
-def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
-    """A configuration, without some of its parts, as resolved plain data.
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration, without Hydra's part, as resolved plain data.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str
     """
     found: dict[str, Any] = {}
     for key in map(str, config):
-        if key not in without:
+        if key != "hydra":
             # Part by part: a copy without the others would take longer than everything else here.
             value = MISSING if OmegaConf.is_missing(config, key) else config[key]
             is_part = OmegaConf.is_config(value)

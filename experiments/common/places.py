@@ -16,8 +16,5 @@ CONF = next(
 EXPERIMENTS = CONF / "experiment"
 """One YAML file an experiment."""
 
-ANATOMIES = tuple(sorted({path.stem for path in (CONF / "valve").glob("*.yaml")} - {"folder"}))
-"""The anatomies that ship; ``folder`` is whatever a case folder holds."""
-
 GATE_RECORDS = CHECKOUT / "results" / "records" / "gate.jsonl"
 """Kept records of the gate in a checkout; an installation has none."""

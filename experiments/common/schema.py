@@ -12,7 +12,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 from omegaconf import MISSING
 from pydantic.fields import FieldInfo
@@ -22,6 +22,8 @@ from mvest.files import sha256_of
 from mvest.reading.text import check_words
 
 T = TypeVar("T")
+Values: TypeAlias = Mapping[str, Any]
+"""Plain data of a configuration, or of a part of it."""
 
 MAX_ENTRIES, MAX_LETTERS = 10_000, 10_000
 """Of a list or mapping, and of a text."""

@@ -1,7 +1,8 @@
 """A study: what it computes, and what the runner and the writer of results need of it.
 
 A study is a module ``experiments/studies/NAME.py`` (or a package of that name) with the object
-``STUDY``. It is found by being there.
+``STUDY``. It is found by being there. What a study refuses, or what builds its parts, it refuses by
+an `MvestError`, which the runner says in one line.
 """
 
 from __future__ import annotations

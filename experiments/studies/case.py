@@ -21,8 +21,7 @@ from experiments.common.schema import build
 from experiments.common.study import Job, Result, Study
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts, require_plausible
-from mvest.personalisation.gate import gate_case, gate_lines
-from mvest.personalisation.model import build_model
+from mvest.personalisation.model import build_model, gate_case, gate_lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,13 +40,7 @@ def run(job: Job[Settings]) -> Result:
 
 
 def check_case(values: Mapping[str, Any], folder: Path) -> str:
-    """Read, check and draw a case without simulating anything, and describe it.
-
-    Raises
-    ------
-    MvestError
-        If the case is not in order.
-    """
+    """Read, check and draw a case without simulating anything, and describe it."""
     from mvest.reporting.case.figures import frames_figure
     from mvest.reporting.figures import save_figure_with
 

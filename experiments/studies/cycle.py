@@ -6,7 +6,7 @@ Everything follows from one simulated cycle of a valve whose parameters are know
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,10 +16,10 @@ import numpy as np
 from experiments.common.building.closure import closure_model
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import gate_of
-from experiments.common.expectation import noise_words
+from experiments.common.building.twin import noise_words
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number
-from experiments.common.schema import build
+from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol, compare_time_steps, with_mesh_error
 from mvest.errors import ConfigurationError, InputError
@@ -42,7 +42,6 @@ from mvest.typing import FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Values = Mapping[str, Any]
 Row = dict[str, Any]
 EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
 """Observations that parameters are estimated from; all but the second are of all frames."""

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import closure_model, mechanics_of
+from experiments.common.building.closure import closure_model, mechanics_of, template_of
 from experiments.common.building.filters import require_one_each
 from experiments.common.cases.own_case import settings_of
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import NOT_GATED, Mesh
+from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol
 from mvest.closure.model import ClosureModel
@@ -63,7 +63,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-Values = Mapping[str, Any]
 Row = dict[str, Any]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import runpy
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +19,7 @@ from pydantic import Field
 from experiments.common.building.filters import build_filter
 from experiments.common.places import CHECKOUT
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.schema import NOT_HASHED, InputFile, Reads, build, contents
+from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, build, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
@@ -37,8 +36,6 @@ from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Values = Mapping[str, Any]
 
 FITTED = "fitted.csv"
 """Where a single model puts the observed points at its estimate."""
@@ -206,13 +203,7 @@ def _points(file: str | None, what: str) -> FloatArray:
 
 
 def run(job: Job[Settings]) -> Result:
-    """Estimate with each model from each observation.
-
-    Raises
-    ------
-    MvestError
-        If a setting or a file is inadmissible.
-    """
+    """Estimate with each model from each observation."""
     about = job.settings.external
     task = task_of(about, job.values, job.folder)
     (job.folder / FITTED).unlink(missing_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,7 @@ from experiments.common.building.filters import filter_of
 from experiments.common.building.twin import build_twin
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import Mesh
-from experiments.common.schema import BY_PARAMETER
+from experiments.common.schema import BY_PARAMETER, Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -29,8 +28,6 @@ from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Values = Mapping[str, Any]
 
 TRANSFORM = Log()
 """All unknowns are positive."""

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import linregress, sem
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import mechanics_of
+from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words, write_report
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.records.record import Record
+from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples, ValveCase
 from mvest.cases.chord_layout import SEEN_CLOSURE
@@ -68,7 +68,6 @@ from mvest.valve.anatomy.template import Template
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Values = Mapping[str, Any]
 Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, how it was imaged, and how many anatomies were drawn for it."""
 
@@ -180,13 +179,7 @@ def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
 def make_imaged_patient(
     values: Values, patient: PatientSettings | None, echo: EchoSettings
 ) -> Path:
-    """Simulate and image the configured patient, unless that was done: the folder where it lies.
-
-    Raises
-    ------
-    MvestError
-        If the configuration is inadmissible or no anatomy that is drawn closes.
-    """
+    """Simulate and image the configured patient, unless that was done: the folder where it lies."""
     patient = require_patient(patient)
     described = {
         "patient": {

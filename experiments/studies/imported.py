@@ -18,15 +18,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from experiments.common.building.anatomy import anatomy_of, build_mesh, folder_hash
 from experiments.common.building.closing import close_valve, draw_closing
-from experiments.common.building.closure import closure_model, mechanics_of
+from experiments.common.building.closure import (
+    anatomy_of,
+    build_mesh,
+    closure_model,
+    folder_hash,
+    mechanics_of,
+)
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import anatomy_digest, gate_cases, gate_rows
 from experiments.common.building.twin import build_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
-from experiments.common.schema import Reads, contents
+from experiments.common.schema import Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.importing.reference_heart import (
@@ -67,8 +72,6 @@ from mvest.valve.mesh.structured import layered_wedges
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Values = Mapping[str, Any]
 
 DATA_VARIABLE = "MVEST_TRIVALVE"
 """Environment variable that names a checkout of the donor's data."""

@@ -26,7 +26,7 @@ from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.own_case import case_words, expect_own, write_report
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, Number, Record
-from experiments.common.schema import build
+from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
@@ -88,7 +88,6 @@ KEPT_ARRAYS = (
 )  # fmt: skip
 """Arrays that Figure 3 needs."""
 
-Values = Mapping[str, Any]
 Patients = Sequence[tuple[Record, EstimateRecord]]
 
 
@@ -169,13 +168,7 @@ def _nees(estimate: EstimateRecord) -> float | None:
 
 
 def expect_patient(values: Values, folder: Path | None = None) -> str:
-    """What to expect of a virtual patient's case, which is simulated first unless it is there.
-
-    Raises
-    ------
-    MvestError
-        If the configuration is inadmissible or the patient's valve does not close.
-    """
+    """What to expect of a virtual patient's case, which is simulated first unless it is there."""
     patient = values["patient"] and build(PatientSettings, values["patient"])
     return expect_own({**values, "case": str(make_patient(values, patient).case)}, folder)
 

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import anatomy_of, build_mesh
-from experiments.common.building.closure import mesh_store
+from experiments.common.building.closure import anatomy_of, build_mesh, mesh_store
 from experiments.common.building.filters import require_one_each
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.records.record import Mesh
+from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-Values = Mapping[str, Any]
 Row = Mapping[str, Any]
 
 MEASURED_ON = (96, 22)

@@ -59,13 +59,7 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_surfaces(job: Job[Settings]) -> Result:
-    """Simulate, export, import, estimate in a process of its own, reveal the truth.
-
-    Raises
-    ------
-    MvestError
-        If the patient's valve does not close, or an importer refuses it.
-    """
+    """Simulate, export, import, estimate in a process of its own, reveal the truth."""
     door, folder = job.settings.door, job.folder
     place = make_patient(job.values, job.settings.patient)
     hidden, positions = place.truth()

@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.common.building.filters import build_filter
+from experiments.common.building.filters import build_filter, observation_variance
 from experiments.common.building.gate import gate_of
-from experiments.common.building.twin import Twin, build_twin
-from experiments.common.expectation import TwinExpectation
+from experiments.common.building.twin import Twin, TwinExpectation, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number, model_of_values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
-from mvest.errors import ConfigurationError, InputError, MvestError
-from mvest.estimation.noise import observation_noise
+from mvest.errors import ConfigurationError, MvestError
 from mvest.estimation.wrappers import SharedStart
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
@@ -203,12 +201,7 @@ def require_twin(values: Mapping[str, Any]) -> None:
         If a setting is inadmissible; the message names it.
     """
     build_filter(values["filter"], tuple(values["parameters"]))
-    variance = values["filter"]["R"]
-    try:
-        observation_noise(np.atleast_1d(np.asarray(variance, dtype=float)), np.size(variance))
-    except (InputError, TypeError, ValueError) as error:
-        text = str(error) if isinstance(error, MvestError) else "expected a number or numbers"
-        raise ConfigurationError(f"filter.R = {variance}: {text}") from error
+    observation_variance(values["filter"]["R"])
     noise = values["observation"]["noise_mm"]
     if noise < 0:
         raise ConfigurationError(f"observation.noise_mm = {noise}, expected at least 0")

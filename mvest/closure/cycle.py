@@ -17,7 +17,7 @@ import numpy as np
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.estimation.estimate import Estimate
-from mvest.estimation.information.model_error import shift_by_model_error, with_shift
+from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.integrate import simulate

@@ -21,8 +21,8 @@ from .information.identifiability import Identifiability as Identifiability
 from .information.identifiability import TradeOff as TradeOff
 from .information.identifiability import cramer_rao_bound as cramer_rao_bound
 from .information.identifiability import identifiability as identifiability
-from .information.model_error import shift_by_model_error as shift_by_model_error
-from .information.model_error import with_shift as with_shift
+from .information.identifiability import shift_by_model_error as shift_by_model_error
+from .information.identifiability import with_shift as with_shift
 from .noise import NoiseCovariance as NoiseCovariance
 from .noise import ObservationNoise as ObservationNoise
 from .noise import observation_noise as observation_noise

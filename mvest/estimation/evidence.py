@@ -92,8 +92,6 @@ class LearnedNoise:
         At the mean, added columns included.
     log_likelihood : float
         log p(e | θ) there.
-    log_evidence : float
-        log p(e): over all θ, to the order of Laplace.
     covariance : (p, p) in filter coordinates
         What the doubt of θ adds to the covariance of the estimate.
     """
@@ -104,7 +102,6 @@ class LearnedNoise:
     quantities: tuple[LearnedQuantity, ...]
     noise: ObservationNoise
     log_likelihood: float
-    log_evidence: float
     covariance: FloatArray
 
     def __str__(self) -> str:
@@ -117,12 +114,7 @@ class LearnedNoise:
 
 
 class NoiseLearner:
-    """Learns the noise of one estimation, again and again as its linearisation improves.
-
-    Parameters
-    ----------
-    family : NoiseFamily
-    """
+    """Learns the noise of one estimation, again and again as its linearisation improves."""
 
     def __init__(self, family: NoiseFamily) -> None:
         self.family = family
@@ -159,12 +151,11 @@ class NoiseLearner:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Posterior:
-    """Of coordinates u: the mode, the mean, a root of the covariance, and log det of that."""
+    """Of coordinates u: the mode, the mean, and a root of the covariance."""
 
     mode: FloatArray
     mean: FloatArray
     spread: FloatArray
-    log_determinant: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,7 +253,7 @@ class Evidence:
         h = self.prior.size
         u = np.zeros(h) if start is None else start
         if not self.root.any():
-            return _Posterior(u, u, np.zeros((h, h)), 0.0)
+            return _Posterior(u, u, np.zeros((h, h)))
         u = np.asarray(
             scipy.optimize.minimize(
                 self.objective, u, jac=True, method="BFGS", options={"gtol": TOLERANCE}
@@ -282,7 +273,7 @@ class Evidence:
         )
         moved = -0.5 * spread.T @ bend
         moved /= max(1.0, float(np.linalg.norm(moved)))
-        return _Posterior(u, u + spread @ moved, spread, -float(np.sum(np.log(values))))
+        return _Posterior(u, u + spread @ moved, spread)
 
     def objective(self, u: FloatArray) -> tuple[float, FloatArray]:
         """−log p(e | θ) − log p(θ) but for a constant, and its derivatives by u."""
@@ -354,7 +345,6 @@ class Evidence:
             more += np.outer(up - down, up - down) / (4.0 * h) + (P_up + P_down - 2.0 * P) / (2 * h)
         spread = self.root @ posterior.spread
         found = Gaussian(self.log(u), spread @ spread.T)
-        constant = 0.5 * self.family.size * float(np.log(2.0 * np.pi))
         return LearnedNoise(
             self.family.names,
             self.prior,
@@ -362,7 +352,6 @@ class Evidence:
             _in_words(self.family, self.prior, found),
             self.family.at(found.mean),
             self.log_likelihood(found.mean),
-            0.5 * posterior.log_determinant - self.objective(posterior.mode)[0] - constant,
             L @ more @ L.T,
         )
 

@@ -1,10 +1,10 @@
+from .chain import default_settings as default_settings
 from .chain import personalise as personalise
-from .defaults import default_settings as default_settings
 from .design import FrameDesigns as FrameDesigns
 from .design import design_case as design_case
 from .design import expect_case as expect_case
-from .gate import gate_case as gate_case
 from .model import build_model as build_model
+from .model import gate_case as gate_case
 from .record import record_of_case as record_of_case
 from .result import FrameDistance as FrameDistance
 from .result import Personalised as Personalised

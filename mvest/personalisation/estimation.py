@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,13 @@ import numpy as np
 from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import predict
+from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.wrappers import SharedStart, of_some
@@ -28,12 +29,81 @@ from mvest.personalisation.geometry_errors import WeighedObservation
 from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.personalisation.model import build_model, frames_model, held_state, with_pressures
 from mvest.personalisation.observation_errors import ObservationErrors
-from mvest.personalisation.places import CaseClosure, Place
 from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseClosure:
+    """The closure of a case's valve, in the forms in which the parts of an estimation take it.
+
+    Attributes
+    ----------
+    model : ClosureModel
+    frames : FramesModel or None
+        All closed frames that are fitted, if they are several.
+    registered : RegisteredModel
+        The same, displaced as a whole before it is seen.
+    shared : SharedStart
+        The same, for many estimations.
+    displacement : mapping
+        Part -> by what the geometry differs from the one that was seen; see
+        `RestGeometry.displaced`.
+    """
+
+    model: ClosureModel
+    frames: FramesModel | None
+    registered: RegisteredModel
+    shared: SharedStart[ClosedState]
+    displacement: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(
+        cls,
+        model: ClosureModel,
+        frames: FramesModel | None,
+        names: tuple[str, ...],
+        start: FloatArray,
+        displacement: Mapping[str, FloatArray] | None = None,
+    ) -> CaseClosure:
+        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``."""
+        registered = RegisteredModel(frames or model, names)
+        return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
+
+    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
+        """Of the valve with another geometry, see `RestGeometry.displaced`.
+
+        All closed frames have the same errors of annulus and tips, as their derivatives say.
+        """
+        model = RestGeometry(self.model).displaced(parts)
+        closure = self.of(model, self.frames, self.registered.names, start, parts)
+        if self.frames is None:
+            return closure
+        states = {name: closure.held(state) for name, state in self.frames.states.items()}
+        frames = replace(self.frames, model=model, states=states)
+        return self.of(model, frames, self.registered.names, start, parts)
+
+    def held(self, state: HeldState) -> HeldState:
+        """A state as it was seen, whose annulus and tips are off as those of this valve."""
+        return replace(
+            state,
+            annulus=state.annulus + self.displacement.get("annulus", 0.0),
+            papillary_tips=state.papillary_tips + self.displacement.get("tips", 0.0),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Moduli and geometry at which a valve was closed, and about which errors are linearised."""
+
+    closure: CaseClosure
+    errors: ObservationErrors
+    m: FloatArray
+    prediction: Prediction
+
 
 ROUGH = 0.05
 """Relative tolerance of an estimate about which the geometry is linearised."""

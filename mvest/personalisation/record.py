@@ -14,7 +14,7 @@ settings       setting, value
 check          (one row) compared, value, limit: `mvest.estimation.check.ApproximationCheck`
 errors         name, unit (empty: a factor), believed, believed_low, believed_high, learned, low,
                high, stretch: what was learned of the errors of the closed frame
-geometry       name, unit, size, stretch: `mvest.personalisation.expected.GeometryShift`
+geometry       name, unit, size, stretch: `mvest.personalisation.result.GeometryShift`
 whiteness      name, statistic, p_value: tests of the standardised innovation
 narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
 image_errors   parameter, samples, share_of_variance (None: they did not enter)

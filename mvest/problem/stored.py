@@ -106,11 +106,6 @@ class StoredModel:
         See :func:`key_of`; the parameters are added to it.
     jacobian : bool
         Whether the Jacobian is kept as well; that of a stored prediction is zero otherwise.
-
-    Attributes
-    ----------
-    key : str
-    counts : Counts
     """
 
     def __init__(

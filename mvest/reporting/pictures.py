@@ -1,4 +1,4 @@
-"""Pictures put into a page that needs no file beside it."""
+"""Pages from templates, and pictures put into them, so that a page needs no other file."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import io
 from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
 from mvest.errors import InputError
+from mvest.reporting.markup import shown_text
 
 WIDEST_PIXELS = 1500
 """Two for each pixel of a page's column."""
@@ -50,3 +52,30 @@ def embedded(path: Path, caption: str) -> dict[str, Any]:
         "width": image.width,
         "height": image.height,
     }
+
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+LONGEST = 1000
+"""Characters of one text on a page."""
+
+
+def rendered(template: str, *folders: Path, **values: Any) -> str:
+    """A template of `TEMPLATES`, or of other folders, with values in it.
+
+    What is no `Markup` is escaped, cut where it is too long, and without characters that would turn
+    or hide what stands beside it.
+    """
+    environment = Environment(
+        loader=FileSystemLoader([*folders, TEMPLATES]),
+        autoescape=True,
+        finalize=_shown,
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(template).render(**values)
+
+
+def _shown(value: Any) -> Any:
+    is_text = isinstance(value, str) and not isinstance(value, Markup)
+    return shown_text(value, LONGEST) if is_text else value

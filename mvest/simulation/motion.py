@@ -59,12 +59,7 @@ class Refusal(Enum):
 
 
 class RefusedError(GeometryError):
-    """A motion that is refused.
-
-    Attributes
-    ----------
-    reason : Refusal
-    """
+    """A motion that is refused."""
 
     def __init__(self, name: str, reason: Refusal, detail: str) -> None:
         super().__init__(f"simulated valve {name}: {reason.value} ({detail})")

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from experiments.common.building.anatomy import guide_of
+from experiments.common.building.closure import guide_of
 from mvest.closure.model import ClosureModel
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.pair_search import ContactPairs

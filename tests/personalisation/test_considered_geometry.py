@@ -33,9 +33,8 @@ from mvest.personalisation.considered_geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.estimation import SETTLED, CaseEstimation
+from mvest.personalisation.estimation import SETTLED, CaseClosure, CaseEstimation
 from mvest.personalisation.indications import indications_of
-from mvest.personalisation.places import CaseClosure
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.problem.verdict import MOVED
 from tests.cases.test_uncertainty import corresponding
@@ -284,7 +283,7 @@ def bent_case(monkeypatch, curve, std):
         return GeometryColumns((MODE,), (slope,), (ErrorColumns(MODE.name, slope),))
 
     monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
-    monkeypatch.setattr("mvest.personalisation.places.RestGeometry", BentGeometry)
+    monkeypatch.setattr("mvest.personalisation.estimation.RestGeometry", BentGeometry)
     straight = made_up_case(std, displaced=False)
     closed = straight.frame(Role.CLOSED)
     frame = replace(closed, vertices=bent(closed.vertices.ravel(), 0.6).reshape(-1, 3))
@@ -474,7 +473,7 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
         return GeometryColumns((MODE,), (BENT[:, None],), (ErrorColumns(MODE.name, BENT[:, None]),))
 
     monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
-    monkeypatch.setattr("mvest.personalisation.places.RestGeometry", Torn)
+    monkeypatch.setattr("mvest.personalisation.estimation.RestGeometry", Torn)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     plain, torn = (
         personalise(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))

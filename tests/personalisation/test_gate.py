@@ -5,8 +5,8 @@ import pytest
 
 from mvest.closure.robustness import GATE_CASES, GateReport, GateRow
 from mvest.closure.smoothness import Path
-from mvest.personalisation import gate
-from mvest.personalisation.gate import gate_case, gate_lines
+from mvest.personalisation import model
+from mvest.personalisation.model import gate_case, gate_lines
 from mvest.personalisation.settings import PersonaliseSettings, Prior
 from tests.closure.test_model import GENTLE, MODULI, SMALL, TINY, model_of, settings_of
 
@@ -22,8 +22,8 @@ def asked(monkeypatch):
             seen.update(build=build, m=m, cases=cases)
             return "report"
 
-        monkeypatch.setattr(gate, "run_gate", run)
-        monkeypatch.setattr(gate, "build_model", lambda *_: model_of(GENTLE, **SMALL, **changes))
+        monkeypatch.setattr(model, "run_gate", run)
+        monkeypatch.setattr(model, "build_model", lambda *_: model_of(GENTLE, **SMALL, **changes))
         unknowns = (Prior(MODULI[1], 3.0, 1.0), Prior(MODULI[0], 5.0, 1.0))
         assert gate_case(None, PersonaliseSettings(unknowns, settings_of(GENTLE))) == "report"
         return seen

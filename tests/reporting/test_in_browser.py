@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from experiments.results.page import write_report
+from experiments.tables import write_report
 from mvest.reporting.case.report import report
 from tests.experiments.results.test_report import publish_sweep
 from tests.experiments.runner.tracking.screenshot import look_at

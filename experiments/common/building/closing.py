@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from experiments.common.building.anatomy import anatomy_of
-from experiments.common.building.closure import closure_model
+from experiments.common.building.closure import anatomy_of, closure_model
 from experiments.common.progress import SolveBar
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.errors import InputError
@@ -116,11 +115,6 @@ def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
         The resolved configuration.
     name : str
         Of the progress bar.
-
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible.
     """
     model = closure_model(values)
     truth = np.array(values["truth"]["values"], dtype=float)

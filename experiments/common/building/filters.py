@@ -7,15 +7,16 @@ from typing import Any, cast
 
 import numpy as np
 
+from experiments.common.schema import Values
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import observation_noise
 from mvest.estimation.transform import Identity, Log, Transform
 from mvest.mechanics.parameters import is_positive
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
-Values = Mapping[str, Any]
 OURS = "mvest.estimation."
 
 
@@ -101,14 +102,24 @@ def require_one_each(name: str, values: FloatArray, parameters: tuple[str, ...])
 
 def _gaussian(name: str, mean: FloatArray, variance: Any) -> Gaussian:
     """Prior with one variance, one for each parameter, or a full covariance."""
-    numbers = as_numbers(name, variance)
+    numbers = _as_numbers(name, variance)
     try:
         return Gaussian.from_variance(mean, numbers)
     except InputError as error:
         raise ConfigurationError(f"{name} = {variance}: {error}") from error
 
 
-def as_numbers(name: str, value: Any) -> float | FloatArray:
+def observation_variance(R: Any) -> float | FloatArray:
+    """``filter.R``, mm²: one positive variance, or one for each observed frame."""
+    variance = _as_numbers("filter.R", R)
+    try:
+        observation_noise(np.atleast_1d(variance), np.size(variance))
+    except InputError as error:
+        raise ConfigurationError(f"filter.R = {R}: {error}") from error
+    return variance
+
+
+def _as_numbers(name: str, value: Any) -> float | FloatArray:
     """A setting that is a number, or an array of them."""
     try:
         numbers = np.asarray(value, dtype=np.float64)

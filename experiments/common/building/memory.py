@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.building.truth import truth_mesh
+from experiments.common.building.twin import truth_mesh
 from mvest.elements import ELEMENTS
 from mvest.errors import ConfigurationError
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import template_of
-from experiments.common.building.closure import mechanics_of
+from experiments.common.building.closure import mechanics_of, template_of
+from experiments.common.schema import Values
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.problem.stored import Store
@@ -25,8 +24,6 @@ from mvest.simulation.drawn_patient import (
 )
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
-
-Values = Mapping[str, Any]
 
 HIDDEN, POSITIONS = "hidden.json", "positions.npz"
 MAX_DRAWS = 5
@@ -57,13 +54,7 @@ class PatientPlace:
 
 
 def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
-    """Simulate the configured patient, unless that was done: where it lies.
-
-    Raises
-    ------
-    MvestError
-        If the configuration is inadmissible or the valve does not close.
-    """
+    """Simulate the configured patient, unless that was done: where it lies."""
     patient = require_patient(patient)
     described = {
         "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},

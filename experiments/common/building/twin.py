@@ -1,40 +1,177 @@
-"""A synthetic study: what estimates, and apart from it what makes the observation."""
+"""A synthetic study: the estimator's model and, apart from it, what makes the observation.
+
+``check=true`` answers with the Fisher information of the same study.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.building.anatomy import anatomy_of, guide_of
-from experiments.common.building.closure import closure_model, mechanics_of
-from experiments.common.building.errors import Correlations, observation_errors
-from experiments.common.building.filters import as_numbers, build_filter, require_one_each
-from experiments.common.building.truth import build_truth, truth_mechanics
+from experiments.common.building.closure import (
+    Anatomy,
+    anatomy_of,
+    build_mesh,
+    closure_model,
+    guide_of,
+    mechanics_of,
+    mesh_store,
+)
+from experiments.common.building.filters import build_filter, observation_variance, require_one_each
+from experiments.common.progress import SolveBar
+from experiments.common.schema import Values
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.noise import observation_noise
-from mvest.estimation.prediction import ObservationModel
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.valve_system import check_parameters
 from mvest.observation.errors import (
+    AnnulusOffset,
+    CoaptationDropout,
+    CorrelatedNoise,
     ObservationError,
     SpatialCorrelation,
+    WhiteNoise,
 )
 from mvest.observation.vertices import require_frames
+from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
-from mvest.problem.stored import Extrapolated, StoredModel
+from mvest.problem.stored import Extrapolated, Store, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
+from mvest.provenance import config_hash
+from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.valve import Valve
+from mvest.valve.anatomy.valve import LeafletSurface, Valve
 
-Values = Mapping[str, Any]
+
+def build_truth(
+    config: Values, plain: ClosureModel, settings: MechanicsSettings, anatomy: Anatomy
+) -> tuple[ClosureModel, StoredModel | Extrapolated]:
+    """The model that the observation is made from, and the same behind its store."""
+    truth, element = config["truth"], config["mechanics"]["element"]
+    changed, other = truth_mesh(config["mesh"], truth), truth["element"] or element
+    coarser = list(truth["extrapolated_from"])
+
+    def on(mesh: dict[str, Any]) -> tuple[ClosureModel, StoredModel]:
+        same = mesh == dict(config["mesh"]) and other == element
+        model = replace(
+            plain,
+            mesh=plain.mesh if same else build_mesh(anatomy, mesh, other, mesh_store(config)),
+            settings=settings,
+            fixed={**config["fixed"], **truth["fixed"]},
+        )
+        if coarser:  # meshes as fine as these take minutes from the open valve
+            model.guide = guide_of(model, anatomy, mesh)
+        described = {
+            "valve": config["valve"],
+            "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
+            "mesh": mesh if mesh["source"] == "tetwild" else _cells(mesh),
+            "element": other,
+            "dt_factor": truth["dt_factor"],
+            "tissue": {region: asdict(tissue) for region, tissue in settings.tissue.items()},
+            "fixed": model.fixed,
+            "observed": [config["observation"]["columns"], config["observation"]["rows"]],
+            "parameters": list(config["parameters"]),
+            **({"guided": True} if coarser else {}),
+        }
+        store = Store(config["paths"]["outputs"])
+        return model, store.model("truth", model, described, MADE_BY)
+
+    model, fine = on(changed)
+    if not coarser:
+        return model, fine
+    if len(coarser) != 2 or changed["source"] != "structured":
+        raise ConfigurationError(
+            f"truth.extrapolated_from = {coarser}, expected columns and rows of a structured mesh"
+        )
+    share = coarser[0] / changed["columns"]
+    if not 0 < share < 1 or share * changed["rows"] != coarser[1]:
+        raise ConfigurationError(
+            f"truth.extrapolated_from = {coarser}, expected fewer cells than {changed['columns']} "
+            f"x {changed['rows']}, by the same share in both directions"
+        )
+    _, coarse = on({**changed, "columns": coarser[0], "rows": coarser[1]})
+    return model, Extrapolated(fine, coarse, share)
+
+
+def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSettings:
+    """The estimator's mechanics with the truth's changes."""
+    for name in truth["fixed"]:
+        try:
+            kind_of(name)
+        except InputError as error:
+            raise ConfigurationError(f"truth.fixed: {error}") from error
+    tissue = dict(settings.tissue)
+    for region, ratio in truth["ratio"].items():
+        if region not in tissue:
+            raise ConfigurationError(
+                f"truth.ratio has the region {region!r}; known: {', '.join(tissue)}"
+            )
+        tissue[region] = replace(tissue[region], ratio=ratio)
+    if truth["reading"] is not None:
+        tissue = {r: replace(old, reading=truth["reading"]) for r, old in tissue.items()}
+    protocol = replace(settings.protocol, dt=settings.protocol.dt * truth["dt_factor"])
+    return replace(settings, tissue=tissue, protocol=protocol)
+
+
+def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
+    """The estimator's mesh settings with the truth's changes."""
+    if truth["refine"] < 1:
+        raise ConfigurationError(f"truth.refine = {truth['refine']}, expected at least 1")
+    changed = dict(mesh)
+    changed["source"] = truth["source"] or mesh["source"]
+    changed["edge_length"] = mesh["edge_length"] / truth["refine"]
+    for name in ("columns", "rows"):
+        given = truth[name]
+        changed[name] = mesh[name] * truth["refine"] if given is None else given
+    changed["layers"] = mesh["layers"] if truth["layers"] is None else truth["layers"]
+    return changed
+
+
+def _cells(mesh: Values) -> dict[str, Any]:
+    """What decides a structured mesh besides its element."""
+    return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
+
+
+MADE_BY = (closure_model, truth_mechanics, truth_mesh)
+"""What makes the closures of a configured valve."""
+
+
+class Correlations:
+    """Correlations between the vertices of a surface, each length factorised once."""
+
+    def __init__(self, surface: LeafletSurface) -> None:
+        self.surface = surface
+        self._made: dict[float, SpatialCorrelation] = {}
+
+    def __call__(self, length: float) -> SpatialCorrelation:
+        """The correlation of one length, mm."""
+        if length not in self._made:
+            self._made[length] = SpatialCorrelation(self.surface.vertices, length)
+        return self._made[length]
+
+
+def observation_errors(
+    settings: Values, correlations: Correlations
+) -> tuple[ObservationError, ...]:
+    """The configured errors that are not zero, in the order in which they arise."""
+    offset = settings["annulus_offset_mm"]
+    made: list[ObservationError] = [AnnulusOffset(tuple(offset))] if np.any(offset) else []
+    made.append(WhiteNoise(settings["noise_mm"]))
+    if settings["correlated_mm"]:
+        correlation = correlations(settings["correlation_length_mm"])
+        made.append(CorrelatedNoise(settings["correlated_mm"], correlation))
+    if settings["dropout_mm"]:
+        made.append(CoaptationDropout(settings["dropout_mm"], correlations.surface))
+    return tuple(made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,11 +237,7 @@ def build_twin(config: Values) -> Twin:
     settings = mechanics_of(config)
     # What is cheap to refuse is refused before anything is meshed.
     filter_, transform, prior = build_filter(config["filter"], parameters)
-    variance = as_numbers("filter.R", config["filter"]["R"])
-    try:
-        observation_noise(np.atleast_1d(variance), np.size(variance))
-    except InputError as error:
-        raise ConfigurationError(f"filter.R = {config['filter']['R']}: {error}") from error
+    variance = observation_variance(config["filter"]["R"])
     frames = tuple(config["observation"]["frames"])
     require_frames(frames)
     if np.size(variance) not in (1, len(frames)):
@@ -178,3 +311,48 @@ def _require_tissue(
             elif f"E_f.{region}" in values:
                 own = [values.get(f"{kind}.{region}") for kind in ("ratio", "G")]
                 _ = tissue.moduli(values[f"E_f.{region}"], *own).material  # refuses what is none
+
+
+OF_THE_MODEL = ("valve", "mesh", "mechanics", "parameters", "fixed", "guided")
+"""Parts of a configuration on which a closure depends, besides where it is computed."""
+
+
+@dataclass(slots=True)
+class TwinExpectation:
+    """Answers for synthetic studies; jobs of a sweep that begin alike share their closure."""
+
+    _known: dict[str, Prediction] = field(default_factory=dict)
+
+    def __call__(self, config: Mapping[str, Any], _folder: Path | None = None) -> str:
+        """The answer for one configuration."""
+        twin = build_twin(config)
+        start = twin.problem.start
+        observed = config["observation"]
+        key = config_hash(
+            {part: config[part] for part in OF_THE_MODEL}
+            | {"at": start.tolist(), "observed": [observed["columns"], observed["rows"]]}
+        )
+        with SolveBar(config["name"], len(twin.model.settings.protocol.steps()), 1) as bar:
+            twin.model.on_step = bar.step
+            if key not in self._known:
+                self._known[key] = SharedStart(twin.model, start)(start)
+        first = self._known[key]
+
+        def model(m: FloatArray) -> Prediction:
+            return first if np.array_equal(m, start) else Prediction.failed("not the start")
+
+        title = f"{config['name']}, {config['row']}"
+        data = twin.observe(model, start, np.random.default_rng(0))
+        if data.observation is None:
+            return unknown_text(title, first.reason)
+        std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
+        noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
+        return expectation_text(
+            title, expect(replace(twin.problem, model=model), data.observation), noise
+        )
+
+
+def noise_words(known: str, std_mm: Sequence[float], length_mm: float) -> str:
+    """How well coordinates are "assumed" or "stated" to be seen."""
+    errors = f"correlated over {length_mm:g} mm" if length_mm else "independent"
+    return f"{' and '.join(f'{s:.3g}' for s in std_mm)} mm of noise {known}, {errors}"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.building.closure import mechanics_of, mesh_store
+from experiments.common.building.twin import noise_words
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
-from experiments.common.expectation import noise_words
 from experiments.common.progress import PartBar, SolveBar
 from experiments.common.records.record import (
     FIELDS,
@@ -19,7 +19,7 @@ from experiments.common.records.record import (
     Record,
     has_passed,
 )
-from experiments.common.schema import build
+from experiments.common.schema import Values, build
 from experiments.common.study import Result
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
@@ -46,8 +46,6 @@ from mvest.problem.record import EstimateRecord, Row
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 from mvest.reporting.expectation import expectation_text
-
-Values = Mapping[str, Any]
 
 TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
@@ -228,13 +226,7 @@ def write_report(folder: Path, record: Record) -> list[Path]:
 
 
 def expect_own(values: Values, _folder: Path | None = None) -> str:
-    """What ``check=true`` says of a case: the answer of the Fisher information.
-
-    Raises
-    ------
-    MvestError
-        If the case is not in order.
-    """
+    """What ``check=true`` says of a case: the answer of the Fisher information."""
     case = read_configured(values["case"])
     if case.closed is None:
         return f"{case.name}: an open frame alone, from which nothing can be estimated"

@@ -95,15 +95,7 @@ class Provenance(Frozen):
 
 
 class Mesh(Frozen):
-    """The estimator's mesh, and the truth's where there is another.
-
-    Attributes
-    ----------
-    sha256 : str
-    nodes : int
-    elements : int or None
-    truth_sha256 : str or None
-    """
+    """The estimator's mesh, and the truth's where there is another."""
 
     sha256: str
     nodes: int

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from experiments.common.building.closure import mechanics_of
 from experiments.common.progress import PartBar
-from experiments.common.schema import NOT_HASHED
+from experiments.common.schema import NOT_HASHED, Values
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
@@ -50,7 +50,6 @@ from mvest.simulation.trials import Trial
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
-Values = Mapping[str, Any]
 Try = Callable[[MovingValve, Trial, Path, TrackingSettings], dict[str, Any]]
 Seen = tuple[Mapping[str, Any], Mapping[str, FloatArray]]
 """Row and arrays of a trial."""
@@ -160,13 +159,7 @@ class ImagingStore:
         return self._store.entry("valves", described, made_by, load_population)
 
     def population(self, which: str) -> tuple[MovingValve, ...]:
-        """A population of simulated valves: ``train``, ``calibration`` or ``test``.
-
-        Raises
-        ------
-        MvestError
-            If a valve does not close in 20 draws, or the store cannot be written.
-        """
+        """A population of simulated valves: ``train``, ``calibration`` or ``test``."""
         drawn = getattr(self.settings, which)
 
         def draw() -> Population:
@@ -202,13 +195,7 @@ class ImagingStore:
         return self._store.entry("models", described, made_by, load_model).path
 
     def train(self, valves: Sequence[MovingValve], trained_on: Values) -> DetectionModel:
-        """Detectors trained on valves.
-
-        Raises
-        ------
-        MvestError
-            If there is nothing to train on, or the store cannot be written.
-        """
+        """Detectors trained on valves."""
         folder, settings = self.samples_folder(), self.settings.training
 
         def sampled(
@@ -249,13 +236,7 @@ class ImagingStore:
         return digest.hexdigest()
 
     def tried(self, function: Try, trials: Sequence[Trial]) -> list[Seen]:
-        """Rows and arrays of trials of the detectors, which are trained by now.
-
-        Raises
-        ------
-        MvestError
-            If a valve does not close, or the store cannot be written.
-        """
+        """Rows and arrays of trials of the detectors, which are trained by now."""
         # The verdict changes nothing of what is found.
         settings = replace(self.settings.detection, min_confidence=0.0)
         of = ["calibration" if t.kind.endswith("calibration") else "test" for t in trials]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.common.records.record import Number, Record
-from experiments.common.schema import build
+from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore, Seen
 from mvest.cases.from_images.expected_error import coverage
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-Values = Mapping[str, Any]
 Row = Mapping[str, Any]
 
 MODEL = "tee.npz"
@@ -105,13 +104,7 @@ class Settings:
 
 
 def run_imaging(job: Job[Settings]) -> Result:
-    """Train detectors and test them on valves that no training saw; the model is left beside.
-
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible; the message names it.
-    """
+    """Train detectors and test them on valves that no training saw; the model is left beside."""
     require_imaging(job.values)
     settings = job.settings.imaging
     store = ImagingStore(job.values, settings)

@@ -6,13 +6,13 @@ from .detected import image_step as image_step
 from .detected import write_detected as write_detected
 from .errors_in_world import samples_in_world as samples_in_world
 from .errors_in_world import valve_axes as valve_axes
+from .errors_in_world import with_bands as with_bands
 from .errors_in_world import without_expected_error as without_expected_error
 from .files import write_for_slicer as write_for_slicer
 from .files import write_landmarks as write_landmarks
 from .files import write_surfaces as write_surfaces
 from .frame_choice import CaseFrames as CaseFrames
 from .frame_choice import choose_frames as choose_frames
-from .measure_bands import with_bands as with_bands
 from .measures import OPEN_SHARE as OPEN_SHARE
 from .measures import closed_frame as closed_frame
 from .measures import contact_distance as contact_distance

@@ -159,7 +159,7 @@ def closed_frame(rows: Sequence[Row]) -> int | None:
 def measure_meaning(name: str) -> tuple[str, str]:
     """Unit (empty for pure numbers) and meaning of an entry of `measure_sequence`.
 
-    Or of a bound of one (`mvest.cases.from_images.measure_bands`).
+    Or of a bound of one (`mvest.cases.from_images.errors_in_world`).
     """
     for end, words in BOUNDS.items():
         if name.endswith(f"_{end}"):

@@ -2,6 +2,10 @@
 
 Every volume is simulated, sampled for all stages at once and forgotten: guesses of every stage are
 missed by set amounts (each stage says which), so that no stage waits for the one before it.
+
+Half of the volumes are made worse at random, so that detectors do not count on one scanner's image:
+by blur, noise that grows with the distance from one side, and a threshold, none of which a setting
+of the simulator does. What is done, and how much, is a choice.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from mvest.errors import InputError
 from mvest.imaging.detection.boundary import boundary_samples
@@ -34,7 +39,6 @@ from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.shape_start import MODES, shape_start_samples
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
-from mvest.imaging.learning.degrade import degrade
 from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.simulator.acquisition import Acquisition, draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
@@ -197,7 +201,7 @@ def render_frame(
 ) -> RenderedFrame:
     """Simulate the volume of one frame of a valve, probe and rendering drawn at random.
 
-    With ``degraded`` it is made worse besides, see :mod:`mvest.imaging.learning.degrade`.
+    With ``degraded`` it is made worse besides, see :mod:`mvest.imaging.learning.training`.
     """
     rng = np.random.default_rng(seed)
     acquisition = draw_acquisition(rng, base, spread)
@@ -341,3 +345,39 @@ def train_model(
         boosters[name] = found_boosters
         tell("stages", k + 1, len(STAGES))
     return DetectionModel(shape, boosters, dict(trained_on or {}))
+
+
+SHARE = 0.5
+"""Of the volumes that are changed at all, and of each change among those."""
+
+MAX_BLUR_VOXELS = 1.3
+MAX_NOISE = 45.0
+"""Grey values of 255, standard deviation where noise is largest."""
+
+MAX_CUT = 70.0
+"""Grey values below which an image is cut off, at most."""
+
+
+def degrade(volume: VolumeSequence, rng: np.random.Generator) -> VolumeSequence:
+    """A volume of grey values from 0 to 255 (uint8), changed at random; 0 stays 0."""
+    if rng.random() >= SHARE:
+        return volume
+    blurs, noises, cuts = rng.random(3) < SHARE
+    seen = np.asarray(volume.frames) > 0
+    grey = np.asarray(volume.frames, dtype=np.float32)
+    if blurs:
+        sigma = rng.uniform(0.0, MAX_BLUR_VOXELS, 3)
+        grey = np.stack([ndimage.gaussian_filter(frame, sigma) for frame in grey])
+    if noises:
+        axis, flip = int(rng.integers(1, 4)), bool(rng.random() < 0.5)
+        along = np.linspace(0.0, 1.0, grey.shape[axis], dtype=np.float32)
+        level = rng.uniform(0.0, MAX_NOISE) * (along[::-1] if flip else along) ** rng.uniform(0, 2)
+        shape = [1, 1, 1, 1]
+        shape[axis] = -1
+        noise = rng.standard_normal(grey.shape, dtype=np.float32)
+        noise = np.stack([ndimage.gaussian_filter(frame, 0.6) for frame in noise])
+        grey = grey + 2.0 * level.reshape(shape) * noise
+    if cuts:
+        grey = grey - np.float32(rng.uniform(0.0, MAX_CUT))
+    frames = np.where(seen, np.clip(grey, 0.0, 255.0), 0.0).astype(np.uint8)
+    return replace(volume, frames=frames)

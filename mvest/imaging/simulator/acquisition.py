@@ -224,13 +224,7 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionRanges:
-    """Ranges of settings, drawn independently of each other.
-
-    Attributes
-    ----------
-    name : str
-    ranges : tuple of Range
-    """
+    """Ranges of settings, drawn independently of each other."""
 
     name: str
     ranges: tuple[Range, ...]

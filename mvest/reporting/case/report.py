@@ -36,8 +36,7 @@ from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.images.step import write_image_step
 from mvest.reporting.markup import ended, number
-from mvest.reporting.page import TEMPLATES, rendered
-from mvest.reporting.pictures import embedded
+from mvest.reporting.pictures import TEMPLATES, embedded, rendered
 
 REPORT, UNKNOWNS = "report.html", "unknowns.csv"
 SCRIPT = TEMPLATES / "case_report.js"

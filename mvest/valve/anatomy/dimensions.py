@@ -118,10 +118,6 @@ class ClosedEdge:
 
     The line is ``y = free_edge.commissural_y - sag (1 - u^2)``, ``z = middle_z - drop u^2`` with
     ``u = x / half_width``.
-
-    Attributes
-    ----------
-    half_width, sag, middle_z, drop : float
     """
 
     half_width: Length = 13.0
@@ -224,15 +220,6 @@ POSITIVE = (
 @dataclass(frozen=True, slots=True)
 class TemplateParameters:
     """Shape of the valve; lengths in mm, angles in degrees.
-
-    Attributes
-    ----------
-    annulus : AnnulusDimensions
-    leaflets : LeafletPair
-    free_edge : FreeEdge
-    closed_edge : ClosedEdge
-    papillary : PapillaryPlace
-    chordae : ChordLayout
 
     Raises
     ------

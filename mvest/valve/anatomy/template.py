@@ -51,10 +51,6 @@ def vertex_region(phi: FloatArray) -> IntArray:
 class Template:
     """A valve in material coordinates.
 
-    Parameters
-    ----------
-    parameters : TemplateParameters
-
     Raises
     ------
     GeometryError

@@ -33,10 +33,6 @@ class GivenValve:
 
     With two leaflets it has material coordinates (`mvest.valve.anatomy.band.Band`) and may be
     meshed in layers; otherwise it is what was given, and its meshes are unstructured.
-
-    Parameters
-    ----------
-    given : Valve
     """
 
     def __init__(self, given: Valve) -> None:

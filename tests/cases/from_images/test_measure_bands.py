@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.from_images import measure_meaning, measure_sequence, valve_axes, with_bands
-from mvest.cases.from_images.measure_bands import BANDED
+from mvest.cases.from_images.errors_in_world import BANDED
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
 from tests import made_up_sequence

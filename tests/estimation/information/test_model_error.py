@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
-from mvest.estimation.information.model_error import shift_by_model_error, with_shift
+from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
 
 PRIOR = Gaussian(np.array([1.0, -1.0]), np.array([[0.5, 0.1], [0.1, 2.0]]))
 R = np.linspace(0.1, 0.4, 6)

@@ -7,11 +7,10 @@ import pytest
 from PIL import Image
 
 from experiments.results.keep import publish
-from experiments.results.page import write_report
 from experiments.studies.twin import STUDY
 from experiments.sweeps.collected import Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
-from experiments.tables import main
+from experiments.tables import main, write_report
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import made_up_twin
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep

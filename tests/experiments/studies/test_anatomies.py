@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import template_of
 from experiments.common.config import plain
-from experiments.common.places import ANATOMIES
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
 from tests.experiments.configured import composed
+from tests.places import ANATOMIES
 
 NORMAL = [name for name in ANATOMIES if name.startswith("normal")]
 
 
 def anatomy(name: str) -> Template:
-    return template_of(plain(composed(f"valve={name}"), ("hydra", "paths", "tracking")))
+    return template_of(plain(composed(f"valve={name}")))
 
 
 def diameters(template: Template) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import anatomy_digest, gate_of
-from experiments.common.places import ANATOMIES, GATE_RECORDS
+from experiments.common.places import GATE_RECORDS
 from experiments.common.records.record import NOT_GATED, Record, has_passed, read_record, stamp
 from experiments.common.records.writer import cautions, write_results
 from experiments.common.study import Result, Results
@@ -19,7 +19,7 @@ from mvest.closure.smoothness import JUMP_LIMIT
 from mvest.estimation import Prediction
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed, plain
-from tests.places import CONF
+from tests.places import ANATOMIES, CONF
 
 SMALL = (
     "mesh.columns=12",

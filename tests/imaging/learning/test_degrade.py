@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mvest.imaging.learning.degrade import degrade
+from mvest.imaging.learning.training import degrade
 from mvest.imaging.volume import VolumeSequence
 
 

@@ -8,10 +8,12 @@ from matplotlib.collections import LineCollection
 
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.reporting.images.montage import LEAFLETS, chosen_frames, montage_figure
-from mvest.reporting.images.planes import (
+from mvest.reporting.images.montage import (
     COLUMNS,
+    LEAFLETS,
+    chosen_frames,
     leaflet_contours,
+    montage_figure,
     near,
     resample,
     valve_planes,

@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from experiments.common.building.anatomy import anatomy_of, build_mesh, template_of, upright
-from experiments.common.building.closure import closure_model
+from experiments.common.building.closure import (
+    anatomy_of,
+    build_mesh,
+    closure_model,
+    template_of,
+    upright,
+)
 from experiments.common.building.gate import anatomy_digest
 from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of, plain

@@ -35,7 +35,7 @@ def test_a_mesh_beyond_the_memory_of_a_job_is_not_built(
     tmp_path, monkeypatch, capsys, setting, named
 ):
     monkeypatch.chdir(tmp_path)
-    meshed = "experiments.common.building.anatomy.structured_mesh"
+    meshed = "experiments.common.building.closure.structured_mesh"
     monkeypatch.setattr(meshed, lambda *_: pytest.fail("built"))
     line = ["experiments.run", "experiment=debug", "memory_limit_gb=2", *setting]
     monkeypatch.setattr(sys, "argv", line)

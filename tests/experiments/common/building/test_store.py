@@ -13,7 +13,7 @@ import experiments
 import mvest.closure.model
 import mvest.files
 import mvest.source
-from experiments.common.building.truth import MADE_BY
+from experiments.common.building.twin import MADE_BY
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
@@ -256,7 +256,7 @@ def test_a_truth_outlives_what_has_no_part_in_it(truth):
     code = truth.code
     edit(code / "mvest" / "estimation" / "filters" / "iterated.py", "max_iterations", "max_loops")
     edit(code / "mvest" / "reporting" / "style.py", "import", "X = 1\nimport")
-    edit(code / "experiments" / "common" / "building" / "truth.py", "fewer cells", "less")
+    edit(code / "experiments" / "common" / "building" / "twin.py", "fewer cells", "less")
     (code / "mvest" / "mechanics" / "another.py").write_text("VISCOSITY = 1.0\n")
     assert not truth()
     # That is, until it is used.
