@@ -285,10 +285,12 @@ def test_volumes_and_what_writes_them_count_where_they_are_used():
 
 def test_importing_a_package_of_ours_has_no_effect():
     # What an __init__ does on the way to one of its modules is in no key. (That of experiments
-    # limits threads.)
+    # limits threads, and that of mvest says where numba keeps what it has compiled.)
     roots = (Path(mvest.__file__).parent, *Path(experiments.__file__).parent.glob("*/"))
     for path in (path for root in roots for path in root.rglob("__init__.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+            if ast.unparse(node) == "choose_cache()":
+                continue
             harmless = ast.Import | ast.ImportFrom | ast.Assign | ast.FunctionDef | ast.ClassDef
             assert is_text or isinstance(node, harmless), f"{path}:{node.lineno}"

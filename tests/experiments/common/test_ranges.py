@@ -17,7 +17,7 @@ from experiments.common.schema import (
     require_within,
 )
 from experiments.common.study import load_settings, study_names
-from experiments.runner.sweep import LauncherSettings
+from experiments.runner.execution.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION, range_of
@@ -95,8 +95,8 @@ def test_all_that_is_configured_is_inside(overrides: list[str]) -> None:
 def test_so_are_the_launchers_settings() -> None:
     for path in sorted((CONF / "hydra" / "launcher").glob("*.yaml")):
         values = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-        require_admissible_values(LauncherSettings, values, "hydra.launcher")
-        known = hints_of(LauncherSettings)
+        require_admissible_values(EngineSettings, values, "hydra.launcher")
+        known = hints_of(EngineSettings)
         assert all(
             name in known for name, value in values.items() if isinstance(value, int | float)
         )
