@@ -17,11 +17,10 @@ from experiments.common.progress import announce_compilation
 from experiments.common.records.metrics import metrics
 from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
-from experiments.common.study import load_study
 from experiments.results.estimates import sweep_table
 from experiments.results.publish import publish_runs, publish_sweep
 from experiments.runner.collecting.collect import NOT_RUN, collect
-from experiments.runner.execution.check import require_admissible
+from experiments.runner.execution.check import require_admissible, require_checks
 from experiments.runner.execution.cluster import EngineSettings, require_engine
 from experiments.runner.execution.engine import run_jobs
 from experiments.runner.jobs.folder import FailedRunError, last_record, nothing_empty
@@ -264,9 +263,5 @@ def _check(job: PlannedJob) -> None:
 
 def _run_checks(plan: Plan) -> None:
     """Say what the data of each job will tell."""
-    study = plan.common["study"]
-    checks = load_study(study).checks()
-    for job in plan.jobs:
-        if not checks or job.values["study"] != study:
-            raise ConfigurationError(f"check=true has nothing to say of the job {job.label}")
+    for job, checks in [(job, require_checks(job.values)) for job in plan.jobs]:
         print(job.label, *(check(job.values, job.folder) for check in checks), "", sep="\n")

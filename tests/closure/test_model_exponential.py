@@ -142,7 +142,7 @@ def test_each_region_follows_its_own_law():
 
     assert np.all(partial("c0.anterior", 0)[mesh.region == 1] == 0)
     assert np.all(partial("E_f.posterior", 1)[mesh.region == 0] == 0)
-    with pytest.raises(InputError, match=r"this region knows c0\.REGION"):
+    with pytest.raises(InputError, match=r"the law of its leaflet knows c0\.REGION"):
         partial("E_f.anterior", 0)
 
 
