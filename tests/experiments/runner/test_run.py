@@ -12,7 +12,6 @@ import yaml
 
 from experiments import tables
 from experiments.common.records.record import read_record
-from experiments.results.keep import records_of
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation import Prediction
@@ -404,32 +403,6 @@ def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
     status, out, err = run("experiment=debug", "dry_run=true", "filter.P0=-1")
     assert (status, out) == (2, "")
     assert "filter.P0 = -1" in err
-
-
-@pytest.mark.slow
-def test_an_experiment_of_several_runs_keeps_a_record_of_each(
-    run, tmp_path, instead_of_closing
-) -> None:
-    instead_of_closing(shrinking)
-    status, _, err = run(
-        "experiment=mesh_independence",
-        "hydra/launcher=basic",
-        "isolate=false",
-        "tracking.enabled=false",
-        "paths.results=published",
-    )
-    assert status == 0, err
-    kept = records_of(tmp_path / "published", "mesh_independence")
-    assert kept is not None
-    assert list(kept.records) == [
-        "mesh-independence-hex18-structured-36-x-4",
-        "mesh-independence-hex18-structured-36-x-8",
-        "mesh-independence-hex18-structured-40-x-5",
-        "mesh-independence-hex18-structured-54-x-6",
-        "mesh-independence-hex18-structured-72-x-8",
-    ]
-    table = (tmp_path / "published" / "mesh_independence.md").read_text(encoding="utf-8")
-    assert table.count("hex18 structured") == 5
 
 
 def test_tables_without_records_say_what_to_do(tmp_path, capsys) -> None:

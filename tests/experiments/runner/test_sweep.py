@@ -7,6 +7,7 @@ import math
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from experiments.results.keep import records_of
 from experiments.runner import plugins, sweep
 from experiments.runner.execution import engine, guard
 from experiments.runner.jobs import limits
@@ -287,6 +289,31 @@ def test_results_are_renewed_by_a_sweep_as_configured_only(run):
     assert not Path("outputs/results").exists()
     run("sweep=debug", "publish=true", "sweep.size=full")
     assert read_sweep(Path("outputs/results/sweeps/debug.json")).size == "full"
+
+
+def test_an_experiment_of_several_runs_keeps_a_record_of_each(run, monkeypatch):
+    # Made-up records have no tables.
+    monkeypatch.setattr(twin, "STUDY", replace(twin.STUDY, summary=None, figure=None))
+    usual = ("experiment=mesh_independence", "paths.results=published")
+    status, _, err = run(*usual)
+    assert status == 0, err
+    names = [
+        "mesh-independence-hex18-structured-36-x-4",
+        "mesh-independence-hex18-structured-36-x-8",
+        "mesh-independence-hex18-structured-40-x-5",
+        "mesh-independence-hex18-structured-54-x-6",
+        "mesh-independence-hex18-structured-72-x-8",
+    ]
+    kept = records_of(Path("published"), "mesh_independence")
+    assert kept is not None
+    assert list(kept.records) == names
+    # What was done before is taken over where the results have lost it.
+    shutil.rmtree("published")
+    assert run(*usual)[0] == 0
+    assert len(runs()) == 5
+    kept = records_of(Path("published"), "mesh_independence")
+    assert kept is not None
+    assert list(kept.records) == names
 
 
 WRONG = [
