@@ -262,6 +262,9 @@ def _check(job: PlannedJob) -> None:
 
 
 def _run_checks(plan: Plan) -> None:
-    """Say what the data of each job will tell."""
-    for job, checks in [(job, require_checks(job.values)) for job in plan.jobs]:
-        print(job.label, *(check(job.values, job.folder) for check in checks), "", sep="\n")
+    """Say what the data of each job will tell; jobs that begin alike share what they compute."""
+    studies = {job.values["study"]: job.values for job in plan.jobs}
+    checks = {study: require_checks(values) for study, values in studies.items()}
+    for job in plan.jobs:
+        found = (check(job.values, job.folder) for check in checks[job.values["study"]])
+        print(job.label, *found, "", sep="\n")
