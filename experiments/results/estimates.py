@@ -40,7 +40,7 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "parameter": ("text", "", "what is estimated, E_f.anterior say; empty of a lost job"),
     "unit": ("text", "", "unit of the parameter; empty for factors"),
     "kind": ("text", "", "modulus, nuisance or derived"),
-    "treatment": ("text", "", "estimated, considered or fixed"),
+    "treatment": ("text", "", "always estimated"),
     "prior_mean": ("number", "as unit", "mean of the prior"),
     "prior_std": ("number", "as unit", "standard deviation of the prior"),
     "estimate": ("number", "as unit", "estimate"),

@@ -124,9 +124,8 @@ class SweepRun:
         self._jobs = {key: PlannedJob(job.request) for key, job in self._jobs.items()}
         del ended, found, plan, batch
         log_sweep(folder, common)
-        if sweeper not in GIVEN_ONCE and any(
-            one._return_value != one._return_value for one in returned
-        ):
+        done = [one.return_value for one in returned if one.status == JobStatus.COMPLETED]
+        if sweeper not in GIVEN_ONCE and any(map(math.isnan, done)):
             raise ConfigurationError(
                 f"objective = {config.objective}: a job has no such number (MLflow shows all names)"
             )

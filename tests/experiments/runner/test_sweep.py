@@ -239,6 +239,10 @@ def test_jobs_may_come_in_several_batches(run, monkeypatch):
     found = read_sweep(Path("outputs/debug/sweep.json")).records
     assert [record.factors for record in found] == [{"seed": 1}, {"seed": 2}, {"seed": 3}]
     assert "debug: 3 of 3 jobs done" in out
+    # A sweeper that chooses by the objective cannot go on without one.
+    status, _, err = run("-m", "experiment=debug", "seed=1,2,3", "objective=no_such_number")
+    assert status == 2
+    assert "objective = no_such_number: a job has no such number" in err
 
 
 def test_the_folders_of_jobs_may_be_named_otherwise(run):
