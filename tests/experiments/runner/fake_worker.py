@@ -2,8 +2,8 @@
 
 ``kill-SEED``, ``exit-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that
 seed, once; ``hold-SEED`` and ``spin-SEED`` run on in compiled code or in Python, ``spawn-SEED``
-waits for a child; one with ``wait-SEED`` goes on when that is gone. Every run leaves a line in
-``runs``.
+waits for a child; one with ``wait-SEED`` writes its process there and goes on when that is gone.
+Every run leaves a line in ``runs``.
 """
 
 import ctypes
@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -30,7 +31,11 @@ def run(job):
     seed = job.values["seed"]
     with Path("runs").open("a") as runs:
         runs.write(f"{seed}\n")
-    while Path(f"wait-{seed}").exists():
+    wait = Path(f"wait-{seed}")
+    with suppress(FileNotFoundError), wait.open("r+") as order:  # never made anew
+        order.truncate()
+        order.write(str(os.getpid()))
+    while wait.exists():
         time.sleep(0.02)
     for name in ("kill", "exit", "raise", "hog", "full", "hold", "spin", "spawn"):
         order = Path(f"{name}-{seed}")
