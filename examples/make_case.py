@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 import mvest
+from mvest.exchange.surfaces import write_surface
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation
-from mvest.valve.io.leaflet_surfaces import write_surface
 
 TRUTH = np.array([1.2 * 6.23, 0.8 * 2.09])
 TISSUE = {"anterior": mvest.TissueSettings(2.65), "posterior": mvest.TissueSettings(1.11)}

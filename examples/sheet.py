@@ -6,8 +6,8 @@ free edge; it is pressed from below. Two regions, before and behind the middle o
 Young's modulus each. `OwnSheet` predicts it with this project's mechanics, `SecondSheet` with
 scikit-fem. The two share nothing but the numbers in `Sheet`: element, strains, load, tangent and
 derivatives are written twice, from different formulas. Run as a program, this file is the second
-one, asked through files by the contract of `mvest.external`; without arguments it says how far the
-codes are apart:
+one, asked through files by the contract of `mvest.exchange.external`; without arguments it says
+how far the codes are apart:
 
     python sheet.py REQUEST FOLDER
     python sheet.py
@@ -52,7 +52,7 @@ from scipy.sparse.linalg import splu
 
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.prediction import Prediction
-from mvest.external.contract import read_request, write_answer
+from mvest.exchange.external.contract import read_request, write_answer
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter

@@ -1,7 +1,7 @@
 """``mvest import`` and ``mvest export``: other programs' files to a case, and from one.
 
-What there is to import and export is what lies in `mvest.cases.importing` and
-`mvest.cases.exporting`; nothing is listed here.
+What there is to import and export is what lies in `mvest.exchange.importing` and
+`mvest.exchange.exporting`; nothing is listed here.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.common.schema import build, schema
 from experiments.console import Parser
 from experiments.interruption import interruptible
-from mvest.cases import exporting, importing
 from mvest.cases.writer import require_new, write_case
 from mvest.errors import ConfigurationError
+from mvest.exchange import exporting, importing
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,16 @@ VALUE_OBJECTS = (
     "mvest.valve.mesh.solid_mesh",
 )
 
+FILES = (
+    "mvest.exchange.child",
+    "mvest.exchange.surfaces",
+    "mvest.exchange.regions",
+    "mvest.exchange.volumes",
+    "mvest.exchange.segmentations",
+    "mvest.exchange.markups",
+)
+"""Of the exchange of files, what knows no case."""
+
 # What each room of mvest may import from mvest, itself aside: the longest name that fits counts.
 # What is not listed has no place.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -71,19 +81,18 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.closure",
         "mvest.observation",
     ),
-    "mvest.cases": (*LEAVES, "mvest.provenance", "mvest.valve"),
-    "mvest.cases.from_images": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
-    "mvest.febio": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.closure"),
-    "mvest.cases.importing": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
-    "mvest.cases.exporting": (
+    "mvest.cases": (*LEAVES, *FILES, "mvest.provenance", "mvest.valve"),
+    "mvest.cases.from_images": (*LEAVES, *FILES, "mvest.valve", "mvest.imaging", "mvest.cases"),
+    "mvest.exchange": (
         *LEAVES,
+        "mvest.provenance",
         "mvest.valve",
         "mvest.mechanics",
         "mvest.imaging",
+        "mvest.estimation",
         "mvest.closure",
         "mvest.problem",
         "mvest.cases",
-        "mvest.febio",
     ),
     "mvest.personalisation": (
         *LEAVES,
@@ -108,12 +117,12 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.valve",
         "mvest.mechanics",
         "mvest.imaging",
+        "mvest.exchange",
         "mvest.closure",
         "mvest.observation",
         "mvest.problem",
         "mvest.cases",
     ),
-    "mvest.external": (*LEAVES, "mvest.provenance", "mvest.estimation"),
     "mvest.reporting": (
         *LEAVES,
         "mvest.provenance",
@@ -148,11 +157,12 @@ IMPORT_NAME = {
     "scikit-image": ("skimage",),
     "scikit-fem": ("skfem",),
     "simpleitk": ("SimpleITK",),
+    "vtk": ("vtkmodules",),
 }
-OPTIONAL = ("viz", "cluster", "postgres", "second-model")
+OPTIONAL = ("viz", "cluster", "febio", "postgres", "second-model")
 """Extras that mvest and experiments may use, within functions."""
 
-LOCKED = ("dev", "docs", "viz", "cluster")
+LOCKED = ("dev", "docs", "viz", "cluster", "febio")
 """Extras that `make lock` pins."""
 
 

@@ -274,7 +274,7 @@ def test_volumes_and_what_writes_them_count_where_they_are_used():
         "mvest.imaging.simulator.beams",
     }
     assert imaged >= FORWARD | volumes | {
-        "mvest.imaging.writing", "mvest.cases.writer",
+        "mvest.exchange.segmentations", "mvest.cases.writer",
     }  # fmt: skip
     assert reached(*SAMPLED_BY) >= volumes
     tried = reached(try_sequence)

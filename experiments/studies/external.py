@@ -26,9 +26,9 @@ from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, predict
 from mvest.estimation.transform import Transform
-from mvest.external.contract import read_points, write_points
-from mvest.external.model import Differences, ProcessModel
-from mvest.external.process import Command, files_of_command
+from mvest.exchange.external.contract import read_points, write_points
+from mvest.exchange.external.model import Differences, ProcessModel
+from mvest.exchange.external.process import Command, files_of_command
 from mvest.problem.estimate import StudyResult
 from mvest.problem.record import EstimateRecord, record_of, spread
 from mvest.reporting.tables import Column, table
@@ -53,7 +53,7 @@ def _python(value: str, _: Values) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelSettings:
-    """A program (mvest/external/README.md), or a function in a file of Python."""
+    """A program (mvest/exchange/external/README.md), or a function in a file of Python."""
 
     command: Annotated[tuple[str, ...], Reads(_command)] = ()  # program and arguments, no shell
     # FILE:FUNCTION, which is called with the settings and returns the model.

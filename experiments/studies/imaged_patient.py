@@ -29,12 +29,12 @@ from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
+from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import draw_acquisition
 from mvest.imaging.simulator.probe import Probe, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing import write_sequence_nrrd
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation.error_budget import EVERYTHING
 from mvest.problem.record import EstimateRecord, Unknown

@@ -34,13 +34,6 @@ from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.importing.reference_heart import (
-    CITATION,
-    ReferenceHeartOptions,
-    heart_files,
-    heart_parts,
-    import_reference_heart,
-)
 from mvest.cases.plausibility import free_orifice
 from mvest.cases.writer import write_case
 from mvest.closure.model import ClosureModel
@@ -49,6 +42,15 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import Remembered, SharedStart
+from mvest.exchange.abaqus.mesh import SetNames
+from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
+from mvest.exchange.importing.reference_heart import (
+    CITATION,
+    ReferenceHeartOptions,
+    heart_files,
+    heart_parts,
+    import_reference_heart,
+)
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
@@ -62,8 +64,6 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.io.abaqus.mesh import SetNames
-from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
 from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.measurements import leaflet_length
 from mvest.valve.mesh.remesh import Remeshed, remesh

@@ -21,8 +21,8 @@ from mvest.cases.checks import (
 )
 from mvest.cases.rims import Rims, find_rims, match_annulus, two_loops, without_ears
 from mvest.cases.schema import CaseFile, CaseFolder, FrameEntry, wrong
-from mvest.cases.surface_files import RegionSurface, read_regions
 from mvest.errors import InputError
+from mvest.exchange.regions import RegionSurface, read_regions
 from mvest.reading.text import read_numbers, read_vertices
 from mvest.typing import FloatArray, IntArray
 

@@ -13,9 +13,9 @@ from mvest.cases.folder import write_error_samples
 from mvest.cases.schema import CASE_FILE, VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError
+from mvest.exchange.surfaces import write_surface
 from mvest.files import write_atomically
 from mvest.reading.text import write_columns
-from mvest.valve.io.leaflet_surfaces import write_surface
 
 
 def write_case(folder: Path | str, case: ValveCase) -> Path:

@@ -20,17 +20,17 @@ from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
-from mvest.cases.importing.segmented import LabelsOptions, import_labels
-from mvest.cases.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError
+from mvest.exchange.importing.segmented import LabelsOptions, import_labels
+from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
+from mvest.exchange.surfaces import write_surface
 from mvest.problem.registration import displace
 from mvest.quantities import Length
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.io.leaflet_surfaces import write_surface
 
 KINDS = ("vertices", "surfaces", "slicerheart", "labels")
 """Of doors, in the order of tables."""

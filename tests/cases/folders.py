@@ -6,8 +6,8 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template
-from mvest.valve.io.leaflet_surfaces import write_surface
 
 TIPS = [[16.0, -0.24, -25.0], [-16.0, -0.24, -25.0]]
 

@@ -12,7 +12,7 @@ import pytest
 
 from mvest.cases.folder import read_case
 from mvest.errors import GeometryError, InputError
-from mvest.valve.io.leaflet_surfaces import read_surface
+from mvest.exchange.surfaces import read_surface
 from tests.cases.folders import plain_folder, save, save_surface
 
 

@@ -10,8 +10,8 @@ from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
+from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template
-from mvest.valve.io.leaflet_surfaces import write_surface
 from tests.cases.folders import TIPS, closing, plain_folder, save, save_surface, template_case
 
 

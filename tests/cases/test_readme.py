@@ -10,8 +10,8 @@ import yaml
 import mvest.cases
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CaseFile, FrameEntry, case_schema
+from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template
-from mvest.valve.io.leaflet_surfaces import write_surface
 from tests.cases.folders import closing, save
 
 README = (Path(mvest.cases.__file__).parent / "README.md").read_text(encoding="utf-8")

@@ -14,13 +14,13 @@ from experiments.common.records.record import stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.case import STUDY, Settings
-from mvest.imaging.reading.reader import read_volume
+from mvest.exchange.volumes.reader import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
+from tests.exchange.volumes import test_nifti, test_philips
+from tests.exchange.volumes import volumes as v
 from tests.experiments.common.test_inputs import own_case, own_program, own_volume, typed
 from tests.experiments.configured import composed, plain
-from tests.imaging.reading import test_nifti, test_philips
-from tests.imaging.reading import volumes as v
 from tests.made_up_closure import use
 
 NAME, NUMBER, DATE = "DOE^JANE", "MRN0815", "19700131"

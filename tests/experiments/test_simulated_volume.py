@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from experiments import cli, simulated_volume
+from mvest.exchange.surfaces import read_surface
+from mvest.exchange.volumes.reader import read_volume
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import default_model
-from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.valve.io.leaflet_surfaces import read_surface
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TRUTH = EXAMPLES / "volume_truth"

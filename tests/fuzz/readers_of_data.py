@@ -7,28 +7,28 @@ import numpy as np
 from experiments.common.records.record import read_record, write_record
 from experiments.runner.planning.plan import Plan
 from mvest.cases.case import ErrorSamples
-from mvest.cases.exporting.febio import read_run
 from mvest.cases.folder import read_case, write_error_samples
 from mvest.estimation.prediction import Prediction
-from mvest.external.contract import (
+from mvest.exchange.abaqus.recording import read_recording
+from mvest.exchange.exporting.febio import read_run
+from mvest.exchange.external.contract import (
     RunRequest,
     read_answer,
     read_request,
     write_answer,
     write_request,
 )
-from mvest.febio.positions import read_positions
+from mvest.exchange.febio.positions import read_positions
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.problem.fields import read_case_fields
 from mvest.provenance import write_json
 from mvest.reading.npz import read_npz
 from mvest.simulation.population import Population, load_population, save_population
-from mvest.valve.io.abaqus.recording import read_recording
 from tests.cases import folders
+from tests.exchange.surfaces import recorded
 from tests.experiments.studies.made_up import made_up, made_up_estimate
 from tests.fuzz.trial import Reader
-from tests.valve.io import recorded
 
 __all__ = ["READERS"]
 

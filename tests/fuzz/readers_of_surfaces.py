@@ -7,19 +7,19 @@ import numpy as np
 import yaml
 
 from mvest.cases.folder import read_case
-from mvest.cases.importing.slicerheart_folder import read_batch
-from mvest.cases.importing.solid import SolidOptions, import_solid
-from mvest.cases.surface_files import read_regions
-from mvest.valve.anatomy.dimensions import TemplateParameters
-from mvest.valve.anatomy.template import Template
-from mvest.valve.geometry.thickening import thicken
-from mvest.valve.io.leaflet_surfaces import (
+from mvest.exchange.importing.slicerheart_folder import read_batch
+from mvest.exchange.importing.solid import SolidOptions, import_solid
+from mvest.exchange.regions import read_regions
+from mvest.exchange.surfaces import (
     read_surface,
     write_surface,
 )
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.thickening import thicken
 from tests.cases.folders import plain_folder
+from tests.exchange.surfaces.glb import Glb
 from tests.fuzz.trial import Reader
-from tests.valve.io.glb import Glb
 
 __all__ = ["READERS"]
 

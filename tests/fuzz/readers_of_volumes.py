@@ -7,15 +7,15 @@ import nibabel
 import numpy as np
 import SimpleITK
 
-from mvest.cases.importing.segmented import LabelsOptions, import_labels
 from mvest.errors import GeometryError
-from mvest.imaging.markups import read_fcsv, read_markups
-from mvest.imaging.reading.nrrd_file import segment_names
-from mvest.imaging.reading.reader import read_volume
+from mvest.exchange.importing.segmented import LabelsOptions, import_labels
+from mvest.exchange.markups import read_fcsv, read_markups
+from mvest.exchange.volumes.nrrd_file import segment_names
+from mvest.exchange.volumes.reader import read_volume
 from mvest.imaging.volume import Modality
+from tests.exchange.volumes import test_nifti, test_philips
+from tests.exchange.volumes import volumes as v
 from tests.fuzz.trial import Reader
-from tests.imaging.reading import test_nifti, test_philips
-from tests.imaging.reading import volumes as v
 
 __all__ = ["READERS"]
 

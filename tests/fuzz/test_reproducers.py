@@ -11,12 +11,12 @@ import nibabel
 import numpy as np
 import pytest
 
+from tests.exchange.volumes import volumes as v
 from tests.fuzz import readers_of_surfaces as surfaces
 from tests.fuzz import readers_of_volumes as volumes
 from tests.fuzz.child import Child
 from tests.fuzz.readers import READERS
 from tests.fuzz.trial import Bench
-from tests.imaging.reading import volumes as v
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits are those of Linux")
 

@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.volume import VolumeSequence
-from tests.imaging.reading.volumes import MIRRORED, ROTATION
+from tests.exchange.volumes.volumes import MIRRORED, ROTATION
 
 
 def volume(direction, shape=(1, 3, 4, 5), times=(0.0,)):

@@ -3,8 +3,8 @@
 The same bodies and the same valve in both, from one mesh: a cube pulled, a sheet inflated, a strip
 bent, a valve under a pressure at which its leaflets do not meet, and a valve that closes. What the
 two differ by is taken apart by computing here with FEBio's law, and with FEBio's element, as well.
-It needs the program (`tests.febio.program`). Parts are laws, bodies and the contacts of the valve:
-none, potential, sliding; all by default. Rows of other contacts stay as they are.
+It needs the program (`tests.exchange.febio.program`). Parts are laws, bodies and the contacts of
+the valve: none, potential, sliding; all by default. Rows of other contacts stay as they are.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import Log
-from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
-from mvest.febio.mesh import LAWS, febio_law, febio_mesh
-from mvest.febio.valve import CONTACTS, FebSettings, differences, valve_document
+from mvest.exchange.febio.document import Control, FebDocument, Prescribed, Pressure
+from mvest.exchange.febio.mesh import LAWS, febio_law, febio_mesh
+from mvest.exchange.febio.valve import CONTACTS, FebSettings, differences, valve_document
 from mvest.files import write_atomically
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate
@@ -49,7 +49,7 @@ from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from tests.febio.program import FebRun, run_febio
+from tests.exchange.febio.program import FebRun, run_febio
 from tests.places import ROOT
 from tests.tables import markdown, write_text
 from tests.verification.strip import MATERIALS

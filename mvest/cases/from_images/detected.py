@@ -25,6 +25,8 @@ from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
+from mvest.exchange.markups import read_markups
+from mvest.exchange.volumes.reader import read_volume
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
@@ -33,9 +35,7 @@ from mvest.imaging.detection.trained_model import (
     load_model,
 )
 from mvest.imaging.learning.accuracy import unlike_share
-from mvest.imaging.markups import read_markups
 from mvest.imaging.models import MODEL_FILE
-from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, LANDMARKS, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.text import read_numbers

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.exchange.markups import PointList, write_markups
+from mvest.exchange.segmentations import segment_name, voxelise_leaflets, write_segmentation
+from mvest.exchange.surfaces import region_arrays, write_surface
 from mvest.files import write_atomically
-from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.valve_sequence import (
     ANNULUS_LABELS,
     ValveSequence,
@@ -18,8 +20,6 @@ from mvest.imaging.valve_sequence import (
     slicerheart_labels,
 )
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing import segment_name, voxelise_leaflets, write_segmentation
-from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface
 
 
 def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -> Path:

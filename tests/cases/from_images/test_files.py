@@ -7,10 +7,10 @@ import pytest
 
 from mvest.cases.from_images import write_for_slicer, write_landmarks, write_surfaces
 from mvest.errors import InputError
+from mvest.exchange.markups import read_markups
+from mvest.exchange.surfaces import read_surface
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.markups import read_markups
 from mvest.imaging.valve_sequence import LANDMARKS
-from mvest.valve.io.leaflet_surfaces import read_surface
 from tests import made_up_sequence
 
 SMALL = ValveLayout(32, 9)

@@ -17,18 +17,18 @@ from experiments.common.schema import Reads, build
 from experiments.common.study import load_settings, study_names
 from experiments.run import main
 from experiments.studies.imported import DonorSettings, recorded_valve
-from mvest.cases.importing.reference_heart import PARTS
 from mvest.cases.writer import write_case
-from mvest.external.contract import write_points
+from mvest.exchange.external.contract import write_points
+from mvest.exchange.importing.reference_heart import PARTS
+from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.volume import Modality, VolumeSequence
-from mvest.imaging.writing import write_sequence_nrrd
 from mvest.reading.documents import read_mapping
 from tests.cases.from_images.test_imaged_case import sequence
+from tests.exchange.external.programs import SPRINGS, springs
+from tests.exchange.surfaces import recorded
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies import test_imported
-from tests.external.programs import SPRINGS, springs
 from tests.made_up_closure import made_up_case
-from tests.valve.io import recorded
 
 
 def marked(cls: type, above: str = "") -> Iterator[str]:

@@ -8,9 +8,9 @@ import pytest
 from experiments.common.records.record import read_record
 from experiments.common.study import Job
 from experiments.studies.external import STUDY, ExternalSettings, ModelSettings, Settings
-from mvest.external.contract import write_points
+from mvest.exchange.external.contract import write_points
+from tests.exchange.external.programs import SPRINGS, springs
 from tests.experiments.configured import composed, plain
-from tests.external.programs import SPRINGS, springs
 
 M = np.array([0.8, 2.5])
 NOISE = 0.01

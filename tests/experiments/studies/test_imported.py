@@ -10,13 +10,13 @@ from experiments.common.records.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
 from experiments.studies.imported import DATA_VARIABLE, DonorSettings, recorded_valve
-from mvest.cases.importing import reference_heart
 from mvest.closure.robustness import GateReport, GateRow
+from mvest.exchange.importing import reference_heart
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.valve.mesh.solid_mesh import embed
-from tests.cases.importing.made_up_heart import heart
+from tests.exchange.importing.made_up_heart import heart
+from tests.exchange.surfaces.recorded import CASE, NAMES, skirt, write
 from tests.experiments.configured import composed, plain
-from tests.valve.io.recorded import CASE, NAMES, skirt, write
 
 TRUTH = np.array([2.0, 1.0, 3.0])
 SMALL = [

@@ -19,10 +19,10 @@ from experiments.studies import case
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
+from mvest.exchange.surfaces import write_surface
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
-from mvest.valve.io.leaflet_surfaces import write_surface
 from mvest.valve.mesh.structured import structured_mesh
 
 REGIONS = ("anterior", "posterior")

@@ -13,12 +13,12 @@ import pytest
 from mvest.cases.folder import read_case
 from mvest.cases.from_images import valve_axes
 from mvest.errors import InputError
+from mvest.exchange.markups import PointList, write_markups
+from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.files import sha256_of
 from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
-from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.volume import Modality, VolumeSequence
-from mvest.imaging.writing import write_sequence_nrrd
 from tests.cases.from_images.test_imaged_case import LAYOUT, sequence
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.detection.frame import LEVELS, standard_frame
+from tests.exchange.volumes.volumes import MIRRORED, ROTATION
 from tests.imaging.detection.made_up import ball_volume
-from tests.imaging.reading.volumes import MIRRORED, ROTATION
 
 POINT = np.array([12.0, -31.0, 84.0])
 

@@ -5,8 +5,8 @@ import pytest
 
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.learning.sampling import SamplePattern, directions, features
+from tests.exchange.volumes.volumes import MIRRORED, ROTATION
 from tests.imaging.detection.made_up import poses
-from tests.imaging.reading.volumes import MIRRORED, ROTATION
 
 SPACING = np.array([0.7, 0.8, 0.9])
 ORIGIN = np.array([-8.0, 5.0, 40.0])

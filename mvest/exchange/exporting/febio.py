@@ -1,0 +1,223 @@
+"""A case, or what was estimated of it, as input of FEBio (file format 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from mvest.cases.case import ValveCase
+from mvest.cases.folder import read_case
+from mvest.closure.model import ClosureModel
+from mvest.errors import InputError
+from mvest.exchange.febio.valve import FebSettings, valve_document
+from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.problem.registration import REGISTRATION
+from mvest.reading.documents import read_mapping
+from mvest.valve.mesh.given import GivenValve
+
+GENERIC = {"anterior": (6.23, 6.23 / 2.35), "posterior": (2.09, 2.09 / 1.89)}
+"""E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
+CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
+"""Points at which the valve is sampled for patches of chordae and the annulus."""
+MAX_RECORD = 1 << 28
+"""Bytes of a run's record that are read."""
+
+
+@dataclass(frozen=True, slots=True)
+class FebioOptions:
+    """What is not in the case.
+
+    Attributes
+    ----------
+    case : str, optional
+        Folder of the case of a run; by default where the run says that it was.
+    E_f, ratio : tuple of float, optional
+        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; by default
+        what the run estimated, or the generic ones of an anterior and a posterior leaflet.
+    nu, reading : float, str
+        Poisson ratio and how it is read (A or C), where no run says so.
+    pressure_mmHg : float, optional
+        By default that of the closed frame.
+    mesh : str
+        ``structured`` (two leaflets: bricks) or ``tetwild`` (tetrahedra).
+    columns, rows : int
+        Bricks around the valve and along the leaflets.
+    edge_length : float
+        mm, of tetrahedra.
+    law, contact, contact_gap_mm, contact_reach_mm, penalty
+        As in `mvest.exchange.febio.valve.FebSettings`.
+    dynamic, density_factor, steps, quasi_newton, tolerance
+        As in `mvest.exchange.febio.valve.FebSettings`.
+    """
+
+    case: str | None = None
+    E_f: tuple[float, ...] | None = None
+    ratio: tuple[float, ...] | None = None
+    nu: float = 0.488
+    reading: str = "A"
+    pressure_mmHg: float | None = None
+    mesh: str = "structured"
+    columns: int = 24
+    rows: int = 4
+    edge_length: float = 2.5
+    law: str = "neo-hookean"
+    contact: str = "potential"
+    contact_gap_mm: float = 1.0
+    contact_reach_mm: float = 1.65
+    penalty: float = 1.0
+    dynamic: bool = True
+    density_factor: float = 1000.0
+    steps: int = 30
+    quasi_newton: int = 10
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.mesh not in ("structured", "tetwild"):
+            raise InputError(f"mesh {self.mesh!r}, expected structured or tetwild")
+        _ = self.febio
+
+    @property
+    def febio(self) -> FebSettings:
+        """What is chosen in FEBio."""
+        return FebSettings(**{own.name: getattr(self, own.name) for own in fields(FebSettings)})
+
+
+def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
+    """Write the closure of a case folder, or of the folder of a run of one, for FEBio.
+
+    Run it with ``febio4 -i TARGET``. The positions of all nodes at every step are then in
+    ``TARGET_positions.csv``, and all else in FEBio's own plot file. What is not the same in FEBio
+    stands at the head of the file.
+
+    Raises
+    ------
+    InputError, GeometryError, MaterialError
+        If the source is not such a folder, or the valve cannot be meshed or has no counterpart.
+    """
+    if target.suffix.lower() != ".feb":
+        raise InputError(f"{target}: expected a name that ends in .feb")
+    values: dict[str, float] = {}
+    tissue: dict[str, TissueSettings] = {}
+    if (source / "result.json").is_file():
+        folder, values, tissue = read_run(source)
+        place = Path(options.case or folder)
+        if not place.is_dir():
+            raise InputError(f"{source}: its case is not at {str(place)!r}; give case=FOLDER")
+        source = place
+    case = read_case(source)
+    model = model_of_case(case, options, values, tissue)
+    document = valve_document(model, np.zeros(0), options.febio)
+    head = (f"{case.name}: closure under {model.settings.protocol.pressure_mmHg:g} mmHg.",)
+    return replace(document, remarks=head + document.remarks).write(target)
+
+
+def read_run(folder: Path) -> tuple[str, dict[str, float], dict[str, TissueSettings]]:
+    """What the run of a case left: the folder of the case, its parameters and its tissue.
+
+    Returns
+    -------
+    case : str
+    values : dict
+        Parameter -> estimate, or what it was held at.
+    tissue : dict
+        Region -> its tissue.
+
+    Raises
+    ------
+    InputError
+        If it is no such run.
+    """
+    record = folder / "result.json"
+    try:
+        found = read_mapping(record, MAX_RECORD)["findings"]["case"]
+        values = {
+            str(row["name"]): float(
+                row["prior_mean"] if row["estimate"] is None else row["estimate"]
+            )
+            for row in found["unknowns"]
+            if row["name"] not in REGISTRATION
+        }
+        tissue = {
+            str(name): TissueSettings(float(own["ratio"]), float(own["nu"]), str(own["reading"]))
+            for name, own in found["settings"]["mechanics"]["tissue"].items()
+        }
+        case = read_mapping(folder / "config.json", MAX_RECORD)["case"]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{record}: no run that estimated a case") from error
+    return str(case), values, tissue
+
+
+def model_of_case(
+    case: ValveCase,
+    options: FebioOptions,
+    values: Mapping[str, float],
+    tissue: Mapping[str, TissueSettings],
+) -> ClosureModel:
+    """The closure of a case with everything at its value: nothing in it is a parameter.
+
+    Parameters
+    ----------
+    case : ValveCase
+    options : FebioOptions
+        What they state goes before ``values`` and ``tissue``.
+    values : mapping
+        Parameter -> value.
+    tissue : mapping
+        Region -> its tissue.
+    """
+    names = case.surface.region_names
+    unlike = [name for name in values if name.startswith(("stiffening.", "prestretch."))]
+    if unlike:
+        raise InputError(
+            f"{', '.join(unlike)}: the file has no law for such tissue; export a run without it"
+        )
+    fixed = {name: value for name, value in values.items() if "." not in name or _is_valve(name)}
+    settings = {}
+    for k, name in enumerate(names):
+        own = tissue.get(name)
+        generic = GENERIC.get(name, (None, None))
+        modulus = values.get(f"E_f.{name}", generic[0])
+        fixed[f"E_f.{name}"] = _of_region("E_f", options.E_f, k, names, modulus)
+        usual = generic[1] if own is None else own.ratio
+        ratio = _of_region("ratio", options.ratio, k, names, usual)
+        nu, reading = (options.nu, options.reading) if own is None else (own.nu, own.reading)
+        settings[name] = TissueSettings(ratio, nu, reading)
+    pressure = options.pressure_mmHg
+    if pressure is None:
+        if case.closed is None:
+            raise InputError(f"case {case.name}: no closed frame; give pressure_mmHg=...")
+        pressure = case.closed.pressure_mmHg
+    given = GivenValve(case.valve)
+    if options.mesh == "structured":
+        mesh = given.layers("hex18", options.columns, options.rows)
+    else:
+        mesh = given.tetrahedra(options.edge_length, "tet10", None)
+    contact = given.valve(CONTACT_COLUMNS, CONTACT_ROWS)
+    mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
+    return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)
+
+
+def _is_valve(name: str) -> bool:
+    """Whether a parameter with a part is one of the closure, not an error of a frame's pressure."""
+    return name.partition(".")[0] in ("E_f", "G", "ratio", "chord_stiffness", "chord_rest_length")
+
+
+def _of_region(
+    name: str,
+    given: tuple[float, ...] | None,
+    k: int,
+    regions: tuple[str, ...],
+    default: float | None,
+) -> float:
+    if given is not None:
+        if len(given) != len(regions):
+            raise InputError(
+                f"{name}: {len(given)} values, expected one of each of {', '.join(regions)}"
+            )
+        return given[k]
+    if default is None:
+        raise InputError(f"no {name} of leaflet {regions[k]!r}; give {name}=[...]")
+    return default

@@ -1,0 +1,396 @@
+"""SlicerHeart: leaflets, annulus, landmarks and papillary muscles of its export modules."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial import cKDTree
+
+from mvest.cases.case import Role, ValveCase
+from mvest.cases.folder import read_case
+from mvest.cases.rims import two_loops
+from mvest.cases.schema import CASE_FILE
+from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.errors import GeometryError, InputError, MvestError
+from mvest.exchange.importing.joining import (
+    REGIONS,
+    Commissures,
+    JoinedLeaflets,
+    commissures_on,
+    drawn_anew,
+    joined,
+)
+from mvest.exchange.importing.parts import Leaflet, write_chords
+from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_batch, read_fem
+from mvest.exchange.regions import RegionSurface
+from mvest.exchange.surfaces import write_surface
+from mvest.typing import FloatArray
+
+OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
+"""Phases in the order in which they are preferred."""
+TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}
+"""s after the open phase, in the order of a cardiac cycle."""
+GENERIC_PRESSURE = 110.0
+"""mmHg on the closed valve: ventricle less atrium from mid to end of systole."""
+CORRELATED_MM = 10.0
+"""Along the leaflets over which errors of a segmentation are alike."""
+MAX_RMS = 4.0
+"""mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
+
+
+@dataclass(frozen=True, slots=True)
+class SlicerheartOptions:
+    """What a folder of SlicerHeart does not say.
+
+    Attributes
+    ----------
+    scene : str or None
+        Whose files are taken where a folder holds those of several.
+    open, closed : str or None
+        Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; MD, ED, CD and MS,
+        ES, CS in this order if not given. For folders of ValveFemExport, which name no phase,
+        ``closed`` is the folder with the closed valve.
+    tips, tips_closed : tuple of float or None
+        Papillary tips, antero-lateral and postero-medial: six numbers, LPS mm; ``tips_closed``
+        those of the closed frame where it has others.
+    pressure_mmHg : float or None
+        Transmitral pressure on the closed valve; 110 mmHg assumed.
+    thickness_mm : tuple of float or None
+        Of the anterior and the posterior leaflet; generic values if not given.
+    midsurface : bool
+        Whether the surfaces are midsurfaces already; those of ValveBatchExport are atrial ones, and
+        are moved to the ventricle by half the thickness, as those of ValveFemExport are, whose
+        shells follow the side that is met first.
+    edge_mm : float
+        Of the triangles of the case.
+    seam_mm : float
+        Up to which distance the leaflets are joined where they part at a commissure.
+    std_mm : float or None
+        Standard deviation of a coordinate of the surfaces; 1 mm assumed.
+    mirrored : bool
+        Take the valve although its landmarks lie as in a mirror.
+    """
+
+    scene: str | None = None
+    open: str | None = None
+    closed: str | None = None
+    tips: tuple[float, ...] | None = None
+    tips_closed: tuple[float, ...] | None = None
+    pressure_mmHg: float | None = None
+    thickness_mm: tuple[float, ...] | None = None
+    midsurface: bool = False
+    edge_mm: float = 1.0
+    seam_mm: float = 1.5
+    std_mm: float | None = None
+    mirrored: bool = False
+
+    def __post_init__(self) -> None:
+        for name, count in (("tips", 6), ("tips_closed", 6), ("thickness_mm", 2)):
+            given = getattr(self, name)
+            if given is not None and (len(given) != count or not np.isfinite(given).all()):
+                raise InputError(f"{name}={list(given)}, expected {count} numbers")
+        for name, low, high in (("edge_mm", 0.3, 5.0), ("seam_mm", 0.0, 10.0)):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name}={getattr(self, name)}, expected {low:g} to {high:g} mm")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Phase:
+    """A phase with its leaflets made one."""
+
+    seen: SeenPhase
+    role: Role
+    name: str
+    surface: RegionSurface
+    tips: FloatArray
+
+
+def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
+    """A case of a folder that SlicerHeart's ValveBatchExport or ValveFemExport wrote.
+
+    An open phase becomes the reference, a closed one the closed frame, another closed one is held
+    out. Leaflets, which are separate surfaces there, are joined along the commissures.
+
+    Parameters
+    ----------
+    source
+        The folder of one scene, with ``*_atrial_*.vtk`` and, if they were exported,
+        ``AnnulusContourPoints.csv``, ``ValveLandmarkPoints.csv`` and ``*_landmarks.fcsv``;
+        papillary muscles are lists of points whose file names say so (``PapillaryMarkup-...``).
+    options
+
+    Raises
+    ------
+    InputError, GeometryError
+        What is missing, by the name of its option; damaged files, axes that contradict each other.
+    """
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
+    derived: list[str] = []
+    try:
+        chosen = _chosen(source, options, derived)
+        phases = _placed(chosen, options, derived)
+        case = _as_case(phases, options, derived)
+    except MvestError as fault:
+        words = str(fault)
+        start = "" if words.startswith(str(source)) else f"{source}: "
+        raise type(fault)(f"{start}{words}") from fault
+    return dataclasses.replace(case, sha256="")
+
+
+def _chosen(
+    source: Path, options: SlicerheartOptions, derived: list[str]
+) -> list[tuple[SeenPhase, Role]]:
+    """The phases that are taken, in the order of time."""
+    if not any(source.rglob("*_atrial_*.vtk")):
+        seen = [(read_fem(source, ""), Role.REFERENCE)]
+        if options.closed is not None:
+            folder = Path(options.closed)
+            if not folder.is_dir():
+                raise InputError(f"closed={options.closed}: no such folder")
+            seen.append((read_fem(folder, ""), Role.CLOSED))
+        return seen
+    by_phase = {seen.phase: seen for seen in read_batch(source, options.scene)}
+    listed = ", ".join(by_phase)
+    for name, phase in (("open", options.open), ("closed", options.closed)):
+        if phase is not None and phase not in by_phase:
+            raise InputError(f"{name}={phase}: no such phase, there are {listed}")
+    opened = options.open or next((p for p in OPEN if p in by_phase), None)
+    if opened is None:
+        raise InputError(f"no open phase ({', '.join(OPEN)}) among {listed}; give open=PHASE")
+    closed = options.closed or next((p for p in CLOSED if p in by_phase and p != opened), None)
+    further = [p for p in CLOSED if p in by_phase and p not in (opened, closed)]
+    left = [p for p in by_phase if p not in (opened, closed, *further)]
+    if left:
+        derived.append(f"phases {', '.join(left)} not taken")
+    roles = {opened: Role.REFERENCE} | dict.fromkeys(further, Role.HELD_OUT)
+    if closed is not None:
+        roles[closed] = Role.CLOSED
+    order = sorted(roles, key=lambda p: (roles[p] is not Role.REFERENCE, TIMES.get(p, 0.6)))
+    return [(by_phase[p], roles[p]) for p in order]
+
+
+def _placed(
+    chosen: Sequence[tuple[SeenPhase, Role]], options: SlicerheartOptions, derived: list[str]
+) -> list[_Phase]:
+    phases: list[_Phase] = []
+    thickness = _thickness(options, derived)
+    offset = (0.0, 0.0) if options.midsurface else (thickness[0] / 2, thickness[1] / 2)
+    if not options.midsurface:
+        derived.append(
+            "midsurface: the atrial surfaces moved to the ventricle by half the thickness "
+            f"({offset[0]:g} and {offset[1]:g} mm); edges that curl by over 30 degrees left out"
+        )
+    seams = None
+    for seen, role in chosen:
+        label = seen.phase or ("closed" if role is Role.CLOSED else "open")
+        name = PHASES.get(seen.phase, label)
+        try:
+            derived += seen.notes
+            tips = _tips_of(seen, role, options, phases, derived, label)
+            raw = _join(seen, tips, options, seams, derived, label)
+            seams = raw.seams
+            surface = drawn_anew(raw, options.edge_mm, offset)
+        except MvestError as fault:
+            raise type(fault)(f"{label}: {fault}") from fault
+        phases.append(_Phase(seen, role, name, surface, tips))
+    derived.append(
+        f"surfaces drawn anew on the lines of their coordinates, edges about {options.edge_mm:g} mm"
+    )
+    return phases
+
+
+def _thickness(options: SlicerheartOptions, derived: list[str]) -> tuple[float, float]:
+    if options.thickness_mm is not None:
+        return options.thickness_mm[0], options.thickness_mm[1]
+    assumed = GENERIC_THICKNESS["anterior"], GENERIC_THICKNESS["posterior"]
+    derived.append(
+        f"thickness: {assumed[0]:g} mm (anterior), {assumed[1]:g} mm (posterior) assumed; "
+        "thickness_mm=[...] states it"
+    )
+    return assumed
+
+
+def _tips_of(
+    seen: SeenPhase,
+    role: Role,
+    options: SlicerheartOptions,
+    before: Sequence[_Phase],
+    derived: list[str],
+    label: str,
+) -> FloatArray:
+    given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
+    if given is not None:
+        return np.array(given, dtype=np.float64).reshape(2, 3)
+    if seen.tips is not None:
+        return seen.tips
+    if before:
+        derived.append(f"papillary tips of {label}: where they are in {before[0].name}")
+        return before[0].tips
+    raise InputError(
+        "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial, "
+        "with base, tip and insertion); give tips=[x,y,z,x,y,z] in LPS mm"
+    )
+
+
+def _join(
+    seen: SeenPhase,
+    tips: FloatArray,
+    options: SlicerheartOptions,
+    seams: FloatArray | None,
+    derived: list[str],
+    label: str,
+) -> JoinedLeaflets:
+    leaflets = []
+    for name, surface in zip(REGIONS, seen.leaflets, strict=True):
+        try:
+            leaflets.append(Leaflet.of(*surface))
+        except GeometryError as fault:
+            raise type(fault)(f"{name} leaflet: {fault}") from fault
+        if leaflets[-1].holes:
+            derived.append(f"{label}, {name} leaflet: {leaflets[-1].holes} holes closed")
+    anterior, posterior = leaflets
+    edges = np.concatenate([leaf.vertices[leaf.loop] for leaf in leaflets])
+    down = tips.mean(axis=0) - edges.mean(axis=0)
+    _check_axes(seen, edges, down, options)
+    if {"ALC", "PMC"} <= set(seen.landmarks):
+        points = np.stack([seen.landmarks["ALC"], seen.landmarks["PMC"]])
+    elif seen.contour is not None:
+        points = commissures_on(seen.contour, anterior, posterior)
+        derived.append(f"{label}: commissures where the leaflet nearer to the annulus changes")
+    else:
+        raise InputError(
+            "neither the landmarks ALC and PMC nor the annulus; export ValveLandmarkPoints.csv or "
+            "AnnulusContourPoints.csv"
+        )
+    band = joined(
+        anterior, posterior, Commissures(points, seen.contour), down, options.seam_mm, seams
+    )
+    shares = ", ".join(f"{100 * share:.0f}" for share in band.seams.ravel())
+    derived.append(
+        f"{label}: leaflets joined at the commissures over {shares} % of their free edges, "
+        f"across at most {band.gap:.1f} mm"
+    )
+    return band
+
+
+def _check_axes(
+    seen: SeenPhase, edges: FloatArray, down: FloatArray, options: SlicerheartOptions
+) -> None:
+    """Raise where tables and surfaces have other axes, or the valve is its own mirror image."""
+    if seen.contour is not None:
+        turned = seen.contour * (-1.0, -1.0, 1.0)
+        away, other = _rms(seen.contour, edges), _rms(turned, edges)
+        if away > MAX_RMS:
+            hint = (
+                f" (with x and y turned it would be {other:.1f} mm: one of them is in RAS where "
+                "LPS is stated, or the other way round)"
+                if other < MAX_RMS
+                else ""
+            )
+            raise InputError(
+                f"the annulus lies {away:.1f} mm from the leaflets, expected at most "
+                f"{MAX_RMS:g} mm{hint}"
+            )
+    marks = seen.landmarks
+    if options.mirrored or not {"A", "P"} <= set(marks):
+        return
+    for left, right in (("ALC", "PMC"), ("AL", "PM")):
+        if {left, right} <= set(marks):
+            sides = np.stack([marks[left] - marks[right], marks["A"] - marks["P"], down])
+            # From the atrium the antero-lateral commissure is on the left of the anterior leaflet.
+            if np.linalg.det(sides) < 0:
+                raise InputError(
+                    f"the landmarks A, P, {left} and {right} lie as in a mirror: from the atrium "
+                    f"{left} is on the right; is one axis turned? (mirrored=true takes it so)"
+                )
+            return
+
+
+def _rms(points: FloatArray, edges: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(cKDTree(edges).query(points)[0]))))
+
+
+def _as_case(
+    phases: Sequence[_Phase], options: SlicerheartOptions, derived: list[str]
+) -> ValveCase:
+    """Write the frames as a folder and read it: the checks and rules of every case."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        document = _document(folder, phases, options, derived)
+        text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+        (folder / CASE_FILE).write_text(text, encoding="utf-8")
+        try:
+            return read_case(folder)
+        except MvestError as fault:
+            words = str(fault).replace(f"{folder / CASE_FILE}: ", "").replace(str(folder), "")
+            raise type(fault)(words) from fault
+
+
+def _document(
+    folder: Path,
+    phases: Sequence[_Phase],
+    options: SlicerheartOptions,
+    derived: list[str],
+) -> dict[str, Any]:
+    thickness = options.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
+    pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
+    if len(phases) > 1:
+        derived.append("times: by the order of the phases in a generic cardiac cycle")
+        if options.pressure_mmHg is None:
+            derived.append(
+                f"pressure: {pressure:g} mmHg on the closed valve assumed, none on the open one; "
+                "pressure_mmHg=... states it"
+            )
+    frames: list[dict[str, Any]] = []
+    time = 0.0
+    for number, phase in enumerate(phases):
+        file = f"{number}.vtp"
+        surface, labels = phase.surface, {"region": np.asarray(phase.surface.region)}
+        write_surface(folder / file, surface.vertices, surface.triangles, {}, labels)
+        reference = phase.role is Role.REFERENCE
+        time = 0.0 if reference else max(time + 0.01, TIMES.get(phase.seen.phase, 0.6))
+        frames.append(
+            {
+                "name": phase.name,
+                "time": time,
+                "role": phase.role.value,
+                "surface": file,
+                "papillary_tips": phase.tips.tolist(),
+                "pressure": 0.0 if reference else float(pressure),
+                **({} if reference else {"corresponds": False}),
+            }
+        )
+    return {
+        "version": 1,
+        "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
+        "source": "SlicerHeart",
+        "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
+        "regions": list(REGIONS),
+        "thickness": dict(zip(REGIONS, map(float, thickness), strict=True)),
+        "frames": frames,
+        **_chordae(folder, phases[0], derived),
+        **(
+            {}
+            if options.std_mm is None
+            else {"observation": {"std_mm": options.std_mm, "correlation_length_mm": CORRELATED_MM}}
+        ),
+        "derived": derived,
+    }
+
+
+def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, Any]:
+    if not len(reference.seen.chords):
+        return {}
+    vertices = reference.surface.vertices
+    loops = two_loops(vertices, reference.surface.triangles)
+    edge = min((vertices[loop] for loop in loops), key=lambda curve: _rms(curve, reference.tips))
+    seen = reference.seen
+    return write_chords(folder, seen.chords, seen.chord_lengths, reference.tips, edge, derived)

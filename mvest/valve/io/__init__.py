@@ -1,1 +1,0 @@
-"""Files of surfaces and solid meshes, and recorded closures."""

@@ -1,0 +1,248 @@
+"""A case as input of FEBio: what is in the file, read by Python's XML reader alone."""
+
+import json
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+import pytest
+
+from experiments.doors import export_command
+from mvest.cases.writer import write_case
+from mvest.errors import InputError
+from mvest.exchange.exporting.febio import FebioOptions, export_febio
+from mvest.mechanics.forces.cables import cable_force
+from tests.cases.folders import template_case
+
+# The order of the sections in which FEBio can resolve names: materials before domains, the mesh
+# before all that acts on it.
+SECTIONS = ["Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "Loads",
+            "Contact", "Constraints", "Discrete", "LoadData", "Output"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("case")
+    write_case(place, template_case())
+    return place
+
+
+@pytest.fixture(scope="module")
+def root(folder):
+    target = folder / "valve.feb"
+    assert export_febio(folder, target, FebioOptions(columns=12, rows=2)) == target
+    return Xml.parse(target).getroot()
+
+
+def values(element):
+    return np.array([float(word) for word in element.text.split(",")])
+
+
+def rows(elements):
+    return np.array([values(e) for e in elements])
+
+
+def test_sections_are_those_of_version_4(root):
+    assert root.tag == "febio_spec"
+    assert root.get("version") == "4.0"
+    assert [child.tag for child in root] == SECTIONS
+
+
+def test_what_is_not_the_same_stands_at_the_head(folder):
+    text = (folder / "valve.feb").read_text()
+    head = text[: text.index("<Module")]
+    assert "121.3 mmHg" in head
+    for part in ("element", "law", "contact", "time", "chordae"):
+        assert f"<!-- {part}: here " in head
+
+
+def test_numbers_of_nodes_and_elements_are_whole(root):
+    nodes = root.findall("Mesh/Nodes/node")
+    assert [int(n.get("id")) for n in nodes] == list(range(1, len(nodes) + 1))
+    elements = root.findall("Mesh/Elements/elem")
+    assert [int(e.get("id")) for e in elements] == list(range(1, 25))
+    x = rows(nodes)
+    corners = rows(elements).astype(int)[:, :8] - 1
+    # Six times the volume of the tetrahedron at the first corner.
+    a, b, c, d = (x[corners[:, k]] for k in (0, 1, 3, 4))
+    assert np.all(np.einsum("ei,ei->e", np.cross(b - a, c - a), d - a) > 0)
+    for name in ("anterior", "posterior"):
+        own = root.find(f"Mesh/Elements[@name='{name}']")
+        data = root.find(f"MeshData/ElementData[@elem_set='{name}']")
+        assert [int(e.get("lid")) for e in data] == list(range(1, len(own) + 1))
+        for axes in data:
+            along, other = values(axes.find("a")), values(axes.find("d"))
+            assert np.linalg.norm(along) == pytest.approx(1.0)
+            assert np.linalg.norm(np.cross(along, other)) > 0.05
+        assert root.find(f"Material/material[@name='{name}']") is not None
+
+
+def test_every_name_is_there(root):
+    surfaces = {s.get("name") for s in root.findall("Mesh/Surface")}
+    sets = {s.get("name") for s in root.findall("Mesh/NodeSet")}
+    springs = {s.get("name") for s in root.findall("Mesh/DiscreteSet")}
+    pairs = {s.get("name") for s in root.findall("Mesh/SurfacePair")}
+    data = {s.get("name") for s in root.findall("MeshData/NodeData")}
+    assert root.find("Loads/surface_load").get("surface") in surfaces
+    for pair in root.findall("Mesh/SurfacePair"):
+        assert {child.text for child in pair} <= surfaces
+    assert {c.get("surface_pair") for c in root.findall("Contact/contact")} == pairs
+    moved = [b for b in root.findall("Boundary/bc") if b.get("node_set")]
+    assert {b.get("node_set") for b in moved} == sets
+    assert {b.find("value").text for b in moved} <= data
+    assert {d.get("discrete_set") for d in root.findall("Discrete/discrete")} == springs
+    materials = root.findall("Discrete/discrete_material")
+    assert [int(d.get("dmat")) for d in root.findall("Discrete/discrete")] == list(
+        range(1, len(materials) + 1)
+    )
+    curves = [int(c.get("id")) for c in root.findall("LoadData/load_controller")]
+    used = {int(e.get("lc")) for e in root.iter() if e.get("lc")}
+    assert curves == list(range(1, len(curves) + 1))
+    assert used == set(curves)
+
+
+def test_pressure_and_motion_follow_the_ramp(root):
+    load = root.find("Loads/surface_load/pressure")
+    points = rows(root.findall(f"LoadData/load_controller[@id='{load.get('lc')}']/points/pt"))
+    assert points[0].tolist() == [0.0, 0.0]
+    assert points[-1, 0] == pytest.approx(0.3)
+    assert points[-1, 1] == pytest.approx(121.3 * 133.322e-6, rel=1e-4)
+    tips = root.find("MeshData/NodeData[@name='tips_z']")
+    case = template_case()
+    move = case.closed.papillary_tips - case.frames[0].papillary_tips
+    assert [float(e.text) for e in tips] == pytest.approx(move[:, 2])
+
+
+def test_a_chord_pulls_as_here(root):
+    case = template_case()
+    chordae = case.chordae
+    ends = root.findall("Mesh/DiscreteSet")
+    x = rows(root.findall("Mesh/Nodes/node"))
+    for k in (0, len(chordae) - 1):
+        pair = values(ends[k].find("delem")).astype(int) - 1
+        apart = np.linalg.norm(x[pair[1]] - x[pair[0]])
+        np.testing.assert_allclose(x[pair[0]], case.frames[0].papillary_tips[chordae.tip[k]])
+        # The patch's average lies within its radius of the insertion.
+        assert np.linalg.norm(x[pair[1]] - chordae.insertion[k]) < 2.0
+        force = rows(root.findall("Discrete/discrete_material")[k].findall("force/points/pt"))
+        for strain in (-0.2, 0.5 * chordae.toe_strain, chordae.toe_strain, 0.08):
+            elongation = chordae.rest_length[k] * (1 + strain) - apart
+            wanted = (
+                chordae.axial_stiffness[k] * cable_force(np.array(strain), chordae.toe_strain)[0]
+            )
+            found = np.interp(elongation, force[:, 0], force[:, 1])
+            assert found == pytest.approx(float(wanted), abs=1e-4)
+
+
+def test_averages_are_averages(root):
+    x = rows(root.findall("Mesh/Nodes/node"))
+    following = root.findall("Boundary/bc[@type='linear constraint']")
+    assert len(following) == 3 * len(template_case().chordae)
+    for bc in following[::3]:
+        children = bc.findall("child_dof")
+        weights = np.array([float(c.find("value").text) for c in children])
+        nodes = np.array([int(c.find("node").text) for c in children]) - 1
+        assert weights.sum() == pytest.approx(1.0)
+        np.testing.assert_allclose(weights @ x[nodes], x[int(bc.find("node").text) - 1], atol=1e-9)
+    for one in root.findall("Constraints/constraint/linear_constraint")[:6]:
+        own = np.array([float(n.text) for n in one])
+        assert own[0] < 0
+        assert own.sum() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_contact_presses_as_its_reference_pressure(root):
+    contact = root.find("Contact/contact")
+    assert contact.get("type") == "contact potential"
+    kc, p, inner, outer = (float(contact.find(t).text) for t in ("kc", "p", "R_in", "R_out"))
+    c1 = 0.5 * p * kc / ((outer - inner) * inner ** (p + 1))
+    c2 = kc / inner**p - c1 * (inner - outer) ** 2
+    # FEContactPotential::PotentialDerive, summed over a plane: each pair counts twice.
+    step = 0.004
+    plane = np.arange(-outer, outer, step)
+    u, v = np.meshgrid(plane, plane)
+    r = np.sqrt(u**2 + v**2 + 1.0)
+    force = np.where(r < inner, kc / r**p - c2, np.where(r < outer, c1 * (r - outer) ** 2, 0.0))
+    pressure = 2 * np.sum(force * 1.0 / r) * step**2
+    assert pressure == pytest.approx(0.016, rel=2e-3)
+
+
+def test_sliding_contact_and_inertia(folder, tmp_path):
+    options = FebioOptions(columns=12, rows=2, contact="sliding", density_factor=10)
+    root = Xml.parse(export_febio(folder, tmp_path / "a.feb", options)).getroot()
+    assert root.find("Contact/contact").get("type") == "sliding-elastic"
+    pair = root.find("Mesh/SurfacePair")
+    assert [child.text for child in pair] == ["anterior_atrial", "posterior_atrial"]
+    assert root.find("Control/analysis").text == "DYNAMIC"
+    assert float(root.find("Material/material/density").text) == pytest.approx(1.04e-8)
+    assert float(root.find("Loads/body_load/C").text) == pytest.approx(0.1)
+
+
+def test_a_run_is_exported_with_its_estimates(folder, tmp_path):
+    unknown = {"prior_mean": 1.0, "estimate": None}
+    unknowns = [
+        unknown | {"name": "E_f.anterior", "estimate": 8.5},
+        unknown | {"name": "E_f.posterior", "prior_mean": 2.5},
+        unknown | {"name": "pressure_scale", "estimate": 0.5},
+        unknown | {"name": "shift.x", "estimate": 3.0},
+    ]
+    tissue = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
+    mechanics = {"tissue": {"anterior": tissue, "posterior": tissue}}
+    record = {"findings": {"case": {"unknowns": unknowns, "settings": {"mechanics": mechanics}}}}
+    (tmp_path / "result.json").write_text(json.dumps(record))
+    (tmp_path / "config.json").write_text(json.dumps({"case": str(folder)}))
+    options = FebioOptions(columns=12, rows=2, contact="none", law="orthotropic")
+    root = Xml.parse(export_febio(tmp_path, tmp_path / "a.feb", options)).getroot()
+    anterior, posterior = root.findall("Material/material")
+    assert float(anterior.find("E1").text) == 8.5
+    assert float(anterior.find("E2").text) == pytest.approx(4.25)
+    assert float(anterior.find("v12").text) == 0.4
+    assert float(posterior.find("E1").text) == 2.5
+    load = root.find("Loads/surface_load/pressure")
+    points = rows(root.findall(f"LoadData/load_controller[@id='{load.get('lc')}']/points/pt"))
+    assert points[-1, 1] == pytest.approx(0.5 * 121.3 * 133.322e-6, rel=1e-4)
+
+
+@pytest.mark.parametrize("unlike", ["stiffening.anterior", "prestretch.posterior"])
+def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, unlike):
+    unknowns = [
+        {"name": name, "prior_mean": 1.0, "estimate": 2.0}
+        for name in ("E_f.anterior", "E_f.posterior", unlike)
+    ]
+    own = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
+    settings = {"mechanics": {"tissue": {"anterior": own, "posterior": own}}}
+    record = {"findings": {"case": {"unknowns": unknowns, "settings": settings}}}
+    (tmp_path / "result.json").write_text(json.dumps(record))
+    (tmp_path / "config.json").write_text(json.dumps({"case": str(folder)}))
+    with pytest.raises(InputError, match=f"{unlike}: the file has no law for such tissue"):
+        export_febio(tmp_path, tmp_path / "a.feb", FebioOptions(columns=12, rows=2))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"E_f": (3.0,)}, "expected one of each of anterior, posterior"),
+        ({"contact": "glue"}, "potential, sliding, none"),
+        ({"contact_gap_mm": 2.0}, "gap < reach"),
+        ({"law": "mooney"}, "orthotropic, neo-hookean"),
+        ({"mesh": "voxels"}, "structured or tetwild"),
+        ({"steps": 0}, ">= 1"),
+    ],
+)
+def test_what_is_wrong_is_said(folder, tmp_path, given, words):
+    with pytest.raises(InputError, match=words):
+        export_febio(folder, tmp_path / "a.feb", FebioOptions(columns=12, rows=2, **given))
+
+
+def test_records_of_something_else_are_refused(tmp_path):
+    (tmp_path / "result.json").write_text("{}")
+    with pytest.raises(InputError, match="no run that estimated a case"):
+        export_febio(tmp_path, tmp_path / "a.feb", FebioOptions())
+
+
+def test_from_the_console(folder, tmp_path, capsys):
+    words = ["febio", str(folder), str(tmp_path / "a.feb"), "columns=12", "rows=2", "E_f=[7,2]"]
+    assert export_command(words) == 0
+    assert "a.feb" in capsys.readouterr().out
+    root = Xml.parse(tmp_path / "a.feb").getroot()
+    assert [float(e.text) for e in root.findall("Material/material/Ez")] == [7.0, 2.0]
+    assert export_command(["febio", str(folder), str(tmp_path / "a.txt")]) == 2
+    assert ".feb" in capsys.readouterr().err

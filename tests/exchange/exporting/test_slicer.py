@@ -1,0 +1,210 @@
+"""What is written for 3D Slicer and ParaView, read by VTK, SimpleITK and the json module."""
+
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import SimpleITK
+
+from mvest.cases.case import Role
+from mvest.cases.writer import write_case
+from mvest.errors import InputError
+from mvest.exchange.exporting.slicer import SlicerOptions, export_slicer
+from mvest.valve.geometry.thickening import thicken
+from mvest.valve.geometry.triangles import principal_stretches
+from tests.cases.folders import template_case
+
+vtk = pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
+from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
+
+CASE = template_case(32, 10)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("slicer")
+    write_case(folder / "case", CASE)
+    return export_slicer(folder / "case", folder / "out", SlicerOptions(voxel_mm=0.8))
+
+
+def read(path):
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    assert reader.GetErrorCode() == 0
+    return reader.GetOutput()
+
+
+def points_of(model):
+    return vtk_to_numpy(model.GetPoints().GetData())
+
+
+def arrays_of(data):
+    return {
+        data.GetArrayName(k): vtk_to_numpy(data.GetArray(k))
+        for k in range(data.GetNumberOfArrays())
+    }
+
+
+def test_paraview_and_slicer_read_the_frames_over_time(exported):
+    entries = ET.parse(exported / "frames.pvd").findall("Collection/DataSet")
+    assert [float(entry.get("timestep")) for entry in entries] == [0.1, 0.3, 0.45]
+    for entry, frame in zip(entries, CASE.frames, strict=True):
+        model = read(exported / entry.get("file"))
+        assert np.array_equal(points_of(model), frame.vertices)
+        corners = vtk_to_numpy(model.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+        assert np.array_equal(corners, frame.triangles)
+        # Slicer takes the axes from here, and would turn the valve about if it read RAS.
+        assert model.GetFieldData().GetAbstractArray("SPACE").GetValue(0) == "LPS"
+        assert np.array_equal(arrays_of(model.GetCellData())["region"], frame.region)
+    last = arrays_of(model.GetPointData())
+    moved = CASE.frames[2].vertices - CASE.surface.vertices
+    assert last["displacement_mm"] == pytest.approx(moved)
+    assert last["stretch_of_area"] == pytest.approx(
+        last["stretch_largest"] * last["stretch_smallest"]
+    )
+
+
+def test_a_segmentation_has_slicerhearts_names_codes_and_place(exported):
+    frame = CASE.frame(Role.CLOSED)
+    image = SimpleITK.ReadImage(str(exported / "closed.seg.nrrd"))
+    labels = SimpleITK.GetArrayFromImage(image)
+    header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys()}
+    for number, (name, code) in enumerate(
+        (("mitral_anterior_leaflet", "a"), ("mitral_posterior_leaflet", "p"))
+    ):
+        assert header[f"Segment{number}_Name"] == name
+        tags = header[f"Segment{number}_Tags"]
+        # Category and type of SlicerHeartSegmentationCategoryTypeModifier.json.
+        assert "TerminologyEntry:SlicerHeart segmentation category and type~" in tags
+        assert "~SCT^91134007^Mitral Valve~" in tags
+        assert f"~SlicerHeart^sh-leaflet-mv-{code}^{name.replace('_', ' ')}~^^~" in tags
+        own = np.unique(frame.triangles[frame.region == number])
+        inner = np.setdiff1d(own, frame.triangles[frame.region != number])
+        at = [image.TransformPhysicalPointToIndex(p) for p in frame.vertices[inner].tolist()]
+        here = np.array([labels[k, j, i] for i, j, k in at])
+        assert (here == number + 1).mean() > 0.9
+        volume = (labels == number + 1).sum() * 0.8**3
+        area = (
+            0.5
+            * np.linalg.norm(
+                np.cross(
+                    *np.diff(
+                        frame.vertices[frame.triangles[frame.region == number]], axis=1
+                    ).swapaxes(0, 1)
+                ),
+                axis=1,
+            ).sum()
+        )
+        assert volume / area == pytest.approx(1.3, rel=0.25)
+
+
+def test_landmarks_have_slicerhearts_labels(exported):
+    content = json.loads((exported / "open.mrk.json").read_text())
+    lists = {item["name"]: item for item in content["markups"]}
+    assert {item["coordinateSystem"] for item in lists.values()} == {"LPS"}
+    at = {
+        point["label"]: np.array(point["position"])
+        for point in lists["AnnulusLabelsMarkup"]["controlPoints"]
+    }
+    assert list(at) == ["A", "P", "AL", "PM", "ALC", "PMC", "MC"]
+    # Anterior at +y and the ventricle at -z: from the atrium, the left is at -x.
+    assert at["A"][1] > 5 > -5 > at["P"][1]
+    for left, right in (("AL", "PM"), ("ALC", "PMC")):
+        assert at[left][0] < -5 < 5 < at[right][0]
+    ring = CASE.frame(Role.REFERENCE).annulus
+    for label in ("ALC", "PMC"):
+        assert np.linalg.norm(ring - at[label], axis=1).min() < 1e-9
+    tip = lists["PapillaryMarkup-antero-lateral"]["controlPoints"][0]["position"]
+    assert tip == CASE.frame(Role.REFERENCE).papillary_tips[1].tolist()
+    assert lists["AnnulusContourMarkup"]["type"] == "ClosedCurve"
+    assert len(lists["AnnulusContourMarkup"]["controlPoints"]) == len(ring)
+
+
+def test_a_run_is_written_with_its_distances(tmp_path):
+    closed = CASE.frame(Role.CLOSED)
+    surface = CASE.surface
+    rest = surface.vertices
+    stretched = rest * [1.2, 1.0, 1.0]
+    (tmp_path / "run").mkdir()
+    np.savez(
+        tmp_path / "run" / "fields.npz",
+        triangles=surface.triangles,
+        region=surface.region,
+        rest=rest,
+        annulus=CASE.annulus,
+        free_edge=CASE.free_edge,
+        frames=np.array(["closed"]),
+        seen=np.array([True]),
+        tips=np.stack([frame.papillary_tips for frame in (CASE.frames[0], closed)]),
+        observed=closed.vertices[None],
+        fitted=stretched[None],
+        distance_fitted=np.full((1, len(rest)), 0.25),
+    )
+    out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions(voxel_mm=1.5))
+    assert {path.name for path in out.glob("*.pvd")} == {"observed.pvd", "fitted.pvd"}
+    first, last = (arrays_of(read(out / f"fitted_000{k}.vtp").GetPointData()) for k in (0, 1))
+    assert set(first) == set(last)
+    assert (first["distance_mm"] == 0).all()
+    assert (last["distance_mm"] == 0.25).all()
+    assert first["stretch_largest"] == pytest.approx(1.0)
+    assert last["stretch_largest"].max() == pytest.approx(1.2, abs=1e-3)
+    assert (out / "open.seg.nrrd").is_file()
+    assert (out / "closed.mrk.json").is_file()
+
+
+def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
+    surface = thicken(CASE.surface)
+    times = np.array([0.0, 0.02, 0.05])
+    frames = surface.vertices + np.array([0.0, 1.0, 2.0])[:, None, None] * [0, 0, 1]
+    stress = np.outer(times, np.ones(len(surface.vertices)))
+    (tmp_path / "run").mkdir()
+    np.savez(
+        tmp_path / "run" / "fields.npz",
+        times=times,
+        frames=frames,
+        triangles=surface.triangles,
+        region=surface.region,
+        stress=stress,
+        contact_pressure=2 * stress,
+    )
+    out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
+    entries = ET.parse(out / "closing.pvd").findall("Collection/DataSet")
+    assert [float(entry.get("timestep")) for entry in entries] == times.tolist()
+    last = arrays_of(read(out / "closing_0002.vtp").GetPointData())
+    assert (last["stress_MPa"] == 0.05).all()
+    assert (last["contact_pressure_MPa"] == 0.1).all()
+    assert last["displacement_mm"] == pytest.approx(np.full_like(frames[0], 2.0) * [0, 0, 1])
+
+
+def test_stretches_are_those_of_a_known_deformation():
+    # F = diag(1.5, 0.8) turned by 0.3 in the plane of a unit square: singular values 1.5 and 0.8.
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    deformed = np.zeros((4, 3))
+    deformed[:, [0, 2]] = square[:, :2] @ (turn @ np.diag([1.5, 0.8])).T
+    largest, smallest = principal_stretches(square, deformed, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert largest == pytest.approx(1.5)
+    assert smallest == pytest.approx(0.8)
+
+
+def test_what_is_no_case_and_no_run_is_refused(tmp_path, exported):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"neither a case \(case\.yaml\) nor a run"):
+        export_slicer(tmp_path / "empty", tmp_path / "out", SlicerOptions())
+    with pytest.raises(InputError, match="exists; expected a new folder"):
+        export_slicer(tmp_path / "empty", exported, SlicerOptions())
+    with pytest.raises(InputError, match=r"voxel_mm=0, expected 0\.1 to 3 mm"):
+        SlicerOptions(voxel_mm=0)
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_with_vertices_of_their_own_are_written(tmp_path):
+    closed = CASE.frame(Role.CLOSED)
+    other = replace(closed, corresponds=False)
+    case = replace(CASE, frames=(CASE.frames[0], other))
+    write_case(tmp_path / "case", case)
+    out = export_slicer(tmp_path / "case", tmp_path / "out", SlicerOptions(voxel_mm=1.5))
+    assert set(arrays_of(read(out / "frames_0001.vtp").GetPointData())) == set()

@@ -1,0 +1,125 @@
+"""What is not exactly an answer to the request is refused, with the file and the row."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.estimation import Prediction
+from mvest.exchange.external.contract import (
+    RunRequest,
+    read_answer,
+    read_points,
+    read_request,
+    write_answer,
+    write_request,
+)
+
+REQUEST = RunRequest(("E", "nu, local"), ("MPa", ""), (0.1 + 0.2, 1e-300), 2, settings={"law": "a"})
+Y = np.array([1.0, 2.0, 3.0, 0.1 + 0.2, 5.0, -6e-30])
+JACOBIAN = np.arange(12.0).reshape(6, 2) / 7
+
+
+def test_a_request_and_its_answer_come_back_to_the_last_digit(tmp_path):
+    write_request(tmp_path, REQUEST, np.array([[0.1, 0.2, 0.3], [1 / 3, 5, 6]]))
+    assert read_request(tmp_path / "request.json") == REQUEST
+    np.testing.assert_array_equal(read_points(tmp_path / "points.csv", 2)[1], [1 / 3, 5, 6])
+    write_answer(tmp_path, Prediction(Y, JACOBIAN), REQUEST.names)
+    answer = read_answer(tmp_path, REQUEST)
+    assert answer.reason == ""
+    np.testing.assert_array_equal(answer.y, Y)
+    np.testing.assert_array_equal(answer.jacobian, JACOBIAN)
+
+
+def test_an_answer_without_derivatives_has_none(tmp_path):
+    write_answer(tmp_path, Prediction(Y, JACOBIAN))
+    assert read_answer(tmp_path, REQUEST).jacobian is None
+
+
+def test_a_failure_is_read_with_its_reason_and_without_numbers(tmp_path):
+    write_answer(tmp_path, Prediction(Y, JACOBIAN), REQUEST.names)
+    write_answer(tmp_path, Prediction.failed("it buckled"), REQUEST.names)
+    answer = read_answer(tmp_path, REQUEST)
+    assert (answer.reason, answer.y.size, answer.jacobian) == ("it buckled", 0, None)
+
+
+ORDER = '{"format": "mvest-external", "version": 1, "status": "converged", "reason": ""}'
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("response.json", None, "response.json is missing"),
+        ("response.json", "", "is not JSON"),
+        ("response.json", ORDER[:-20], "is not JSON"),
+        ("response.json", "[1]", "holds a list"),
+        ("response.json", "[" * 100_000, "is not JSON"),
+        ("response.json", ORDER.replace('""', "NaN"), "NaN is no number"),
+        ("response.json", ORDER.replace("1,", "2,"), "expected ('mvest-external', 1)"),
+        ("response.json", ORDER.replace("converged", "ok"), "status 'ok'"),
+        ("response.json", ORDER + " " * 1_000_001, "expected at most 1000000"),
+        ("observation.csv", None, "observation.csv is missing"),
+        ("observation.csv", "", "columns none, expected x,y,z"),
+        ("observation.csv", "1,2,3\n4,5,6\n", "columns 1,2,3"),
+        ("observation.csv", "x,z,y\n1,2,3\n4,5,6\n", "columns x,z,y"),
+        ("observation.csv", "x,y,z\n1,2,3\n", "1 rows, expected 2"),
+        ("observation.csv", "x,y,z\n" + "1,2,3\n" * 3, "more than the 2 rows"),
+        ("observation.csv", "x,y,z\n1,2,3\n4,5\n", "row 1 has 2 cells"),
+        ("observation.csv", "x,y,z\n1,2,3\n\n4,5,6\n", "row 1 has 0 cells"),
+        ("observation.csv", "x,y,z\n1,2,3\n4,nan,6\n", "y of row 1 is 'nan'"),
+        ("observation.csv", "x,y,z\n1,2,3\n4,5,inf\n", "z of row 1 is 'inf'"),
+        ("observation.csv", "x,y,z\n1,2,3\n1e999,5,6\n", "x of row 1 is '1e999'"),
+        ("observation.csv", "x,y,z\n1,2,3\n1_0,5,6\n", "x of row 1 is '1_0'"),
+        ("observation.csv", "x,y,z\n1,2,3\n,5,6\n", "x of row 1 is ''"),
+        ("observation.csv", "x;y;z\n1;2;3\n4;5;6\n", "columns x;y;z"),
+        ("observation.csv", b"x,y,z\n1,2,3\n4,5,\xff\n", "no UTF-8"),
+        ("observation.csv", 'x,y,z\n1,2,3\n4,5,"6\n', "no comma-separated text"),
+        ("jacobian.csv", "E,nu\n" + "1,2\n" * 6, "columns E,nu, expected E,nu, local"),
+        ("jacobian.csv", 'E,"nu, local"\n' + "1,2\n" * 5, "5 rows, expected 6"),
+        ("jacobian.csv", '"nu, local",E\n' + "1,2\n" * 6, "columns nu, local,E"),
+        ("jacobian.csv", 'E,"nu, local"\n' + "1,-inf\n" * 6, "nu, local of row 0"),
+    ],
+)
+def test_a_damaged_answer_is_refused(tmp_path, file, content, message):
+    write_answer(tmp_path, Prediction(Y, JACOBIAN), REQUEST.names)
+    read_answer(tmp_path, REQUEST)
+    if content is None:
+        (tmp_path / file).unlink()
+    else:
+        (tmp_path / file).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError) as error:
+        read_answer(tmp_path, REQUEST)
+    assert message in str(error.value)
+    assert len(str(error.value)) < 300
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path):
+    write_answer(tmp_path, Prediction(Y, JACOBIAN))
+    (tmp_path / "observation.csv").unlink()
+    (tmp_path / "observation.csv").mkdir()
+    with pytest.raises(InputError, match=r"observation\.csv cannot be read"):
+        read_answer(tmp_path, REQUEST)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((("a",), ("",), (1.0, 2.0), 1), "1 names, 1 units and 2 values"),
+        (((), (), (), 1), "at least one"),
+        ((("a", "a"), ("", ""), (1.0, 2.0), 1), "different names"),
+        ((("a",), ("",), (float("nan"),), 1), "finite"),
+        ((("a",), ("",), (1.0,), 0), "0 points"),
+    ],
+)
+def test_an_inadmissible_request_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        RunRequest(*arguments)
+
+
+def test_what_is_no_request_is_refused(tmp_path):
+    file = tmp_path / "request.json"
+    for change in ({"parameters": [{"name": "a"}]}, {"parameters": 3}, {"settings": 1}):
+        file.write_text(json.dumps(REQUEST.data() | change))
+        with pytest.raises(InputError, match="no request"):
+            read_request(file)

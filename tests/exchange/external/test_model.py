@@ -1,0 +1,249 @@
+"""A program behind the filters: its derivatives, its failures, its finished runs."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
+from mvest.exchange.external.model import Differences, ProcessModel
+from mvest.exchange.external.process import Command
+from tests.exchange.external.programs import NAMES, SPRINGS, answering, model, springs
+
+M = np.array([0.8, 2.5])
+
+
+def ran(folder) -> int:
+    """How often the program was really started."""
+    return sum(len(p.read_text().split()) for p in (folder / "runs").glob("*/count.txt"))
+
+
+def test_its_own_derivatives_are_taken_as_they_are(tmp_path):
+    program = model(tmp_path, "exact", differences=None)
+    prediction = program(M)
+    y, jacobian = springs(*M)
+    assert prediction.converged, prediction.reason
+    np.testing.assert_allclose(prediction.y, y, rtol=1e-15)
+    np.testing.assert_allclose(prediction.jacobian, jacobian, rtol=1e-15)
+    assert (program.runs, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
+
+
+@pytest.mark.parametrize("processes", [1, 3])
+def test_differences_are_of_their_order(tmp_path, processes):
+    # 2/k expanded: central differences err by d^2 f'''/6 = (s k)^2 (12 / k^4) / 6, relative to f'
+    # that is s^2; forward ones by d f''/2, relative to f' that is s.
+    _, jacobian = springs(*M)
+    for scheme, step, order in (("central", 0.02, 2), ("forward", 0.02, 1)):
+        differences = Differences(scheme, step, processes=processes)
+        program = model(tmp_path, differences=differences)
+        found = program(M).jacobian
+        relative = (found - jacobian)[jacobian != 0] / jacobian[jacobian != 0]
+        expected = step**order * (1 if order == 2 else -1)
+        np.testing.assert_allclose(relative, expected, rtol=0.03)
+        assert np.all(found[jacobian == 0] == 0)
+        assert not program.own_jacobian
+    # 1 + 4 runs, then upper neighbours of the forward scheme are finished already.
+    assert program.runs + program.reused == 3
+    assert (program.runs, ran(tmp_path)) == (0, 5)
+
+
+def test_without_derivatives_and_differences_there_is_no_prediction(tmp_path):
+    assert "jacobian.csv is missing" in model(tmp_path, differences=None)(M).reason
+
+
+def test_a_filter_finds_the_truth_through_files(tmp_path):
+    y, _ = springs(*M)
+    program = model(tmp_path, "exact", differences=None)
+    prior = Gaussian(np.array([2.0, 1.0]), np.diag([9.0, 9.0]))
+    filter_ = IteratedFilter(tolerance=1e-7)
+    found = filter_(program, prior, y, 1e-8, names=NAMES, transform=Log())
+    assert found.converged
+    # In log k2 the prior's variance is 9 and its distance 0.9; noise of 1e-4 mm on 2/k2 = 0.8 mm
+    # leaves a variance of 2 * 1e-8 / 0.8^2: the prior draws by 3e-9.
+    np.testing.assert_allclose(found.mean, M, rtol=1e-7)
+    assert found.forward_solves == program.runs == ran(tmp_path)
+
+
+def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_path):
+    model(tmp_path)(M)
+    assert ran(tmp_path) == 5
+    again = model(tmp_path)
+    again(M)
+    assert (again.runs, again.reused, ran(tmp_path)) == (0, 5, 5)
+    # A value in its last digit, a setting, a variable, an argument: other runs.
+    model(tmp_path, differences=Differences("forward"))(np.nextafter(M, 9))
+    assert ran(tmp_path) == 8
+    higher = model(tmp_path, settings={"height": 4.0})(M)
+    assert higher.y[5] == 4.0
+    assert ran(tmp_path) == 13
+    fresh = model(tmp_path, reuse=False)
+    fresh(M)
+    assert (fresh.runs, fresh.reused) == (5, 0)
+
+
+def test_a_changed_input_makes_finished_runs_worthless(tmp_path):
+    mesh = tmp_path / "mesh.txt"
+    mesh.write_text("coarse")
+    model(tmp_path, inputs=[mesh])(M)
+    model(tmp_path, inputs=[mesh])(M)
+    assert ran(tmp_path) == 5
+    mesh.write_text("finer!")
+    model(tmp_path, inputs=[mesh])(M)
+    assert ran(tmp_path) == 10
+    with pytest.raises(InputError, match="cannot read"):
+        model(tmp_path, inputs=[tmp_path / "absent"])
+
+
+def test_a_finished_run_that_was_damaged_is_done_again(tmp_path):
+    first = model(tmp_path, "exact")(M)
+    (folder,) = (tmp_path / "runs").glob("run-*")
+    table = folder / "observation.csv"
+    table.write_text(table.read_text().replace("2.5", "2.6"))
+    again = model(tmp_path, "exact")
+    np.testing.assert_array_equal(again(M).y, first.y)
+    assert (again.runs, again.reused) == (1, 0)
+
+
+def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
+    # A program that goes by what no command says: it writes nothing once there is that file.
+    off = f"import os, sys\nif os.path.exists({str(tmp_path / 'off')!r}): sys.exit()\n"
+    assert model(tmp_path, "exact", source=off + SPRINGS)(M).converged
+    (folder,) = (tmp_path / "runs").glob("run-*")
+    (folder / "finished.json").unlink()
+    (tmp_path / "off").touch()
+    # The same run again: what lies there is another's.
+    silent = model(tmp_path, "exact", source=off + SPRINGS)
+    for _ in range(2):
+        assert silent(M).reason == f"{folder.name}: response.json is missing"
+    assert (silent.runs, silent.reused) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("sys.exit('out of licences')", "exit status 1; its last words: out of licences"),
+        ("time.sleep(60)", "stopped at the time limit of 0.5 s"),
+        ("response.unlink()", "response.json is missing"),
+        ("response.write_text(response.read_text()[:9])", "response.json is not JSON"),
+        ("observation.unlink()", "observation.csv is missing"),
+        ("observation.write_text('x,y,z\\n1,2,3\\n')", "1 rows, expected 2"),
+        ("observation.write_text('x,y,z\\n1,2,3\\n4,nan,6\\n')", "'nan'"),
+        ("jacobian.write_text('k1\\n' + '1\\n' * 6)", "jacobian.csv: columns k1"),
+        ("jacobian.write_text('k1,k2\\n' + '1,2\\n' * 2)", "jacobian.csv: 2 rows, expected 6"),
+    ],
+)
+def test_whatever_goes_wrong_is_the_reason_of_a_failed_prediction(tmp_path, body, message):
+    program = model(tmp_path, source=answering(body), limit=0.5 if "sleep" in body else 30)
+    prediction = program(M)
+    assert not prediction.converged
+    assert message in prediction.reason
+    assert prediction.reason.startswith("run-")
+    assert (program.runs, ran(tmp_path)) == (1, 1)
+
+
+def test_what_the_program_says_of_its_failure_is_told(tmp_path):
+    program = model(tmp_path)
+    assert program(np.array([-1.0, 2.0])).reason.endswith("k1 = -1.0: expected > 0")
+    # The model stands; the lower neighbour does not.
+    near_zero = model(tmp_path, differences=Differences(floor=1.0))(np.array([1e-4, 2.0]))
+    assert near_zero.reason.startswith("run for a difference at k1 = -0.0009, k2 = 2: run-")
+
+
+def test_a_filter_ends_with_the_reason_of_a_program_that_fails_at_the_start(tmp_path):
+    prior = Gaussian(np.array([-1.0, 2.0]), np.eye(2))
+    found = IteratedFilter()(model(tmp_path), prior, springs(*M)[0], 1e-4)
+    assert found.reason is Reason.MODEL_FAILED
+    assert "expected > 0" in found.detail
+
+
+def test_parameters_without_a_size_need_a_floor(tmp_path):
+    differences = Differences()
+    with pytest.raises(InputError, match="parameter 1 is 0"):
+        differences.neighbours(np.array([1.0, 0.0]))
+    np.testing.assert_allclose(
+        Differences("forward", 0.1, floor=2.0).neighbours(np.array([3.0, 0.0])),
+        [[3.3, 0.0], [3.0, 0.2]],
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"scheme": "exact"}, "central, forward"),
+        ({"relative_step": 0.0}, "relative_step"),
+        ({"relative_step": float("nan")}, "relative_step"),
+        ({"floor": -1.0}, "floor"),
+        ({"processes": 0}, "processes"),
+    ],
+)
+def test_inadmissible_differences_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        Differences(**settings)
+
+
+def test_an_inadmissible_model_is_refused_before_anything_runs(tmp_path):
+    command = Command((sys.executable,))
+    with pytest.raises(InputError, match="2 names, 1 units"):
+        ProcessModel(command, tmp_path, NAMES, 2, units=("MPa",))
+    with pytest.raises(ConfigurationError, match="points"):
+        ProcessModel(command, tmp_path, NAMES, 2, points=np.zeros((3, 3)))
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot write"):
+        ProcessModel(command, tmp_path / "file" / "runs", NAMES, 2)
+    with pytest.raises(InputError, match="1 parameters"):
+        ProcessModel(command, tmp_path, NAMES, 2)(np.ones(1))
+
+
+def test_a_run_without_a_place_is_a_reason_and_no_run(tmp_path):
+    program = model(tmp_path)
+    (tmp_path / "runs").rmdir()
+    (tmp_path / "runs").touch()
+    assert "Not a directory" in program(M).reason
+    assert (program.runs, program.reused) == (0, 0)
+
+
+def counted(monkeypatch, tmp_path, *arguments: str) -> int:
+    """Runs that are started for a command line in ``tmp_path``."""
+    monkeypatch.chdir(tmp_path)
+    command = Command((*arguments, "{request}", "{folder}"))
+    program = ProcessModel(command, tmp_path / "runs", NAMES, 2, units=("N/mm", "N/mm"))
+    assert program(M).converged
+    return program.runs
+
+
+def test_after_a_change_of_a_file_in_the_command_nothing_finished_serves(tmp_path, monkeypatch):
+    ours = tmp_path / "bin"
+    ours.mkdir()
+    (ours / "solve.py").write_text(SPRINGS)
+    helper, mesh, tool = ours / "helper.py", tmp_path / "mesh.inp", ours / "tool"
+    for file in (helper, mesh):
+        file.write_text("1")
+    tool.write_text(f'#!/bin/sh\nexec {sys.executable} -S "$1" "$3" "$4"\n')
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(ours), prepend=":")
+    words = ("tool", "{here}/bin/solve.py", f"--mesh={mesh}")
+    assert counted(monkeypatch, tmp_path, *words) == 5
+    assert counted(monkeypatch, tmp_path, *words) == 0
+    for file in (ours / "solve.py", helper, mesh, tool):
+        file.write_text(file.read_text() + "\n# changed\n")
+        assert counted(monkeypatch, tmp_path, *words) == 5, file
+    # Another program of this name is found first.
+    other = tmp_path / "first"
+    other.mkdir()
+    (other / "tool").write_text(tool.read_text() + "# another\n")
+    (other / "tool").chmod(0o755)
+    monkeypatch.setenv("PATH", str(other), prepend=":")
+    assert counted(monkeypatch, tmp_path, *words) == 5
+    # What the program writes into its run's folder is none of it, nor what lies elsewhere.
+    (tmp_path / "notes.txt").touch()
+    assert counted(monkeypatch, tmp_path, *words) == 0
+
+
+def test_an_answer_is_not_kept_whose_program_was_changed_while_it_ran(tmp_path):
+    source = SPRINGS + "\nopen(__file__, 'a').write('# and on')\n"
+    prediction = model(tmp_path, "exact", source=source, differences=None)(M)
+    assert "a file that it depends on was changed while it ran" in prediction.reason
+    again = model(tmp_path, "exact", differences=None)
+    assert again(M).converged
+    assert again.runs == 1

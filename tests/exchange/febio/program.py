@@ -1,0 +1,146 @@
+"""The program ``febio4``, where there is one, and what it says of a run.
+
+It is no part of this project. The variable ``MVEST_FEBIO`` names it, or it is found on ``PATH``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mvest.errors import ConfigurationError
+from mvest.exchange.febio.document import FebDocument, positions_file
+from mvest.exchange.febio.positions import MAX_LOG, read_positions
+from mvest.processes import run
+from mvest.reading.text import read_text
+from mvest.typing import FloatArray
+
+VARIABLE = "MVEST_FEBIO"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FebRun:
+    """What became of a run.
+
+    Attributes
+    ----------
+    converged : bool
+        Whether FEBio came to the end.
+    reason : str
+        The last complaint of its log, where it did not.
+    times : (s,)
+        s of the steps that it completed, the reference state first.
+    frames : (s, n, 3) mm
+        Positions of the nodes of the mesh that was given.
+    steps, iterations : int
+        As FEBio counts them.
+    seconds : float
+        Processor time of the program.
+    version : str
+    """
+
+    converged: bool
+    reason: str
+    times: FloatArray
+    frames: FloatArray
+    steps: int
+    iterations: int
+    seconds: float
+    version: str
+
+
+def febio_program() -> Path:
+    """The program.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none.
+    """
+    given = os.environ.get(VARIABLE)
+    found = given or shutil.which("febio4")
+    if not found or not Path(found).is_file():
+        raise ConfigurationError(
+            f"no FEBio: {given or 'febio4'} is no program; expected one on PATH, or its place in "
+            f"the variable {VARIABLE} (febio.org)"
+        )
+    return Path(found)
+
+
+def run_febio(document: FebDocument, path: Path, *, time_limit_s: float = 3600.0) -> FebRun:
+    """Write a document and run FEBio on it, with one thread.
+
+    Parameters
+    ----------
+    document : FebDocument
+    path : Path
+        Of the input file; FEBio writes beside it.
+    time_limit_s : float
+        After which it is stopped, which is a run that did not converge.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no program.
+    OSError
+        If it cannot be started, or a file cannot be written.
+    """
+    program = febio_program()
+    document.write(path)
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    command = [str(program), "-i", path.name, "-nosplash", "-silent"]
+    before = os.times()
+    reason = ""
+    try:
+        ended = run(
+            command,
+            timeout=time_limit_s,
+            cwd=path.parent,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        code = ended.returncode
+    except subprocess.TimeoutExpired:
+        code, reason = 1, f"stopped after {time_limit_s:g} s"
+    after = os.times()
+    seconds = after.children_user + after.children_system
+    seconds -= before.children_user + before.children_system
+    log = path.with_suffix(".log")
+    said = read_text(log, MAX_LOG) if log.is_file() else ""
+    converged = code == 0 and "N O R M A L" in said
+    if not (converged or reason):
+        complaints = re.findall(r"^ *\*[^*\n]*[a-z][^*\n]*\* *$", said, re.MULTILINE)
+        reason = complaints[-1].strip(" *") if complaints else f"exit status {code}"
+    rest = np.vstack([document.mesh.solid.nodes, document.further])
+    logged = positions_file(path)
+    times, frames = np.zeros(0), np.zeros((0, *rest.shape))
+    if logged.is_file():
+        times, frames = read_positions(logged, len(rest))
+    frames = np.concatenate([rest[None], frames])[:, : len(document.mesh.solid.nodes)]
+    return FebRun(
+        converged,
+        reason,
+        np.concatenate([[0.0], times]),
+        document.mesh.restored(frames),
+        len(times),
+        _iterations(said),
+        seconds,
+        _version(said),
+    )
+
+
+def _iterations(said: str) -> int:
+    counts = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", said)
+    return int(counts[-1]) if counts else 0
+
+
+def _version(said: str) -> str:
+    found = re.search(r"version\s+(\d[\d.]*)", said)
+    return found.group(1) if found else ""

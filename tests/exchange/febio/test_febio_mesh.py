@@ -1,0 +1,205 @@
+"""Meshes in the elements of FEBio.
+
+Laws as FEBio has them, worked out here by its formulas.
+"""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.exchange.febio.mesh import febio_law, febio_mesh, opposite_faces
+from mvest.mechanics.body import box, outer_faces
+from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.settings import ExponentialTissue
+from mvest.valve.anatomy.template import Template
+from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.structured import structured_mesh
+
+# Where FEBio's shape functions of hex27 are one, from FESolidElementShape.cpp: a factor 0.5 r (r+1)
+# is one at r = 1, 0.5 r (r-1) at r = -1 and 1 - r^2 at r = 0.
+HEX27 = """-1-1-1 +1-1-1 +1+1-1 -1+1-1 -1-1+1 +1-1+1 +1+1+1 -1+1+1 0-1-1 +10-1 0+1-1 -10-1
+0-1+1 +10+1 0+1+1 -10+1 -1-10 +1-10 +1+10 -1+10 0-10 +100 0+10 -100 00-1 00+1 000"""
+
+
+def corners_of(words):
+    """Signs of the coordinates of each word."""
+    out = []
+    for word in words.split():
+        values, sign = [], 1
+        for letter in word:
+            if letter in "+-":
+                sign = -1 if letter == "-" else 1
+            else:
+                values.append(sign * int(letter))
+                sign = 1
+        out.append(values)
+    return np.array(out)
+
+
+def mesh_of(kind, cells=(2, 3, 2), size=(2.0, 3.0, 1.0)):
+    nodes, elements = box(kind, cells, size)
+    faces = outer_faces(elements, kind)
+    top = faces[np.all(np.isclose(nodes[faces][:, :, 2], size[2]), axis=1)]
+    fibre = np.tile([1.0, 0.0, 0.0], (len(nodes), 1))
+    return SolidMesh(nodes, elements, kind, np.zeros(len(elements), int), ("a",), fibre, top)
+
+
+def test_nodes_of_a_brick_are_where_febio_has_them():
+    mesh = febio_mesh(mesh_of("hex18", (1, 1, 1), (2.0, 2.0, 2.0)))
+    assert mesh.element == "hex27"
+    places = mesh.solid.nodes[mesh.elements[0]] - 1
+    np.testing.assert_allclose(places, corners_of(HEX27), atol=1e-12)
+
+
+def test_faces_of_a_brick_go_round_it():
+    mesh = febio_mesh(mesh_of("hex27", (1, 1, 1), (2.0, 2.0, 2.0)))
+    kind, nodes = mesh.faces(mesh.solid.pressure_faces)
+    assert kind == "quad9"
+    x = mesh.solid.nodes[nodes[0]]
+    # Each middle lies between the corners before and after it, and the way round is seen from
+    # outside against the clock.
+    for k in range(4):
+        np.testing.assert_allclose(x[4 + k], (x[k] + x[(k + 1) % 4]) / 2)
+    np.testing.assert_allclose(x[8], x[:4].mean(axis=0))
+    assert np.cross(x[1] - x[0], x[2] - x[1])[2] > 0
+
+
+def test_nodes_of_a_wedge_are_where_febio_has_them():
+    mesh = febio_mesh(mesh_of("wedge12", (1, 1, 1)))
+    assert mesh.element == "penta15"
+    x = mesh.solid.nodes[mesh.elements[0]]
+    for low, high, middle in ((0, 3, 12), (1, 4, 13), (2, 5, 14)):
+        np.testing.assert_allclose(x[middle], (x[low] + x[high]) / 2)
+        assert x[low, 2] < x[high, 2]
+    for k in range(3):
+        for base, middle in ((0, 6), (3, 9)):
+            ends = x[base + k] + x[base + (k + 1) % 3]
+            np.testing.assert_allclose(x[middle + k], ends / 2)
+
+
+@pytest.mark.parametrize("kind", ["tet4", "tet10", "hex18", "hex18_thin", "hex27", "wedge12"])
+def test_given_nodes_are_the_first(kind):
+    given = mesh_of(kind)
+    mesh = febio_mesh(given)
+    np.testing.assert_array_equal(mesh.restored(mesh.solid.nodes), given.nodes)
+    assert np.all(mesh.solid.fibre == [1.0, 0.0, 0.0])
+    assert mesh.solid.nodes[mesh.elements].shape[:2] == (len(given.elements), len(mesh.elements[0]))
+
+
+def test_sides_of_wedges_follow_from_febios_interpolation():
+    given = mesh_of("wedge18")
+    mesh = febio_mesh(given)
+
+    def field(x):
+        # All of what fifteen nodes represent up to the second degree, and one of the third.
+        one, r, z = x[:, 0], x[:, 1], x[:, 2]
+        return np.stack([one**2 + z * r, one * r - z**2, one * z * r + 2 * r], axis=1)
+
+    moved = field(mesh.solid.nodes)
+    unknown = np.setdiff1d(mesh.solid.elements, mesh.elements)
+    assert len(unknown)
+    spoilt = moved.copy()
+    spoilt[unknown] = np.nan
+    np.testing.assert_allclose(mesh.restored(spoilt), moved, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["hex18", "hex27", "tet10", "wedge12", "wedge18"])
+def test_the_other_side_is_as_large_and_looks_the_other_way(kind):
+    mesh = febio_mesh(mesh_of(kind)).solid
+    faces = opposite_faces(mesh)
+    assert len(faces) == len(mesh.pressure_faces)
+    x = mesh.nodes[faces]
+    assert np.allclose(x[:, :, 2], 0.0)
+    corners = mesh.nodes[faces[:, [0, 2, 8]]] if faces.shape[1] == 9 else x[:, :3]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+    assert np.all(normal[:, 2] < 0)
+
+
+@pytest.mark.parametrize("kind", ["hex18", "tet10"])
+def test_atrial_faces_of_a_valve(kind):
+    mesh = febio_mesh(structured_mesh(Template(), kind, 12, 2)).solid
+    faces = opposite_faces(mesh)
+    assert not np.isin(faces, mesh.pressure_faces).any()
+    assert len(faces) == len(mesh.pressure_faces)
+
+
+A = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL)
+C = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.NEARLY_INCOMPRESSIBLE)
+REST = np.zeros((1, 1, 6))
+
+
+def stretched(seed=0, size=0.15):
+    """A symmetric deformation gradient far from the reference."""
+    h = np.random.default_rng(seed).uniform(-size, size, (3, 3))
+    return np.eye(3) + 0.5 * (h + h.T)
+
+
+def invariants(c):
+    return {
+        "I1": np.trace(c),
+        "I2": 0.5 * (np.trace(c) ** 2 - np.trace(c @ c)),
+        "I4": c[0, 0],
+        "I5": (c @ c)[0, 0],
+        "J": np.sqrt(np.linalg.det(c)),
+    }
+
+
+def energy_of(expression, values):
+    functions = {"sqrt": np.sqrt, "exp": np.exp, "H": lambda x: float(x > 0)}
+    return eval(expression.replace("^", "**"), {"__builtins__": {}}, {**functions, **values})
+
+
+def stress_by_differences(energy, c, step=1e-5):
+    """S = 2 dW/dC as a six-vector."""
+    out = []
+    for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)):
+        d = np.zeros((3, 3))
+        d[i, j] += 0.5
+        d[j, i] += 0.5
+        out.append((energy(c + step * d) - energy(c - step * d)) / step)
+    return np.array(out)
+
+
+def green(c):
+    e = 0.5 * (c - np.eye(3))
+    return np.array([[[e[0, 0], e[1, 1], e[2, 2], 2 * e[1, 2], 2 * e[0, 2], 2 * e[0, 1]]]])
+
+
+@pytest.mark.parametrize("material", [A, C])
+def test_the_orthotropic_stiffness_is_the_same(material):
+    p = febio_law(material, "orthotropic").parameters
+    # FEOrthoElastic::EvaluateLameCoefficients: the compliance that it inverts.
+    s = np.array(
+        [
+            [1 / p["E1"], -p["v12"] / p["E1"], -p["v31"] / p["E3"]],
+            [-p["v12"] / p["E1"], 1 / p["E2"], -p["v23"] / p["E2"]],
+            [-p["v31"] / p["E3"], -p["v23"] / p["E2"], 1 / p["E3"]],
+        ]
+    )
+    np.testing.assert_allclose(np.linalg.inv(s), material.stiffness[:3, :3], rtol=1e-12)
+    shear = [p["G23"], p["G31"], p["G12"]]
+    np.testing.assert_allclose(shear, np.diag(material.stiffness)[3:], rtol=1e-12)
+
+
+def test_the_exponential_is_the_same_where_the_volume_is():
+    tissue = ExponentialTissue(0.02, 4.0, 300.0)
+    law = febio_law(tissue)
+    f = stretched(1, 0.1)
+    f /= np.cbrt(np.linalg.det(f))
+    c = f.T @ f
+    ours = ExponentialLaw.of([tissue]).response(green(c), np.zeros(1, int), REST, 0.0)[0][0, 0]
+
+    def energy(x):
+        values = invariants(x)
+        volume = values["J"]
+        values |= {"I1": values["I1"] * volume ** (-2 / 3)}
+        bulk = law.parameters["k"] / 4 * (volume**2 - 1 - 2 * np.log(volume))
+        return energy_of(law.parameters["W"], values) + bulk
+
+    np.testing.assert_allclose(stress_by_differences(energy, c), ours, rtol=1e-5, atol=1e-7)
+
+
+def test_an_unknown_law_is_refused():
+    with pytest.raises(InputError, match="orthotropic, neo-hookean"):
+        febio_law(A, "mooney")

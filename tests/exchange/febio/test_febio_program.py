@@ -1,0 +1,116 @@
+"""Bodies in FEBio beside this project's; only where the program is (see `program`)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import ConfigurationError, InputError
+from mvest.exchange.febio.document import Control, FebDocument, Prescribed, Pressure
+from mvest.exchange.febio.mesh import febio_law, febio_mesh
+from mvest.exchange.febio.positions import read_positions
+from mvest.mechanics.body import simulate_body
+from mvest.mechanics.law.linear import LinearLaw
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.solid import Law
+from mvest.mechanics.steps import NewtonSettings
+from tests.exchange.febio.program import febio_program, run_febio
+from tests.exchange.febio.test_febio_mesh import mesh_of
+
+MATERIAL = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL)
+PRESSURE = 0.03
+
+
+@pytest.fixture
+def program():
+    try:
+        return febio_program()
+    except ConfigurationError as error:
+        pytest.skip(str(error))
+
+
+def sheet(kind):
+    """A sheet of 8 x 6 x 1.3 mm whose fibres run askew."""
+    mesh = mesh_of(kind, (4, 3, 1), (8.0, 6.0, 1.3))
+    fibre = np.tile([0.8, 0.6, 0.0], (len(mesh.nodes), 1))
+    rim = np.flatnonzero(np.isin(mesh.nodes[:, 0], (0.0, 8.0)))
+    return mesh, fibre, rim
+
+
+def ours(mesh, fibre, rim, law):
+    return simulate_body(
+        mesh.nodes,
+        mesh.elements,
+        mesh.element_type,
+        material=law,
+        fibre=fibre[0],
+        fixed_nodes=rim,
+        pressure_faces=mesh.pressure_faces,
+        pressure=[(0.0, 0.0), (1.0, PRESSURE)],
+        times=np.arange(1, 6) / 5,
+        static=True,
+        newton=NewtonSettings(tolerance=1e-11),
+    )
+
+
+def theirs(mesh, fibre, rim, kind, folder):
+    directed = febio_mesh(replace(mesh, fibre=fibre))
+    nodes = np.flatnonzero(np.isin(directed.solid.nodes[:, 0], (0.0, 8.0)))
+    document = FebDocument(
+        directed,
+        (febio_law(MATERIAL, kind),),
+        Control(1.0, 0.2, 1e-4, 0.2, displacement=1e-9, energy=1e-20),
+        Pressure(directed.solid.pressure_faces, np.array([[0.0, 0.0], [1.0, PRESSURE]])),
+        (Prescribed("rim", nodes, np.zeros((len(nodes), 3)), np.array([[0.0, 0.0], [1.0, 1.0]])),),
+    )
+    return run_febio(document, folder / "sheet.feb")
+
+
+# FEBio writes twelve digits, and knows the points of integration of tet10 to eight.
+@pytest.mark.parametrize(("kind", "difference"), [("tet4", 1e-10), ("tet10", 2e-8)])
+def test_a_sheet_is_the_same_where_element_and_law_are(kind, difference, program, tmp_path):
+    mesh, fibre, rim = sheet(kind)
+    law = LinearLaw.of([MATERIAL])
+    assert isinstance(law, Law)
+    here = ours(mesh, fibre, rim, law)
+    there = theirs(mesh, fibre, rim, "orthotropic", tmp_path)
+    assert there.converged, there.reason
+    assert there.version.startswith("4")
+    assert there.times[-1] == pytest.approx(1.0)
+    moved = np.abs(here.frames[-1] - mesh.nodes).max()
+    assert moved > 0.15
+    assert np.abs(there.frames[-1] - here.frames[-1]).max() < difference
+    # Another law is not the same at these strains.
+    other = ours(mesh, fibre, rim, MATERIAL)
+    assert np.abs(other.frames[-1] - here.frames[-1]).max() > 1e-3
+
+
+def log_of(path, text):
+    path.write_text(text)
+    return path
+
+
+STEP = "*Step  = {}\n*Time  = {}\n*Data  = positions\n1,0,0,{}\n2,1,0,{}\n"
+
+
+def test_positions_are_read_and_a_broken_step_left_out(tmp_path):
+    text = STEP.format(0, 0, 0.5, 0.25) + STEP.format(1, 0.1, 1.5, 1.25)
+    path = log_of(tmp_path / "log.csv", text + "*Step  = 2\n*Time  = 0.2\n1,0,0,1\n")
+    times, frames = read_positions(path, 2)
+    np.testing.assert_array_equal(times, [0.0, 0.1])
+    np.testing.assert_array_equal(frames[1], [[0, 0, 1.5], [1, 0, 1.25]])
+
+
+@pytest.mark.parametrize(
+    "row", ["2,1,0", "2,1,0,nan(ind)", "3,1,0,0", "2,1,0,0\n3,0,0,0", "2,1,0,0,0"]
+)
+def test_other_rows_are_refused(row, tmp_path):
+    path = log_of(tmp_path / "log.csv", f"*Step  = 1\n*Time  = 1\n1,0,0,0\n{row}\n")
+    with pytest.raises(InputError, match=r"log\.csv"):
+        read_positions(path, 2)
+
+
+def test_without_the_program_it_is_said_how_to_name_it(monkeypatch, tmp_path):
+    monkeypatch.setenv("MVEST_FEBIO", str(tmp_path / "none"))
+    with pytest.raises(ConfigurationError, match="MVEST_FEBIO"):
+        febio_program()

@@ -1,0 +1,46 @@
+"""A reference heart whose valve is known: the template thickened, and muscles below its tips."""
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from mvest.exchange.importing.reference_heart import HEAD_MM, PARTS
+from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.thickening import thicken
+
+TEMPLATE = Template()
+SHIFT = np.array([40.0, 470.0, -12.0])
+
+
+def muscle(tip):
+    """A closed spindle 40 mm long and 8 mm wide below a tip, which is the middle of its head."""
+    around, rows = 16, np.linspace(0.5 * HEAD_MM, 0.5 * HEAD_MM - 40.0, 43)
+    angle = 2 * np.pi * np.arange(around) / around
+    radius = 4.0 * np.sqrt(np.sin(np.linspace(0.02, np.pi - 0.02, len(rows))))
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    points = np.concatenate(
+        [np.column_stack([r * ring, np.full(around, z)]) for r, z in zip(radius, rows, strict=True)]
+    )
+    a = np.arange(around * (len(rows) - 1))
+    b = a // around * around + (a + 1) % around
+    side = np.concatenate(
+        [np.column_stack([a, a + around, b]), np.column_stack([b, a + around, b + around])]
+    )
+    return tip + points, side
+
+
+def parts():
+    """The template thickened and its muscles, mm: points and triangles of each."""
+    valve = TEMPLATE.valve(64, 20)
+    thick = thicken(valve.surface)
+    found = [(thick.vertices, thick.triangles), *map(muscle, valve.papillary_tips)]
+    return [(points + SHIFT, triangles) for points, triangles in found]
+
+
+def heart(folder: Path) -> Path:
+    """Write the parts of the template's heart."""
+    folder.mkdir()
+    for name, (points, triangles) in zip(PARTS, parts(), strict=True):
+        meshio.Mesh(points, [("triangle", triangles.astype(np.int32))]).write(folder / name)
+    return folder

@@ -1,0 +1,154 @@
+"""A reference heart as a case: all that is known of a made-up one comes back.
+
+The tip of a papillary muscle is its end towards the leaflets, wherever it lies.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mvest.cases.folder import read_case
+from mvest.cases.plausibility import doubts
+from mvest.cases.writer import write_case
+from mvest.errors import GeometryError, InputError
+from mvest.exchange.importing.reference_heart import (
+    CITATION,
+    DATA_VARIABLE,
+    HEAD_MM,
+    OBJECTS,
+    PARTS,
+    ReferenceHeartOptions,
+    heart_files,
+    import_reference_heart,
+    papillary_tip,
+)
+from mvest.valve.geometry.proximity import closest_points
+from tests.exchange.importing.made_up_heart import SHIFT, TEMPLATE, heart, parts
+from tests.exchange.surfaces.glb import write_parts
+from tests.places import ROOT
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return heart(tmp_path_factory.mktemp("heart") / "parts")
+
+
+@pytest.fixture(scope="module")
+def case(folder):
+    return import_reference_heart(folder, ReferenceHeartOptions())
+
+
+def test_the_valve_that_was_thickened_comes_back(folder):
+    case = import_reference_heart(folder, ReferenceHeartOptions(smoothing_mm=0.0))
+    valve = TEMPLATE.valve(112, 29)
+    near = closest_points(
+        case.surface.vertices - SHIFT, valve.surface.vertices, valve.surface.triangles
+    )
+    assert np.quantile(near.distance, 0.95) < 0.2
+    thickness = near.interpolate(valve.surface.thickness, valve.surface.triangles)
+    assert np.median(np.abs(case.surface.thickness - thickness)) < 0.1
+    tips = case.frames[0].papillary_tips - SHIFT
+    np.testing.assert_allclose(tips, valve.papillary_tips, atol=0.3)
+    # The anterior leaflet is the one at y > 0.
+    assert case.surface.region_names == ("anterior", "posterior")
+    middle = [
+        case.surface.vertices[np.unique(case.surface.triangles[case.surface.region == k])].mean(0)
+        for k in (0, 1)
+    ]
+    assert middle[0][1] > middle[1][1]
+
+
+def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_path):
+    assert case.closed is None
+    assert not doubts(case)
+    back = read_case(write_case(tmp_path / "case", case))
+    np.testing.assert_array_equal(back.surface.vertices, case.surface.vertices)
+    assert back.source == CITATION
+    assert "shape is all that is real" in back.description
+    said = " ".join(back.derived)
+    for word in ("papillary tips", "thickness: kept between", "assumed closure", "smoothed"):
+        assert word in said
+
+
+def test_chordae_are_shorter_for_edges_that_stay_deeper(folder, case):
+    deeper = import_reference_heart(folder, ReferenceHeartOptions(closed_depth=1.0))
+    assert deeper.chordae.rest_length.sum() < case.chordae.rest_length.sum() - 10.0
+
+
+def test_what_is_missing_is_asked_for_in_one_line(folder, tmp_path, monkeypatch):
+    monkeypatch.delenv(DATA_VARIABLE, raising=False)
+    for place in (None, tmp_path):
+        with pytest.raises(InputError, match="not part of this package: take ") as raised:
+            heart_files(place)
+        assert "\n" not in str(raised.value)
+    monkeypatch.setenv(DATA_VARIABLE, str(folder))
+    assert [file.name for file in heart_files()] == list(PARTS)
+
+
+def test_the_file_as_it_is_distributed_is_the_same_heart(case, tmp_path):
+    # In metres, all parts of the heart in one file.
+    objects = {"VH_M_aortic_valve": (np.eye(3), np.array([[0, 1, 2]]))}
+    for name, (points, triangles) in zip(OBJECTS, parts(), strict=True):
+        objects[name] = (1e-3 * points, triangles)
+    path = write_parts(tmp_path / "heart.glb", objects)
+    found = import_reference_heart(path, ReferenceHeartOptions())
+    # Single precision at half a metre.
+    assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=2e-3)
+    assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-3)
+    del objects[OBJECTS[2]]
+    write_parts(path, objects)
+    with pytest.raises(InputError, match=f"no part is called {OBJECTS[2]}"):
+        import_reference_heart(path, ReferenceHeartOptions())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"smoothing_mm": -1.0}, "smoothing_mm"),
+        ({"min_thickness_mm": 3.0}, "0 < min < max"),
+        ({"max_thickness_mm": 6.0}, "max <= 5"),
+        ({"closed_depth": 1.5}, "closed_depth"),
+    ],
+)
+def test_options_that_are_none_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        ReferenceHeartOptions(**options)
+
+
+def test_the_heart_itself_is_a_plausible_valve():
+    place = Path(os.environ.get(DATA_VARIABLE) or ROOT.parent / "shared" / "data" / "hra_mitral")
+    if not (place / PARTS[0]).is_file():
+        pytest.skip(f"needs the reference heart: {CITATION}; name its folder in {DATA_VARIABLE}")
+    case = import_reference_heart(place, ReferenceHeartOptions())
+    assert not doubts(case)
+    tips = case.frames[0].papillary_tips
+    assert np.linalg.norm(tips[0] - tips[1]) == pytest.approx(24.1, abs=0.5)
+    assert len(case.chordae) == 34
+
+
+def muscle(length=30.0, width=8.0):
+    """Half a spheroid of that length along z from its base, tip up."""
+    rng = np.random.default_rng(3)
+    z = rng.uniform(0.0, 1.0, 4000)
+    angle = rng.uniform(0.0, 2 * np.pi, len(z))
+    radius = 0.5 * width * np.sqrt(1 - z**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), length * z])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_head_is_found_at_the_end_towards_the_leaflets(seed):
+    rng = np.random.default_rng(seed)
+    turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-50, 50, 3)
+    leaflets = np.array([[5.0, 3.0, 45.0], [-5.0, 0.0, 50.0]])
+    tip = papillary_tip(muscle() @ turn.T + shift, leaflets @ turn.T + shift)
+    back = (tip - shift) @ turn
+    # Points are even along z: the middle of the last HEAD_MM.
+    np.testing.assert_allclose(back, [0.0, 0.0, 30.0 - 0.5 * HEAD_MM], atol=0.4)
+
+
+def test_a_muscle_without_a_long_axis_is_refused():
+    with pytest.raises(GeometryError, match="which end is its tip is not known; give tips"):
+        papillary_tip(muscle(length=8.0, width=14.0), np.array([[0.0, 0.0, 40.0]]))

@@ -1,0 +1,249 @@
+"""Folders of SlicerHeart, written by VTK and pandas, become cases."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from mvest.cases.case import Role
+from mvest.cases.folder import read_case
+from mvest.cases.writer import write_case
+from mvest.errors import GeometryError, InputError
+from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.thickening import thicken
+from mvest.valve.geometry.triangles import areas
+from mvest.valve.mesh.given import GivenValve
+from tests.cases.folders import template_case
+
+pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
+from tests.exchange.importing.slicerheart_exports import (
+    atrial_leaflet,
+    batch_export,
+    fem_export,
+    in_lps,
+    write_model,
+)
+
+OPTIONS = SlicerheartOptions(pressure_mmHg=120.0)
+TRUTH = template_case(64, 16)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    return batch_export(tmp_path_factory.mktemp("slicerheart") / "P001", TRUTH)
+
+
+@pytest.fixture
+def folder(exported, tmp_path):
+    """A copy to change."""
+    return shutil.copytree(exported, tmp_path / "P001")
+
+
+def away(frame, truth):
+    """mm of each vertex of a frame from the true midsurface."""
+    return closest_points(frame.vertices, in_lps(truth.vertices), truth.triangles).distance
+
+
+@pytest.fixture(scope="module")
+def case(exported):
+    return import_slicerheart(exported, OPTIONS)
+
+
+def test_both_phases_are_the_true_midsurfaces(case):
+    truth = {frame.role: frame for frame in TRUTH.frames}
+    assert [frame.name for frame in case.frames] == ["mid-diastole", "mid-systole"]
+    for frame in case.frames:
+        distance = away(frame, truth[frame.role])
+        # Half a thickness is 0.6 mm: without it, or to the other side, this would fail.
+        assert np.sqrt(np.mean(distance**2)) < 0.05
+    assert not case.frame(Role.CLOSED).corresponds
+    assert case.frame(Role.CLOSED).pressure_mmHg == 120.0
+    tips = truth[Role.REFERENCE].papillary_tips
+    assert case.frame(Role.REFERENCE).papillary_tips == pytest.approx(
+        in_lps(tips[np.argsort(tips[:, 0])]), abs=1e-6
+    )
+
+
+def test_the_valve_can_be_thickened_wherever_it_is_sampled(case):
+    # Where the free edges part a kink would make the thick leaflets pass through themselves.
+    given = GivenValve(case.valve)
+    thicken(given.valve(80, 21).surface, given.normals(80, 21))
+
+
+def test_leaflets_keep_their_names_and_areas(case):
+    surface, reference = case.surface, TRUTH.surface
+    assert surface.region_names == ("anterior", "posterior")
+    corners = [s.vertices[s.triangles] for s in (surface, reference)]
+    area = [
+        np.bincount(
+            s.region, 0.5 * np.linalg.norm(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
+        )
+        for s, c in zip((surface, reference), corners, strict=True)
+    ]
+    assert area[0] == pytest.approx(area[1], rel=0.03)
+
+
+def test_what_was_not_given_is_said(case, exported):
+    said = " | ".join(case.derived)
+    for words in ("thickness: 1.32 mm", "half the thickness", "joined at the commissures", "times"):
+        assert words in said
+    assert "110 mmHg" not in said
+    assert "110 mmHg" in " | ".join(import_slicerheart(exported, SlicerheartOptions()).derived)
+
+
+def test_it_is_a_case_that_can_be_written_and_read(case, tmp_path):
+    again = read_case(write_case(tmp_path / "case", case))
+    assert np.array_equal(again.surface.vertices, case.surface.vertices)
+    assert again.derived == case.derived
+
+
+@pytest.mark.slow
+def test_leaflets_cut_out_of_a_segmentation_come_within_half_a_voxel(tmp_path):
+    # Quads where triangles were clipped, slivers and rims that curl, as SlicerHeart's have.
+    folder = batch_export(tmp_path / "P001", TRUTH, voxel_mm=0.5)
+    found = import_slicerheart(folder, OPTIONS)
+    truth = {frame.role: frame for frame in TRUTH.frames}
+    for frame in found.frames:
+        true = truth[frame.role]
+        back = closest_points(in_lps(true.vertices), frame.vertices, frame.triangles).distance
+        assert np.sqrt(np.mean(back**2)) < 0.25
+        assert np.quantile(away(frame, true), 0.9) < 0.5
+        # Half of each rim is on the side that was cut out, and would add a twelfth.
+        area = [areas(f.vertices, f.triangles).sum() for f in (frame, true)]
+        assert area[0] == pytest.approx(area[1], rel=0.05)
+
+
+def test_one_phase_is_an_anatomy(folder):
+    for file in folder.glob("*_MS_*"):
+        file.unlink()
+    alone = import_slicerheart(folder, OPTIONS)
+    assert [frame.role for frame in alone.frames] == [Role.REFERENCE]
+
+
+def test_the_annulus_alone_tells_the_commissures(folder, case):
+    (folder / "ValveLandmarkPoints.csv").unlink()
+    found = import_slicerheart(folder, OPTIONS)
+    assert "commissures where the leaflet nearer to the annulus changes" in " | ".join(
+        found.derived
+    )
+    for frame, expected in zip(found.frames, case.frames, strict=True):
+        distance = closest_points(frame.vertices, expected.vertices, expected.triangles).distance
+        assert np.sqrt(np.mean(distance**2)) < 0.1
+
+
+def test_models_in_r_a_s_are_the_same_valve(folder, case):
+    frame = TRUTH.frame(Role.REFERENCE)
+    for label, name in enumerate(("anterior", "posterior")):
+        model = atrial_leaflet(frame, label, {"anterior": 1.32, "posterior": 1.26}[name])
+        points = model.GetPoints()
+        for k in range(points.GetNumberOfPoints()):
+            x, y, z = points.GetPoint(k)
+            points.SetPoint(k, -x, -y, z)
+        file = folder / f"P001_mitral_frame_3_MD_atrial_mitral_{name}_leaflet.vtk"
+        write_model(file, model, space="RAS", binary=False, version=51)
+    found = import_slicerheart(folder, OPTIONS)
+    assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=1e-3)
+    for file in folder.glob("*_MD_atrial_*"):
+        file.write_bytes(file.read_bytes().replace(b"SPACE=RAS", b"no axes at"))
+    found = import_slicerheart(folder, OPTIONS)
+    assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=1e-3)
+    assert "names no axes in its header, so R, A, S are assumed" in " | ".join(found.derived)
+
+
+def refused(folder, words, kind=InputError, **options):
+    with pytest.raises(kind, match=words) as caught:
+        import_slicerheart(folder, SlicerheartOptions(**options))
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(folder))
+
+
+def test_l_p_s_stated_for_r_a_s_is_refused(folder):
+    for file in folder.glob("*_MD_atrial_*"):
+        file.write_bytes(file.read_bytes().replace(b"SPACE=LPS", b"SPACE=RAS"))
+    refused(
+        folder, r"MD: the annulus lies .* mm from the leaflets.*with x and y turned it would be 0"
+    )
+
+
+def test_a_mirrored_valve_is_refused_unless_it_is_said(folder, case):
+    file = folder / "ValveLandmarkPoints.csv"
+    swapped = {"ALC": "PMC", "PMC": "ALC", "AL": "PM", "PM": "AL"}
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    lines = [[swapped.get(cell, cell) for cell in line] for line in lines]
+    file.write_text("\n".join(map(",".join, lines)) + "\n")
+    refused(folder, "lie as in a mirror: from the atrium ALC is on the right.*mirrored=true")
+    taken = import_slicerheart(folder, SlicerheartOptions(pressure_mmHg=120.0, mirrored=True))
+    assert len(taken.surface.vertices) == len(case.surface.vertices)
+
+
+def test_missing_tips_are_asked_for_by_name(folder):
+    tips = import_slicerheart(folder, OPTIONS).frame(Role.REFERENCE).papillary_tips
+    for file in folder.glob("Papillary*"):
+        file.unlink()
+    refused(folder, r"MD: no papillary tips .*; give tips=\[x,y,z,x,y,z\] in LPS mm")
+    given = import_slicerheart(folder, SlicerheartOptions(tips=tuple(tips.ravel())))
+    assert given.frame(Role.REFERENCE).papillary_tips == pytest.approx(tips)
+    assert "papillary tips of MS: where they are in mid-diastole" in " | ".join(given.derived)
+
+
+def test_missing_annulus_is_asked_for_by_name(folder):
+    for name in ("ValveLandmarkPoints.csv", "AnnulusContourPoints.csv"):
+        (folder / name).unlink()
+    refused(folder, "neither the landmarks ALC and PMC nor the annulus; export")
+
+
+def test_other_valves_scenes_and_phases_are_refused(folder):
+    refused(folder, "closed=ES: no such phase, there are MD, MS", closed="ES")
+    refused(folder, "of scene 'P002'", scene="P002")
+    for file in folder.glob("*_MS_atrial_*"):
+        shutil.copy(file, file.with_name(file.name.replace("P001", "P002")))
+    refused(folder, r"2 scenes \(P001, P002\); give scene=NAME")
+    for file in folder.glob("*_atrial_*"):
+        file.rename(file.with_name(file.name.replace("mitral_frame", "tricuspid_frame")))
+    refused(folder, "no surfaces SCENE_mitral.*valves: tricuspid", scene="P001")
+
+
+def test_damaged_and_closed_surfaces_are_refused(folder):
+    file = next(iter(folder.glob("*_MD_atrial_mitral_anterior*")))
+    content = file.read_bytes()
+    file.write_bytes(content[:2000])
+    refused(folder, "anterior_leaflet.vtk: ends within")
+    file.write_bytes(content)
+    vtk = pytest.importorskip("vtk")
+    sphere = vtk.vtkSphereSource()
+    sphere.SetRadius(10)
+    sphere.Update()
+    write_model(file, sphere.GetOutput())
+    refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
+
+
+@pytest.mark.parametrize("branched", [False, True])
+def test_a_folder_of_valve_fem_export_brings_its_chords(tmp_path, branched):
+    reference = TRUTH.frame(Role.REFERENCE)
+    fem = fem_export(tmp_path / "fem", reference, TRUTH.chordae, branched=branched)
+    case = import_slicerheart(fem, SlicerheartOptions())
+    assert [frame.role for frame in case.frames] == [Role.REFERENCE]
+    assert np.sqrt(np.mean(away(case.frame(Role.REFERENCE), reference) ** 2)) < 0.05
+    assert len(case.chordae) == len(TRUTH.chordae)
+    expected = np.linalg.norm(
+        TRUTH.chordae.insertion - reference.papillary_tips[TRUTH.chordae.tip], axis=1
+    )
+    # Files of text have six digits.
+    assert np.sort(case.chordae.rest_length) == pytest.approx(np.sort(expected), abs=1e-2)
+    marginal = TRUTH.chordae.family_names.index("marginal")
+    assert (case.chordae.family == 0).sum() == (TRUTH.chordae.family == marginal).sum()
+    assert case.chordae.axial_stiffness.sum() == pytest.approx(TRUTH.chordae.axial_stiffness.sum())
+    tips = in_lps(reference.papillary_tips)
+    found = case.frame(Role.REFERENCE).papillary_tips
+    assert np.abs(found[:, None] - tips).sum(axis=2).min(axis=1).max() < 1e-2
+
+
+def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(tmp_path):
+    folders = [
+        fem_export(tmp_path / frame.name, frame, TRUTH.chordae)
+        for frame in (TRUTH.frame(Role.REFERENCE), TRUTH.frame(Role.CLOSED))
+    ]
+    options = SlicerheartOptions(closed=str(folders[1]), pressure_mmHg=100.0)
+    case = import_slicerheart(folders[0], options)
+    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), TRUTH.frame(Role.CLOSED)) ** 2)) < 0.05

@@ -1,0 +1,5 @@
+"""Shapes that are written and read again."""
+
+from tests.valve.conftest import shapes
+
+__all__ = ["shapes"]

@@ -1,0 +1,146 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK
+
+from mvest.errors import InputError
+from mvest.exchange.volumes.reader import read_volume
+from mvest.imaging.volume import Modality, VolumeSequence
+from tests.exchange.volumes import volumes as v
+
+TIMES = np.array([0.5, 0.54, 0.58])
+
+
+def write(
+    path: Path, dtype: str = "uint8", direction: np.ndarray = v.ROTATION, compress: bool = False
+) -> VolumeSequence:
+    """Let SimpleITK write the volume, with 40 ms between frames."""
+    stored = np.ascontiguousarray(np.moveaxis(v.frames(dtype), [1, 2, 3], [3, 2, 1]))
+    image = SimpleITK.GetImageFromArray(stored, isVector=False)
+    whole = np.eye(4)
+    whole[:3, :3] = direction
+    image.SetDirection(whole.ravel())
+    image.SetSpacing([*v.SPACING, 0.04])
+    image.SetOrigin([*v.ORIGIN, TIMES[0]])
+    SimpleITK.WriteImage(image, str(path), compress)
+    return VolumeSequence(v.frames(dtype), v.SPACING, direction, v.ORIGIN, TIMES)
+
+
+def read(path: Path, time_unit: str | None = "s") -> VolumeSequence:
+    return read_volume(path, modality=Modality.ULTRASOUND, time_unit=time_unit)
+
+
+@pytest.mark.parametrize("name", ["a.mha", "a.mhd"])
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("direction", [v.ROTATION, v.MIRRORED], ids=["right", "left"])
+def test_what_simpleitk_writes(
+    tmp_path: Path, name: str, compress: bool, direction: np.ndarray
+) -> None:
+    expected = write(tmp_path / name, direction=direction, compress=compress)
+    v.assert_same(read(tmp_path / name), expected)
+
+
+@pytest.mark.parametrize("dtype", ["int16", "float32", "uint16"])
+def test_types_of_voxels(tmp_path: Path, dtype: str) -> None:
+    expected = write(tmp_path / "a.mha", dtype)
+    v.assert_same(read(tmp_path / "a.mha"), expected)
+
+
+def test_the_unit_of_time_is_asked_for(tmp_path: Path) -> None:
+    write(tmp_path / "a.mha")
+    with pytest.raises(InputError, match=r"a\.mha: ElementSpacing: times without a unit"):
+        read(tmp_path / "a.mha", time_unit=None)
+
+
+def test_three_axes_are_one_frame(tmp_path: Path) -> None:
+    stored = np.ascontiguousarray(v.frames()[0].T)
+    image = SimpleITK.GetImageFromArray(stored)
+    image.SetSpacing(v.SPACING.tolist())
+    SimpleITK.WriteImage(image, str(tmp_path / "a.mha"))
+    found = read(tmp_path / "a.mha", time_unit=None)
+    np.testing.assert_array_equal(found.frames, v.frames()[:1])
+
+
+BAD = {
+    "no spacing": (r"ElementSpacing = .*\n", "", "ElementSpacing"),
+    "no direction": (r"TransformMatrix = .*\n", "", "TransformMatrix"),
+    "no origin": (r"Offset = .*\n", "", "Offset"),
+    "a spacing missing": (r"(ElementSpacing = \S+) .*", r"\1", "ElementSpacing"),
+    "negative spacing": (r"ElementSpacing = ", "ElementSpacing = -", "ElementSpacing"),
+    "absurd spacing": (r"ElementSpacing = \S+", "ElementSpacing = 11", "ElementSpacing"),
+    "absurd extent": (r"ElementSpacing = \S+", "ElementSpacing = 0.5", "ElementSpacing"),
+    "axes not at right angles": (
+        r"TransformMatrix = \S+",
+        "TransformMatrix = 2",
+        "TransformMatrix",
+    ),
+    "space and time mixed": (r"(TransformMatrix = .*) 0 1\n", r"\1 0.5 1\n", "TransformMatrix"),
+    "two axes": (r"NDims = 4", "NDims = 2", "NDims"),
+    "five axes": (r"NDims = 4", "NDims = 5", "NDims"),
+    "few voxels": (r"DimSize = \d+", "DimSize = 10", "DimSize"),
+    "absurd size": (r"DimSize = .*", "DimSize = 3000 3000 3000 30", "DimSize"),
+    "no whole number": (r"DimSize = 20", "DimSize = 20.5", "DimSize"),
+    "more voxels than bytes": (r"DimSize = 20", "DimSize = 21", "ElementDataFile"),
+    "fewer voxels than bytes": (r"DimSize = 20", "DimSize = 19", "ElementDataFile"),
+    "colour": (r"ElementType", "ElementNumberOfChannels = 3\nElementType", "ElementNumberOf"),
+    "numbers as text": (r"BinaryData = True", "BinaryData = False", "BinaryData"),
+    "no flag": (r"CompressedData = False", "CompressedData = Maybe", "CompressedData"),
+    "unknown type": (r"MET_UCHAR", "MET_LONG", "ElementType"),
+    "offset of data": (r"ElementType", "HeaderSize = 12\nElementType", "HeaderSize"),
+    "data elsewhere": (r"LOCAL", "../a.raw", "ElementDataFile"),
+    "data at an absolute path": (r"LOCAL", "/etc/hostname", "ElementDataFile"),
+    "data in several files": (r"LOCAL", "LIST", "ElementDataFile"),
+    "stated twice": (r"Offset = ", "Offset = 1 2 3 4\nOffset = ", "Offset"),
+    "1 s from frame to frame": (r"(ElementSpacing = .*) \S+\n", r"\1 1\n", "ElementSpacing"),
+    "no field": (r"Offset = ", "Offset ", "header"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
+    pattern, replacement, field = BAD[what]
+    path = tmp_path / "bad.mha"
+    write(path)
+    head, mark, voxels = path.read_bytes().partition(b"LOCAL\n")
+    text, count = re.subn(pattern, replacement, (head + mark).decode(), count=1)
+    assert count == 1
+    path.write_bytes(text.encode() + voxels)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: {field}")
+    assert ", expected " in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_a_file_cut_anywhere_is_refused(
+    tmp_path: Path, compress: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mha"
+    write(path, compress=compress)
+    whole = path.read_bytes()
+    header = whole.index(b"LOCAL\n") + 6
+    for end in [
+        *(header * n // 10 for n in range(10)),
+        *(len(whole) * n // 10 for n in range(1, 10)),
+        len(whole) - 1,
+    ]:
+        path.write_bytes(whole[:end])
+        with pytest.raises(InputError) as caught:
+            read(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_damaged_compression_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mha"
+    write(path, compress=True)
+    content = bytearray(path.read_bytes())
+    content[-2000] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.mha: ElementDataFile: \d+ bytes, then "):
+        read(path)

@@ -1,0 +1,425 @@
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.exchange.volumes.reader import read_volume
+from mvest.imaging.volume import Modality, VolumeSequence
+from tests.exchange.volumes import volumes as v
+
+
+def read(path: Path) -> VolumeSequence:
+    return read_volume(path, modality=Modality.ULTRASOUND)
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip"])
+@pytest.mark.parametrize("axis", [0, 1, 3])
+def test_the_frames_may_lie_along_any_axis(tmp_path: Path, axis: int, encoding: str) -> None:
+    fields = v.nrrd_fields(axis) | {"encoding": encoding}
+    path = v.write_nrrd(tmp_path / "a.seq.nrrd", fields, v.nrrd_voxels(axis))
+    found = read(path)
+    v.assert_same(found, v.sequence())
+    assert found.frames.flags.c_contiguous
+    assert found.source == "a.seq.nrrd"
+    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_limit_of_bytes_can_be_stated(tmp_path: Path) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields())
+    size = v.frames().size
+    assert read_volume(path, modality=Modality.MR, max_bytes=size).frames.size == size
+    with pytest.raises(InputError, match="max_bytes of read_volume"):
+        read_volume(path, modality=Modality.MR, max_bytes=size - 1)
+
+
+def test_the_content_counts_and_not_the_name(tmp_path: Path) -> None:
+    v.assert_same(read(v.write_nrrd(tmp_path / "a.nii.gz", v.nrrd_fields())), v.sequence())
+
+
+def test_a_left_handed_volume_stays_left_handed(tmp_path: Path) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields(direction=v.MIRRORED))
+    found = read(path)
+    assert np.linalg.det(found.direction) == pytest.approx(-1)
+    v.assert_same(found, v.sequence(direction=v.MIRRORED))
+
+
+@pytest.mark.parametrize(
+    ("space", "signs"),
+    [
+        ("right-anterior-superior", (-1, -1, 1)),
+        ("RAS", (-1, -1, 1)),
+        ("LAS", (1, -1, 1)),
+        ("LPS", (1, 1, 1)),
+    ],
+)
+def test_spaces_become_lps(tmp_path: Path, space: str, signs: tuple[int, int, int]) -> None:
+    fields = v.nrrd_fields(direction=v.ROTATION * np.array(signs)[:, np.newaxis])
+    fields |= {"space": space, "space origin": v.vector(v.ORIGIN * signs)}
+    v.assert_same(read(v.write_nrrd(tmp_path / "a.nrrd", fields)), v.sequence())
+
+
+def test_space_stated_twice_with_one_meaning(tmp_path: Path) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields(), extra="space: LPS\n")
+    v.assert_same(read(path), v.sequence())
+
+
+def test_carriage_returns_before_the_ends_of_lines(tmp_path: Path) -> None:
+    path = tmp_path / "a.nrrd"
+    text = v.nrrd_text(v.nrrd_fields()).replace(b"\n", b"\r\n")
+    path.write_bytes(text + v.nrrd_voxels())
+    v.assert_same(read(path), v.sequence())
+
+
+def test_milliseconds(tmp_path: Path) -> None:
+    fields = v.nrrd_fields() | {
+        "units": '"ms" "" "" ""',
+        "axis 0 index values=": "0 30 80",
+    }
+    np.testing.assert_allclose(read(v.write_nrrd(tmp_path / "a.nrrd", fields)).times, v.TIMES)
+
+
+def test_times_of_a_multivolume(tmp_path: Path) -> None:
+    fields = v.nrrd_fields()
+    del fields["axis 0 index values="], fields["axis 0 index type="], fields["units"]
+    fields["MultiVolume.FrameLabels="] = "0,30,80"
+    fields["MultiVolume.FrameIdentifyingDICOMTagUnits="] = "ms"
+    np.testing.assert_allclose(read(v.write_nrrd(tmp_path / "a.nrrd", fields)).times, v.TIMES)
+
+
+def test_time_as_an_axis_of_the_world(tmp_path: Path) -> None:
+    fields = v.nrrd_fields(3)
+    steps = (v.ROTATION * v.SPACING).T
+    vectors = [v.vector(np.append(step, 0.0)) for step in steps] + ["(0,0,0,40)"]
+    for name in ("units", "axis 3 index values=", "axis 3 index type="):
+        del fields[name]
+    fields |= {
+        "space": "left-posterior-superior-time",
+        "space directions": " ".join(vectors),
+        "space units": '"mm" "mm" "mm" "ms"',
+        "space origin": v.vector(np.append(v.ORIGIN, 0.0)),
+    }
+    found = read(v.write_nrrd(tmp_path / "a.nrrd", fields, v.nrrd_voxels(3)))
+    np.testing.assert_allclose(found.times, [0, 0.04, 0.08])
+    np.testing.assert_array_equal(found.frames, v.frames())
+
+
+def test_times_without_a_unit_take_the_users(tmp_path: Path) -> None:
+    fields = v.nrrd_fields() | {"axis 0 index values=": "0 30 80"}
+    del fields["units"]
+    path = v.write_nrrd(tmp_path / "a.nrrd", fields)
+    found = read_volume(path, modality=Modality.CT, time_unit="ms")
+    np.testing.assert_allclose(found.times, v.TIMES)
+    assert found.modality is Modality.CT
+    found = read_volume(path, modality=Modality.CT, frame_interval_s=0.05)
+    np.testing.assert_allclose(found.times, [0, 0.05, 0.1])
+    with pytest.raises(InputError, match=r"a\.nrrd: axis 0 index values: times without a unit"):
+        read(path)
+
+
+def single(encoding: str = "raw") -> tuple[dict[str, str], bytes]:
+    fields = v.nrrd_fields() | {"encoding": encoding, "dimension": "3"}
+    steps = (v.ROTATION * v.SPACING).T
+    fields |= {
+        "sizes": " ".join(map(str, v.SHAPE[1:])),
+        "kinds": "domain domain domain",
+        "space directions": " ".join(v.vector(step) for step in steps),
+    }
+    for name in ("labels", "units", "axis 0 index values=", "axis 0 index type="):
+        del fields[name]
+    return fields, v.frames()[1].tobytes(order="F")
+
+
+def test_three_axes_are_one_frame_at_zero(tmp_path: Path) -> None:
+    found = read(v.write_nrrd(tmp_path / "a.nrrd", *single()))
+    np.testing.assert_array_equal(found.frames, v.frames()[1:2])
+    assert found.times.tolist() == [0.0]
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip"])
+def test_data_beside_their_header(tmp_path: Path, encoding: str) -> None:
+    fields = v.nrrd_fields() | {"encoding": encoding, "data file": "./a.bin"}
+    attached = v.write_nrrd(tmp_path / "attached.nrrd", fields)
+    text = v.nrrd_text(fields)
+    (tmp_path / "a.bin").write_bytes(attached.read_bytes()[len(text) :])
+    header = tmp_path / "a.nhdr"
+    header.write_bytes(text)
+    found = read(header)
+    v.assert_same(found, v.sequence())
+    both = header.read_bytes() + (tmp_path / "a.bin").read_bytes()
+    assert found.sha256 == hashlib.sha256(both).hexdigest()
+
+
+def test_bytes_and_lines_before_the_data_are_skipped(tmp_path: Path) -> None:
+    (tmp_path / "a.raw").write_bytes(b"one line\n12345" + v.nrrd_voxels())
+    path = tmp_path / "a.nhdr"
+    for skips in ({"line skip": "1", "byte skip": "5"}, {"byteskip": "-1"}):
+        path.write_bytes(v.nrrd_text(v.nrrd_fields() | {"data file": "a.raw"} | skips))
+        v.assert_same(read(path), v.sequence())
+
+
+@pytest.mark.parametrize(
+    ("stored", "endian", "kind"),
+    [
+        ("uint8", "little", "uint8"),
+        ("int8", "little", "int16"),
+        ("int16", "big", "int16"),
+        ("uint16", "little", "int16"),
+        ("int32", "big", "int16"),
+        ("float32", "big", "float32"),
+        ("float64", "little", "float32"),
+    ],
+)
+def test_types_of_voxels(tmp_path: Path, stored: str, endian: str, kind: str) -> None:
+    dtype = np.dtype(stored).newbyteorder("<" if endian == "little" else ">")
+    name = {"float32": "float", "float64": "double"}.get(stored, stored)
+    expected = (v.frames("int32") - (100 if stored != "uint8" and stored[0] != "u" else 0)) // 2
+    voxels = expected.astype(dtype).tobytes(order="F")
+    fields = v.nrrd_fields() | {"type": name, "endian": endian}
+    found = read(v.write_nrrd(tmp_path / "a.nrrd", fields, voxels))
+    assert found.frames.dtype == kind
+    np.testing.assert_array_equal(found.frames, expected)
+
+
+def test_integers_beyond_two_bytes_become_floats(tmp_path: Path) -> None:
+    values = v.frames("uint16") + np.uint16(60000)
+    fields = v.nrrd_fields() | {"type": "ushort"}
+    found = read(v.write_nrrd(tmp_path / "a.nrrd", fields, values.tobytes(order="F")))
+    assert found.frames.dtype == np.float32
+    np.testing.assert_array_equal(found.frames, values)
+
+
+Change = Callable[[dict[str, str]], object]
+
+BAD: dict[str, tuple[Change, str, str]] = {
+    "colour": (
+        lambda f: f.update(kinds="RGB-color domain domain domain"),
+        "kinds",
+        "one grey value",
+    ),
+    "five axes": (lambda f: f.update(dimension="5"), "dimension", "3 (one volume) or 4"),
+    "sizes and dimension": (lambda f: f.update(sizes="3 20 24"), "sizes", "4 axes"),
+    "no sizes": (lambda f: f.pop("sizes"), "sizes", "a number for each axis"),
+    "no spacing": (lambda f: f.pop("space directions"), "space directions", "a vector in mm"),
+    "no origin": (lambda f: f.pop("space origin"), "space origin", "centre of the first voxel"),
+    "no space": (lambda f: f.pop("space"), "space", "left-posterior-superior"),
+    "unknown space": (lambda f: f.update(space="scanner-xyz"), "space", "left-posterior-superior"),
+    "all axes in space": (
+        lambda f: f.update({"space directions": "(1,0,0) (0,1,0) (0,0,1) (1,1,0)"}),
+        "space directions",
+        "three, and 'none' for the frames",
+    ),
+    "no axes at right angles": (
+        lambda f: f.update({"space directions": "none (1,0,0) (0.1,1,0) (0,0,1)"}),
+        "space directions",
+        "right angles",
+    ),
+    "spacing in cm": (
+        lambda f: f.update({"space directions": "none (0.04,0,0) (0,0.04,0) (0,0,0.04)"}),
+        "space directions",
+        "0.05 to 5 mm",
+    ),
+    "small extent": (
+        lambda f: f.update({"space directions": "none (0.1,0,0) (0,0.1,0) (0,0,0.1)"}),
+        "space directions",
+        "20 to 500 mm",
+    ),
+    "few voxels": (lambda f: f.update(sizes="3 20 24 8"), "sizes", "at least 16"),
+    "no frames": (lambda f: f.update(sizes="0 20 24 28"), "sizes", "at least one frame"),
+    "absurd size": (lambda f: f.update(sizes="300 2000 2000 2000"), "sizes", "at most 4 GiB"),
+    "origin far away": (
+        lambda f: f.update({"space origin": "(1e6,0,0)"}),
+        "space origin",
+        "coordinates in mm",
+    ),
+    "units of length": (lambda f: f.update(units='"s" "deg" "" ""'), "units", "mm"),
+    "space units": (
+        lambda f: f.update({"space units": '"mm" "inch" "mm"'}),
+        "space units",
+        "mm, cm, m or um",
+    ),
+    "time runs back": (
+        lambda f: f.update({"axis 0 index values=": "0 0.05 0.03"}),
+        "axis 0 index values",
+        "increasing times",
+    ),
+    "same time twice": (
+        lambda f: f.update({"axis 0 index values=": "0 0 0.03"}),
+        "axis 0 index values",
+        "increasing times",
+    ),
+    "ms taken for s": (
+        lambda f: f.update({"axis 0 index values=": "0 30 60"}),
+        "axis 0 index values",
+        "less than 1 s",
+    ),
+    "s taken for ms": (
+        lambda f: f.update({"units": '"ms" "" "" ""'}),
+        "axis 0 index values",
+        "at least 0.002 s",
+    ),
+    "a time is missing": (
+        lambda f: f.update({"axis 0 index values=": "0 0.03"}),
+        "axis 0 index values",
+        "one for each of 3 frames",
+    ),
+    "a time is no number": (
+        lambda f: f.update({"axis 0 index values=": "0 0.03 end"}),
+        "axis 0 index values",
+        "numbers",
+    ),
+    "a time is nan": (
+        lambda f: f.update({"axis 0 index values=": "0 nan 0.03"}),
+        "axis 0 index values",
+        "finite times",
+    ),
+    "percent of a beat": (
+        lambda f: f.update({"units": '"%" "" "" ""', "axis 0 index values=": "0 5 10"}),
+        "axis 0 index values",
+        "times in s or ms",
+    ),
+    "index of text": (
+        lambda f: f.update({"axis 0 index type=": "text"}),
+        "axis 0 index type",
+        "numeric",
+    ),
+    "a segmentation": (lambda f: f.update({"Segment0_ID=": "Leaf"}), "Segment0_ID", "an image"),
+    "a label map": (
+        lambda f: f.update({"DataNodeClassName=": "vtkMRMLLabelMapVolumeNode"}),
+        "DataNodeClassName",
+        "vtkMRMLScalarVolumeNode",
+    ),
+    "unknown modality": (
+        lambda f: f.update({"mvest.modality=": "pet"}),
+        "mvest.modality",
+        "ultrasound, ct, mr",
+    ),
+    "other encoding": (lambda f: f.update(encoding="bzip2"), "encoding", "raw or gzip"),
+    "unknown type": (lambda f: f.update(type="block"), "type", "float or double"),
+    "no order of bytes": (
+        lambda f: (f.pop("endian"), f.update(type="short")),
+        "endian",
+        "little or big",
+    ),
+    "more voxels than bytes": (
+        lambda f: f.update(sizes="3 20 24 29"),
+        "data",
+        "41760 bytes that the header says",
+    ),
+    "fewer voxels than bytes": (
+        lambda f: f.update(sizes="3 20 24 27"),
+        "data",
+        "38880 bytes that the header says",
+    ),
+    "data elsewhere": (
+        lambda f: f.update({"data file": "../a.raw"}),
+        "data file",
+        "the name of a file in the same folder",
+    ),
+    "data at an absolute path": (
+        lambda f: f.update({"data file": "/etc/hostname"}),
+        "data file",
+        "the name of a file in the same folder",
+    ),
+    "data in several files": (
+        lambda f: f.update({"data file": "LIST"}),
+        "data file",
+        "a file in the same folder",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
+    change, field, expected = BAD[what]
+    fields = v.nrrd_fields()
+    change(fields)
+    path = v.write_nrrd(tmp_path / "bad.nrrd", fields)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: {field}: ")
+    assert expected in message.partition(", expected ")[2]
+    assert "\n" not in message
+    assert len(message) < 700
+
+
+def test_a_data_file_that_is_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "out.raw").write_bytes(v.nrrd_voxels())
+    (folder / "a.raw").symlink_to(tmp_path / "out.raw")
+    (folder / "a.nhdr").write_bytes(v.nrrd_text(v.nrrd_fields() | {"data file": "a.raw"}))
+    with pytest.raises(InputError, match="data file"):
+        read(folder / "a.nhdr")
+
+
+@pytest.mark.parametrize(
+    "extra", ["space: right-anterior-superior\n", "sizes: 3 20 28 24\n", "no field\n"]
+)
+def test_a_contradiction_is_refused(tmp_path: Path, extra: str) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields(), extra=extra)
+    with pytest.raises(InputError, match=r"expected (one value|'field: value')"):
+        read(path)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_a_frame_that_shows_nothing_is_refused(tmp_path: Path, value: float) -> None:
+    voxels = v.frames("float32")
+    voxels[2] = value
+    if value:
+        voxels[2, :10] = 1.0
+    fields = v.nrrd_fields() | {"type": "float"}
+    path = v.write_nrrd(tmp_path / "a.nrrd", fields, voxels.tobytes(order="F"))
+    with pytest.raises(InputError, match=r"a\.nrrd: data: .* frame 2 are (0|no numbers), expected"):
+        read(path)
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip"])
+def test_a_file_cut_anywhere_is_refused(tmp_path: Path, encoding: str) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields() | {"encoding": encoding})
+    whole = path.read_bytes()
+    header = len(v.nrrd_text(v.nrrd_fields() | {"encoding": encoding}))
+    places = [header * n // 10 for n in range(10)] + [len(whole) * n // 10 for n in range(1, 10)]
+    for end in [*places, len(whole) - 1]:
+        path.write_bytes(whole[:end])
+        with pytest.raises(InputError) as caught:
+            read(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_damaged_compression_is_refused(tmp_path: Path) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields() | {"encoding": "gzip"})
+    content = bytearray(path.read_bytes())
+    content[-2000] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.nrrd: data: \d+ bytes, then "):
+        read(path)
+
+
+def test_a_header_without_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.nrrd"
+    path.write_bytes(b"NRRD0005\n" + b"# more\n" * 200_000)
+    with pytest.raises(InputError, match=r"header: no end in 1048576 bytes"):
+        read(path)
+
+
+def test_what_the_file_states_is_not_contradicted(tmp_path: Path) -> None:
+    fields = v.nrrd_fields() | {"mvest.modality=": "ct"}
+    path = v.write_nrrd(tmp_path / "a.nrrd", fields)
+    assert read_volume(path).modality is Modality.CT
+    with pytest.raises(InputError, match=r"modality: mr, but .*a\.nrrd states ct"):
+        read_volume(path, modality=Modality.MR)
+    with pytest.raises(InputError, match=r"frame_interval_s: .*a\.nrrd states its own times"):
+        read_volume(path, frame_interval_s=0.03)
+    with pytest.raises(InputError, match=r"time_unit: 'ms', but .*a\.nrrd states 's'"):
+        read_volume(path, time_unit="ms")
+
+
+def test_modality_must_be_known(tmp_path: Path) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields())
+    with pytest.raises(InputError, match=r"a\.nrrd: modality: not stated .* ultrasound, ct, mr"):
+        read_volume(path)
