@@ -1,0 +1,393 @@
+"""Meshes in the files of others, for the child (`mvest.exchange.child`): all end as VTK's objects.
+
+VTK reads its own formats, trimesh GLB. STL, OBJ and PLY are read here: VTK takes binary STL files
+that are cut off, and drops the groups of OBJ files and the properties of PLY files; trimesh reads
+no binary PLY files that mix triangles and quadrilaterals.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+
+Arrays = Mapping[str, NDArray[np.generic]]
+LINES, STRIPS, POLYGONS = (3, 4), (6,), (5, 7, 9)
+FLAT = (1, 2, *LINES, *STRIPS, *POLYGONS)
+"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves."""
+
+
+def read_cells(path: Path, suffix: str) -> dict[str, Any]:
+    """The fields of `mvest.exchange.surfaces.Mesh` for a file of this kind.
+
+    Raises
+    ------
+    InputError, GeometryError
+        A damaged file, no points, or cells that name points that do not exist.
+    """
+    data, groups = _READERS[suffix](path)
+    if not data.GetNumberOfPoints():
+        raise InputError("damaged or empty: no points, expected a surface")
+    points = _numpy(data.GetPoints().GetData()).astype(np.float64)
+    types, sizes, corners = _cells(data, len(points))
+    triangles, rows = _triangles(points, types, sizes, corners)
+    at_points, at_cells = _arrays(data.GetPointData()), _arrays(data.GetCellData())
+    for what, count, arrays in (
+        ("points", len(points), at_points),
+        ("cells", len(types), at_cells),
+    ):
+        for name, values in arrays.items():
+            if len(values) != count:
+                raise InputError(f"data {name!r} has {len(values)} rows, expected {count} {what}")
+    line = np.isin(types, LINES)
+    line_ends = np.cumsum(sizes[line])[:-1]
+    numbers, counts = np.unique(types[~np.isin(types, FLAT)], return_counts=True)
+    name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
+    names = [name_of(number).removeprefix("vtk").lower() for number in numbers.tolist()]
+    field_data = _arrays(data.GetFieldData())
+    with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
+        words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
+    return {
+        "points": points,
+        "triangles": triangles,
+        "lines": np.split(corners[np.repeat(line, sizes)], line_ends) if line.any() else [],
+        "others": dict(zip(names, counts.tolist(), strict=True)),
+        "point_data": at_points,
+        "cell_data": {name: values[rows] for name, values in at_cells.items()},
+        "field_data": field_data,
+        "space": words[1].decode() if words else field_data.get("SPACE"),
+        "groups": [groups[row] for row in rows.tolist()] if groups else [],
+    }
+
+
+def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Types and sizes ``(c,)`` of all cells, and their corners one after another."""
+    if data.IsA("vtkPolyData"):
+        parts = [data.GetVerts(), data.GetLines(), data.GetPolys(), data.GetStrips()]
+        types = np.repeat([2, 4, 7, 6], [part.GetNumberOfCells() for part in parts])
+    else:
+        parts = [data.GetCells()]
+        types = np.zeros(0) if not data.GetNumberOfCells() else _numpy(data.GetCellTypesArray())
+    ends = [_numpy(part.GetOffsetsArray()) for part in parts]
+    corners = np.concatenate([_numpy(part.GetConnectivityArray()) for part in parts])
+    whole = all(part.IsValid() for part in parts)
+    if not whole or (len(corners) and not 0 <= corners.min() <= corners.max() < count):
+        raise GeometryError("cells name points that do not exist")
+    sizes = np.concatenate([np.diff(part) for part in ends])
+    return types.astype(np.int64), sizes.astype(np.int64), corners.astype(np.int64)
+
+
+def _triangles(
+    points: FloatArray, types: IntArray, sizes: IntArray, corners: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Triangles ``(m, 3)`` of polygons and strips, and the number ``(m,)`` of each one's cell.
+
+    VTK cuts polygons, not strips: vtkTriangleFilter 9.7 mistakes the cells of these.
+    """
+    polygon = np.isin(types, POLYGONS) & (sizes > 2)
+    flat, rows = corners[np.repeat(polygon, sizes)], np.flatnonzero(polygon)
+    if (sizes[polygon] != 3).any():
+        cutter = vtk_module("vtkFiltersCore").vtkTriangleFilter()
+        cutter.SetInputData(polydata(points, flat, sizes[polygon], cell_data={"row": rows}))
+        cutter.Update()
+        flat = _numpy(cutter.GetOutput().GetPolys().GetConnectivityArray())
+        rows = _numpy(cutter.GetOutput().GetCellData().GetArray("row"))
+    parts, cells = [flat.reshape(-1, 3)], [rows]
+    ends = np.cumsum(sizes)
+    for cell in np.flatnonzero(np.isin(types, STRIPS)):
+        strip = corners[ends[cell] - sizes[cell] : ends[cell]]
+        part = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
+        part[1::2] = part[1::2][:, [1, 0, 2]]  # every second one faces the other way
+        parts.append(part)
+        cells.append(np.full(len(part), cell))
+    rows = np.concatenate(cells)
+    order = np.argsort(rows, kind="stable")
+    return np.concatenate(parts)[order].astype(np.int64), rows[order]
+
+
+def vtk_module(name: str) -> Any:
+    """One of VTK's modules; they are imported singly, as all of them take a second."""
+    return importlib.import_module(f"vtkmodules.{name}")
+
+
+def _numpy(array: Any) -> NDArray[Any]:
+    result: NDArray[Any] = vtk_module("util.numpy_support").vtk_to_numpy(array)
+    return result
+
+
+def _add(into: Any, arrays: Arrays) -> None:
+    for name, values in arrays.items():
+        column = vtk_module("util.numpy_support").numpy_to_vtk(values, deep=1)
+        column.SetName(name)
+        into.AddArray(column)
+
+
+def polydata(
+    points: FloatArray,
+    corners: IntArray,
+    sizes: IntArray,
+    point_data: Arrays | None = None,
+    cell_data: Arrays | None = None,
+) -> Any:
+    """VTK's object of polygons: their corners one after another, and how many each has."""
+    convert, model = vtk_module("util.numpy_support"), vtk_module("vtkCommonDataModel")
+    result, cells = model.vtkPolyData(), model.vtkCellArray()
+    places = vtk_module("vtkCommonCore").vtkPoints()
+    places.SetData(convert.numpy_to_vtk(points, deep=1))
+    ends = np.concatenate([[0], np.cumsum(sizes)])
+    cells.SetData(*(convert.numpy_to_vtkIdTypeArray(k, deep=1) for k in (ends, corners)))
+    result.SetPoints(places)
+    result.SetPolys(cells)
+    _add(result.GetPointData(), point_data or {})
+    _add(result.GetCellData(), cell_data or {})
+    return result
+
+
+def _arrays(data: Any) -> dict[str, Any]:
+    """Arrays of numbers by their names, and text that is one word."""
+    result: dict[str, Any] = {}
+    for number in range(data.GetNumberOfArrays()):
+        array, name = data.GetAbstractArray(number), data.GetArrayName(number) or ""
+        if array.IsA("vtkStringArray"):
+            if array.GetNumberOfValues() == 1:
+                result[name] = array.GetValue(0)
+        elif array.IsA("vtkDataArray") and not array.IsA("vtkBitArray"):
+            result[name] = _numpy(array)
+    return result
+
+
+def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
+    """What one of VTK's readers reads; what it says of errors, some as warnings, is raised."""
+    said: list[str] = []
+
+    def heard(_window: object, event: str, text: str) -> None:
+        # Warnings are of damage too; ranges that VTK notes beside an array may be infinite.
+        if ("Error reading" in text or event == "ErrorEvent") and "InformationKey" not in text:
+            said.append(text)
+
+    heard.CallDataType = "string0"  # type: ignore[attr-defined]
+    window = vtk_module("vtkCommonCore").vtkOutputWindow.GetInstance()
+    tags = [window.AddObserver(event, heard) for event in ("ErrorEvent", "WarningEvent")]
+    reader = getattr(vtk_module(module), name)()
+    reader.SetFileName(str(path))
+    if module == "vtkIOLegacy":
+        _prepare_legacy(reader, path.read_bytes())
+    reader.Update()
+    for tag in tags:
+        window.RemoveObserver(tag)
+    if said:
+        words = re.sub(r"^.*?, line [0-9]+\s", "", said[0], flags=re.S)
+        raise InputError(f"damaged: {re.sub(r'^vtk[^:]*0x[0-9a-f]+.: ', '', words)}")
+    data = reader.GetOutput()
+    if data is None or not (data.IsA("vtkPolyData") or data.IsA("vtkUnstructuredGrid")):
+        kind = data.GetClassName().removeprefix("vtk") if data else "nothing"
+        raise InputError(f"holds {kind}, expected PolyData or an UnstructuredGrid")
+    return data, []
+
+
+def _prepare_legacy(reader: Any, content: bytes) -> None:
+    """Have all arrays read, and numbers that are missing at the end of a text noticed.
+
+    VTK 9.7 makes numbers up where a text ends too early, but not where it meets a word instead. So
+    a field without arrays follows.
+    """
+    for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
+        getattr(reader, f"ReadAll{what}On")()
+    if b"ASCII" in b"".join(content[:1024].upper().splitlines()[2:3]):
+        reader.ReadFromInputStringOn()
+        reader.SetInputString(content.decode("latin-1") + "\nFIELD end 0\n")
+
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_HEADER = 84
+
+
+def _stl(path: Path) -> tuple[Any, list[str]]:
+    """An STL file, its triangles sharing the corners that are equal to the last digit."""
+    content = path.read_bytes()
+    count = int.from_bytes(content[80:_STL_HEADER], "little")
+    whole = _STL_HEADER + count * _FACET.itemsize
+    if len(content) == whole or (len(content) > whole and b"\0" in content[:_STL_HEADER]):
+        corners = np.frombuffer(content, _FACET, count, _STL_HEADER)["corners"].astype(np.float64)
+    elif content.lstrip()[:5].lower() == b"solid":
+        words = content.lower().split()
+        at = [k for k, word in enumerate(words) if word == b"vertex"]
+        if words.count(b"endloop") * 3 != len(at) or b"endsolid" not in words:
+            raise InputError(f"{len(at)} corners, expected three of each facet and endsolid")
+        corners = np.array([float(word) for k in at for word in words[k + 1 : k + 4]])
+    else:
+        raise InputError(f"{len(content)} bytes, expected {whole} for {count} triangles")
+    points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return polydata(points, numbers.ravel(), np.full(numbers.size // 3, 3)), []
+
+
+def _obj(path: Path) -> tuple[Any, list[str]]:
+    """An OBJ file with the names of its groups, or of its objects where there are no groups."""
+    points: list[tuple[float, float, float]] = []
+    corners: list[int] = []
+    sizes: list[int] = []
+    groups: dict[str, list[str]] = {"g": [], "o": []}
+    now = {"g": "", "o": ""}
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    for line in text.splitlines():
+        word, *rest = line.partition("#")[0].split() or [""]
+        if word == "v":
+            x, y, z, *_ = rest
+            points.append((float(x), float(y), float(z)))
+        elif word == "f":
+            face = [int(corner.split("/")[0]) for corner in rest]
+            # A negative number counts from the last vertex so far; none is 0.
+            corners += [k - 1 if k >= 0 else len(points) + k for k in face]
+            sizes.append(len(face))
+            for kind, name in now.items():
+                groups[kind].append(name)
+        elif word in now:
+            now[word] = " ".join(rest)
+    named = groups["g"] if any(groups["g"]) else groups["o"]
+    surface = polydata(
+        np.array(points).reshape(-1, 3),
+        np.array(corners, dtype=np.int64),
+        np.array(sizes, dtype=np.int64),
+    )
+    return surface, named if any(named) else []
+
+
+_PLY_TYPES = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
+"""That NumPy does not know, or takes for larger ones."""
+_PLY_ORDER: dict[str, Literal["=", "<", ">"]] = {
+    "ascii": "=",
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
+}
+
+
+def _ply(path: Path) -> tuple[Any, list[str]]:
+    """A PLY file with the properties of its vertices and faces."""
+    head, mark, body = path.read_bytes().partition(b"end_header")
+    lines = [line.split() for line in head.decode("latin-1").splitlines()]
+    if not mark or lines[:1] != [["ply"]]:
+        raise InputError("damaged or no PLY file: no header from 'ply' to 'end_header'")
+    body = body.partition(b"\n")[2]
+    form = next(words[1] for words in lines if words[:1] == ["format"])
+    if form == "ascii":  # every number takes eight bytes then
+        body = np.array(body.split(), dtype="f8").tobytes()
+    elements: dict[str, tuple[int, list[tuple[str, list[np.dtype[Any]]]]]] = {}
+    for words in lines:
+        if words[:1] == ["element"]:
+            elements[words[1]] = (int(words[2]), [])
+        elif words[:1] == ["property"]:
+            kinds = [_PLY_TYPES.get(word, word) for word in words[1:-1] if word != "list"]
+            kinds = ["f8"] * len(kinds) if form == "ascii" else kinds
+            types = [np.dtype(kind).newbyteorder(_PLY_ORDER[form]) for kind in kinds]
+            list(elements.values())[-1][1].append((words[-1], types))
+    tables: dict[str, dict[str, NDArray[Any]]] = {}
+    at = 0
+    for name, (count, properties) in elements.items():
+        tables[name], at = _ply_columns(body, at, count, properties)
+    if form == "ascii" and at < len(body):
+        raise InputError(f"holds {(len(body) - at) // 8} numbers more than its header says")
+    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    if not {"x", "y", "z"} <= set(vertex):
+        raise InputError("no element vertex with x, y and z")
+    name = "vertex_index" if "vertex_index" in face else "vertex_indices"
+    none = np.zeros(0, dtype=np.int64)
+    single = [
+        {key: v for key, v in table.items() if f"{key} size" not in table and key[-5:] != " size"}
+        for table in (vertex, face)
+    ]
+    return polydata(
+        np.column_stack([single[0].pop(axis).astype(np.float64) for axis in "xyz"]),
+        face.get(name, none).astype(np.int64),
+        face.get(f"{name} size", none).astype(np.int64),
+        *single,
+    ), []
+
+
+def _ply_columns(
+    body: bytes, at: int, count: int, properties: list[tuple[str, list[np.dtype[Any]]]]
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Columns of an element, and where the next one begins.
+
+    Of a list there are two: its lengths, and under its name all its numbers one after another.
+    Rows whose lists are as long as those of the first are read at once.
+    """
+    runs: list[NDArray[Any]] = []
+    ahead = 16
+    while count:
+        fields: list[tuple[str, np.dtype[Any], tuple[int, ...]]] = []
+        for name, types in properties:
+            shape: tuple[int, ...] = ()
+            if len(types) == 2:
+                size = np.frombuffer(body, types[0], 1, at + np.dtype(fields).itemsize)[0]
+                fields.append((f"{name} size", types[0], ()))
+                shape = (int(size),)
+            fields.append((name, types[-1], shape))
+        row = np.dtype(fields)
+        rows = min(count, ahead, (len(body) - at) // row.itemsize)
+        if not rows:
+            raise InputError(f"ends {count} rows too early")
+        table = np.frombuffer(body, row, rows, at)
+        sizes = [table[name] == table[name][0] for name, _, _ in fields if name[-5:] == " size"]
+        alike = np.all(sizes, axis=0) if sizes else np.ones(rows, dtype=np.bool_)
+        run = rows if alike.all() else int(np.argmin(alike))
+        ahead = 2 * ahead if run == rows else 16
+        runs.append(table[:run])
+        at, count = at + run * row.itemsize, count - run
+    names = (runs[0].dtype.names or ()) if runs else ()
+    columns = {name: np.concatenate([run[name].ravel() for run in runs]) for name in names}
+    return {k: v.astype(v.dtype.newbyteorder("=")) for k, v in columns.items()}, at
+
+
+def _glb(path: Path) -> tuple[Any, list[str]]:
+    """All objects of a scene where its nodes place them, by the names of the nodes or meshes."""
+    import trimesh
+
+    content = path.read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    needed = list(map(str, document.get("extensionsRequired", [])))
+    if any("sparse" in array or "bufferView" not in array for array in document["accessors"]):
+        needed.append("sparse or compressed arrays")  # which trimesh reads as zeros
+    if needed:
+        words = ", ".join(needed)
+        raise InputError(f"needs {words} of glTF; save it without compression or extensions")
+    # A stream without a name: arrays in other files are not followed.
+    scene = trimesh.load_scene(
+        io.BytesIO(content), file_type="glb", skip_materials=True, process=False
+    )
+    points: list[FloatArray] = [np.zeros((0, 3))]
+    faces: list[IntArray] = [np.zeros((0, 3), dtype=np.int64)]
+    names: list[str] = []
+    for node in map(str, reversed(list(scene.graph.nodes_geometry))):
+        transform, geometry = scene.graph[node]
+        part = scene.geometry[geometry].copy()
+        if isinstance(part, trimesh.Trimesh):
+            part.apply_transform(transform)
+            faces.append(sum(map(len, points)) + np.asarray(part.faces))
+            points.append(np.asarray(part.vertices, dtype=np.float64))
+            if part.metadata["from_gltf_primitive"]:  # one of several of its node
+                node = str(scene.graph.transforms.parents[node])
+            names += [str(geometry) if node.isdecimal() else node] * len(part.faces)
+    corners = np.concatenate(faces).ravel()
+    return polydata(np.concatenate(points), corners, np.full(len(names), 3)), names
+
+
+_READERS: dict[str, Callable[[Path], tuple[Any, list[str]]]] = {
+    ".vtk": partial(_vtk, module="vtkIOLegacy", name="vtkGenericDataObjectReader"),
+    ".vtp": partial(_vtk, module="vtkIOXML", name="vtkXMLPolyDataReader"),
+    ".vtu": partial(_vtk, module="vtkIOXML", name="vtkXMLUnstructuredGridReader"),
+    ".stl": _stl,
+    ".obj": _obj,
+    ".ply": _ply,
+    ".glb": _glb,
+}
