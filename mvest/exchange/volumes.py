@@ -330,9 +330,7 @@ def _times(
         raise fault(path, field, found, expected)
     steps, low, high = np.diff(times), MIN_INTERVAL_S, MAX_INTERVAL_S
     if times.shape != (count,) or not np.isfinite(times).all():
-        raise fault(
-            path, field, f"times {_numbers(times)}", f"a finite one of each of {count} frames"
-        )
+        raise fault(path, field, _numbers(times), f"a time of each of {count} frames")
     if not ((steps >= low) & (steps < high)).all():
         expected = f"increasing times, by at least {low:g} s and less than {high:g} s"
         raise fault(path, field, f"{_numbers(times)} s", expected)
