@@ -43,6 +43,8 @@ FILES = (
     "mvest.exchange.surfaces",
     "mvest.exchange.regions",
     "mvest.exchange.volumes",
+    "mvest.exchange._images",
+    "mvest.exchange._plausible",
     "mvest.exchange.segmentations",
     "mvest.exchange.markups",
 )
