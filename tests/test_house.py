@@ -44,6 +44,7 @@ FILES = (
     "mvest.exchange.regions",
     "mvest.exchange.volumes",
     "mvest.exchange._images",
+    "mvest.exchange._nrrd",
     "mvest.exchange._plausible",
     "mvest.exchange.segmentations",
     "mvest.exchange.markups",

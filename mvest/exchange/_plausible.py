@@ -7,15 +7,31 @@ and emptier than an image.
 
 from __future__ import annotations
 
+import gzip
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.exchange._images import MODALITY_KEY, Stated, Voxels, check, fault, opened
+from mvest.exchange._images import (
+    Opened,
+    Stated,
+    Voxels,
+    check,
+    fault,
+    metaimage,
+    nifti,
+    philips,
+)
+from mvest.exchange._nrrd import MODALITY_KEY, nrrd_file
 from mvest.imaging.volume import Modality
 from mvest.typing import FloatArray
+
+READABLE = "NRRD, MetaImage, NIfTI or Philips Cartesian DICOM"
+MAX_HEADER = 2**20
+"""Bytes within which a header ends."""
 
 SECONDS_PER_UNIT = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
@@ -58,7 +74,7 @@ def image(
     InputError
         See `mvest.exchange.volumes.read_volume`.
     """
-    stated, _ = opened(path)
+    stated, _ = _opened(path)
     check(not stated.labels, stated.labels, "a segmentation or label map", "an image")
     return _common(stated, MIN_VOXELS, EXTENT_MM, max_bytes) | {
         "times": _times(stated, frame_interval_s, time_unit),
@@ -74,7 +90,7 @@ def label_map(path: Path, max_bytes: int) -> dict[str, Any]:
     InputError
         See `mvest.exchange.volumes.read_labels`.
     """
-    stated, _ = opened(path)
+    stated, _ = _opened(path)
     check(not stated.modality, "modality", stated.modality, "a label map, no image")
     about = _common(stated, MIN_LABELS, LABELS_MM, max_bytes)
     times = None
@@ -98,7 +114,7 @@ def image_values(path: Path) -> Voxels:
     InputError
         Damaged data, a frame without contrast, values that are no numbers.
     """
-    stated, load = opened(path)
+    stated, load = _opened(path)
     field, frames = stated.names[3], np.ascontiguousarray(load())
     lows, highs = (f(frames, axis=(1, 2, 3)).astype(np.float64) for f in (np.min, np.max))
     for number, (low, high) in enumerate(zip(lows, highs, strict=True)):
@@ -125,7 +141,7 @@ def label_values(path: Path) -> Voxels:
     InputError
         Damaged data, no label at all, or values that are no whole numbers.
     """
-    stated, load = opened(path)
+    stated, load = _opened(path)
     field, frames = stated.names[3], np.ascontiguousarray(load())
     if frames.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
@@ -144,7 +160,32 @@ def data_file(path: Path) -> str:
     InputError
         The file cannot be read, or names no file in its own folder.
     """
-    return opened(path)[0].data_file
+    return _opened(path)[0].data_file
+
+
+def _opened(path: Path) -> Opened:
+    """What a file states and how its voxels are read; its content counts, not its name.
+
+    Raises
+    ------
+    InputError
+        A format that is not read, or a field that is missing, damaged or not supported. The
+        function that reads voxels raises it if there are fewer or more than the header says.
+    """
+    with path.open("rb") as file:
+        head = begin = file.read(MAX_HEADER)
+    if head[:2] == b"\x1f\x8b":
+        with gzip.open(path) as stream:
+            begin = stream.read(540)
+    if head.startswith(b"NRRD"):
+        return nrrd_file(path, head)
+    if begin[344:347] in (b"n+1", b"ni1") or begin[4:7] in (b"n+2", b"ni2"):
+        return nifti(path, begin)
+    if head[128:132] == b"DICM" or head[:2] in (b"\x08\x00", b"\x02\x00"):
+        return philips(path)
+    if re.match(rb"\s*(ObjectType|NDims|Comment)\s*=", head) and b"ElementDataFile" in head:
+        return metaimage(path, head)
+    raise fault("content", f"{head[:8]!r}", READABLE)
 
 
 def _common(

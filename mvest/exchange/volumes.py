@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from mvest.errors import InputError
 from mvest.exchange import _plausible
-from mvest.exchange._images import READABLE
 from mvest.exchange.child import in_child
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
@@ -122,7 +121,7 @@ def read_volume(
     source = Path(path)
     if source.is_dir():
         convert = "convert a DICOM series with 3D Slicer, to .nrrd or .seq.nrrd"
-        raise InputError(f"{source}: a folder, expected one file: {READABLE}; {convert}")
+        raise InputError(f"{source}: a folder, expected one file: {_plausible.READABLE}; {convert}")
     options = (None if modality is None else modality.value, frame_interval_s, time_unit, max_bytes)
     about = in_child(_plausible.image, source, *options)
     about["modality"] = Modality(about["modality"])

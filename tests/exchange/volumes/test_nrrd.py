@@ -336,7 +336,7 @@ def test_a_frame_that_shows_nothing_is_refused(tmp_path: Path, value: float) -> 
         voxels[2, :10] = 1.0
     fields = v.nrrd_fields() | {"type": "float"}
     path = v.write_nrrd(tmp_path / "a.nrrd", fields, voxels.tobytes(order="F"))
-    with pytest.raises(InputError, match=r"a\.nrrd: data: .* frame 2 (are 0|that are no numbers), expected"):
+    with pytest.raises(InputError, match=r"a\.nrrd: data: .* frame 2 (are 0|that are no)"):
         read(path)
 
 
