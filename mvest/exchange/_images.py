@@ -227,7 +227,8 @@ def metaimage(path: Path, head: bytes) -> Opened:
 #
 # How the volume lies in the patient is not stated. It is placed as SlicerHeart places it
 # (DicomUltrasoundPlugin.py: an image of these spacings without origin or directions, which in 3D
-# Slicer is RAS), so that landmarks from 3D Slicer fit.
+# Slicer is RAS), so that landmarks from 3D Slicer fit. ITK-SNAP (GuidedNativeImageIO.cxx) has the
+# same origin, and rows and slices the other way.
 
 PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 PHILIPS_DIRECTION = np.diag([-1.0, -1.0, 1.0])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,106 +61,74 @@ ORTHOGONAL = 1e-3
 """Largest cosine between axes, which files give with three digits or more."""
 
 
-def image(
+def about(
     path: Path,
-    modality: str | None,
-    frame_interval_s: float | None,
-    time_unit: str | None,
+    labels: bool,
     max_bytes: int,
+    modality: str | None = None,
+    frame_interval_s: float | None = None,
+    time_unit: str | None = None,
 ) -> dict[str, Any]:
-    """What a file and its user state of an image: `_common` with times ``(F,)`` s and modality.
+    """What a file and its user state of an image or of labels, once all of it is plausible.
+
+    That is its spacing, direction, origin and times, the bytes of its voxels and the name of its
+    data file; the modality of an image; segments of labels, and whether their frames are layers.
 
     Raises
     ------
     InputError
-        See `mvest.exchange.volumes.read_volume`.
+        See `mvest.exchange.volumes`.
     """
     stated, _ = _opened(path)
-    check(not stated.labels, stated.labels, "a segmentation or label map", "an image")
-    return _common(stated, MIN_VOXELS, EXTENT_MM, max_bytes) | {
-        "times": _times(stated, frame_interval_s, time_unit),
-        "modality": _modality(stated.modality, modality),
-    }
-
-
-def label_map(path: Path, max_bytes: int) -> dict[str, Any]:
-    """What a file states of labels: `_common` with times ``(F,)`` s or None, and segments.
-
-    Raises
-    ------
-    InputError
-        See `mvest.exchange.volumes.read_labels`.
-    """
-    stated, _ = _opened(path)
+    result = _common(stated, labels, max_bytes)
+    if not labels:
+        check(not stated.labels, stated.labels, "a segmentation or label map", "an image")
+        result["times"] = _times(stated, frame_interval_s, time_unit)
+        return result | {"modality": _modality(stated.modality, modality)}
     check(not stated.modality, "modality", stated.modality, "a label map, no image")
-    about = _common(stated, MIN_LABELS, LABELS_MM, max_bytes)
-    times = None
-    if stated.times is not None and not stated.is_layers:
-        try:
-            times = _times(stated, None, None)
-        except InputError:
-            times = None  # as many programs write where they know none
-    return about | {
-        "times": times,
-        "segments": stated.segments,
-        "is_layers": stated.is_layers,
-    }
+    result |= {"times": None, "segments": stated.segments, "is_layers": stated.is_layers}
+    # Many programs write times that no heart has where they know none.
+    with suppress(InputError):
+        if stated.times is not None and not stated.is_layers:
+            result["times"] = _times(stated, None, None)
+    return result
 
 
-def image_values(path: Path) -> Voxels:
-    """Frames ``(F, I, J, K)`` of uint8, int16 or float32, each of which shows something.
+def values(path: Path, labels: bool) -> Voxels:
+    """Voxels ``(F, I, J, K)``: integers of labels; uint8, int16 or float32 of an image.
 
     Raises
     ------
     InputError
-        Damaged data, a frame without contrast, values that are no numbers.
+        Damaged data; of an image a frame without contrast, or values that are no numbers; no label
+        at all, or labels that are no whole numbers.
     """
     stated, load = _opened(path)
     field, frames = stated.names[3], np.ascontiguousarray(load())
+    if labels:
+        with np.errstate(invalid="ignore"):
+            whole = frames.astype(np.int32) if frames.dtype.kind == "f" else frames
+        check((whole == frames).all(), field, "other numbers", "whole numbers, the labels")
+        check(whole.any(), field, "all voxels are 0", "labels from 1 on")
+        return whole.astype(whole.dtype.newbyteorder("="), copy=False)
     lows, highs = (f(frames, axis=(1, 2, 3)).astype(np.float64) for f in (np.min, np.max))
     for number, (low, high) in enumerate(zip(lows, highs, strict=True)):
         finite = np.isfinite(low) and np.isfinite(high)
         check(finite, field, f"voxels of frame {number} that are no numbers", "numbers")
         found = f"all voxels of frame {number} are {low:g}"
         check(low < high, field, found, "an image in every frame")
-    limits = np.iinfo(np.int16)
+    limits, largest = np.iinfo(np.int16), max(-lows.min(), highs.max())
     if frames.dtype == np.uint8:
         return frames
     if frames.dtype.kind in "iu" and lows.min() >= limits.min and highs.max() <= limits.max:
         return frames.astype(np.int16, copy=False)
-    largest = max(-lows.min(), highs.max())
     fits = largest <= np.finfo(np.float32).max
     check(fits, field, f"{largest:g}", "numbers in the range of 4 bytes")
     return frames.astype(np.float32, copy=False)
 
 
-def label_values(path: Path) -> Voxels:
-    """Labels ``(F, I, J, K)``, integers.
-
-    Raises
-    ------
-    InputError
-        Damaged data, no label at all, or values that are no whole numbers.
-    """
-    stated, load = _opened(path)
-    field, frames = stated.names[3], np.ascontiguousarray(load())
-    if frames.dtype.kind == "f":
-        with np.errstate(invalid="ignore"):
-            whole = frames.astype(np.int32)
-        check((whole == frames).all(), field, "other numbers", "whole numbers, the labels")
-        frames = whole
-    check(frames.any(), field, "all voxels are 0", "labels from 1 on")
-    return frames.astype(frames.dtype.newbyteorder("="), copy=False)
-
-
 def data_file(path: Path) -> str:
-    """Name of the file beside a header that holds its voxels; empty if there is none.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or names no file in its own folder.
-    """
+    """Name of the file beside a header that holds its voxels; empty if there is none."""
     return _opened(path)[0].data_file
 
 
@@ -188,13 +157,12 @@ def _opened(path: Path) -> Opened:
     raise fault("content", f"{head[:8]!r}", READABLE)
 
 
-def _common(
-    stated: Stated, min_voxels: int, extent_mm: tuple[float, float], max_bytes: int
-) -> dict[str, Any]:
+def _common(stated: Stated, labels: bool, max_bytes: int) -> dict[str, Any]:
     """Place of a volume that is plausible, the bytes of its voxels, and its data file's name.
 
     A left-handed system stays one.
     """
+    min_voxels, extent_mm = (MIN_LABELS, LABELS_MM) if labels else (MIN_VOXELS, EXTENT_MM)
     (size, place, origin, values, _), shape = stated.names, stated.shape
     counted = f"{' x '.join(map(str, shape))} frames and voxels"
     enough = shape[0] >= 1 and min(shape[1:]) >= min_voxels
@@ -234,14 +202,7 @@ def _words(values: FloatArray) -> str:
 
 
 def _times(stated: Stated, frame_interval_s: float | None, time_unit: str | None) -> FloatArray:
-    """Times ``(F,)`` s of the frames; a single frame without a time is at 0.
-
-    Raises
-    ------
-    InputError
-        Times without unit, or none at all, and the user did not say; the user contradicts the file;
-        times that do not increase, or by steps that no recording of a heart has.
-    """
+    """Times ``(F,)`` s of the frames; a single frame without a time is at 0."""
     field, count, given = stated.names[4], stated.shape[0], stated.times
     unit = SECONDS_PER_UNIT.get(stated.unit.lower())
     if frame_interval_s is not None:

@@ -8,7 +8,6 @@ first what it states, then its voxels within a limit of memory that follows from
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,11 +121,11 @@ def read_volume(
     if source.is_dir():
         convert = "convert a DICOM series with 3D Slicer, to .nrrd or .seq.nrrd"
         raise InputError(f"{source}: a folder, expected one file: {_plausible.READABLE}; {convert}")
-    options = (None if modality is None else modality.value, frame_interval_s, time_unit, max_bytes)
-    about = in_child(_plausible.image, source, *options)
-    about["modality"] = Modality(about["modality"])
-    voxels = _with_voxels(source, about, _plausible.image_values)
-    return VolumeSequence(**about, **voxels, source=source.name)
+    name = None if modality is None else modality.value
+    found = _read(source, False, max_bytes, name, frame_interval_s, time_unit)
+    return VolumeSequence(
+        **found | {"modality": Modality(found["modality"]), "source": source.name}
+    )
 
 
 def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
@@ -139,11 +138,9 @@ def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
     InputError
         As `read_volume`; an image, no label at all, or values that are no whole numbers.
     """
-    source = Path(path)
-    about = in_child(_plausible.label_map, source, max_bytes)
-    about["segments"] = tuple(Segment(*segment) for segment in about["segments"])
-    voxels = _with_voxels(source, about, _plausible.label_values)
-    return LabelMap(**about, **voxels)
+    found = _read(Path(path), True, max_bytes)
+    segments = tuple(Segment(*segment) for segment in found["segments"])
+    return LabelMap(**found | {"segments": segments})
 
 
 def files_of_volume(path: Path) -> dict[str, Path]:
@@ -159,16 +156,16 @@ def _files(path: Path, data_file: str) -> list[Path]:
     return [path, path.resolve().parent / data_file] if data_file else [path]
 
 
-def _with_voxels(path: Path, about: dict[str, Any], values: Callable[..., Any]) -> dict[str, Any]:
-    """Frames ``(F, I, J, K)``, and the SHA-256 of the bytes of the file and its data file."""
-    size, data_file = about.pop("bytes"), about.pop("data_file")
-    limits = {
-        "memory_gb": round(COPIES * size / 2**30 + 1, 1),
-        "seconds": 60 + size // BYTES_PER_SECOND,
-    }
+def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
+    """What a file states, its voxels, and the SHA-256 of all of its bytes."""
+    found: dict[str, Any] = in_child(_plausible.about, path, labels, *options)
+    size, files = found.pop("bytes"), _files(path, found.pop("data_file"))
+    memory_gb = round(COPIES * size / 2**30 + 1, 1)
+    limits = {"memory_gb": memory_gb, "seconds": 60 + size // BYTES_PER_SECOND}
     digest = hashlib.sha256()
-    for source in _files(path, data_file):
+    for source in files:
         with source.open("rb") as file:
             while chunk := file.read(2**20):
                 digest.update(chunk)
-    return {"frames": in_child(values, path, **limits), "sha256": digest.hexdigest()}
+    frames = in_child(_plausible.values, path, labels, **limits)
+    return found | {"frames": frames, "sha256": digest.hexdigest()}
