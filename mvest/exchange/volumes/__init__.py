@@ -1,1 +1,0 @@
-"""Reading volumes over time from the files that scanners and viewers write."""
