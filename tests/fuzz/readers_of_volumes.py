@@ -9,7 +9,7 @@ import SimpleITK
 
 from mvest.errors import GeometryError
 from mvest.exchange.importing.segmented import LabelsOptions, import_labels
-from mvest.exchange.markups import read_fcsv, read_markups
+from mvest.exchange.markups import read_markups
 from mvest.exchange.volumes.nrrd_file import segment_names
 from mvest.exchange.volumes.reader import read_volume
 from mvest.imaging.volume import Modality
@@ -172,6 +172,6 @@ READERS = (
             lambda folder: philips(folder / "a.dcm", False, False),
         ),
     ),
-    Reader("fcsv", read_fcsv, (fcsv,)),
+    Reader("fcsv", read_markups, (fcsv,)),
     Reader("markups", read_markups, (markups,)),
 )

@@ -17,7 +17,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.parts import chord_lines
-from mvest.exchange.markups import TO_LPS, read_fcsv, read_markups
+from mvest.exchange.markups import TO_LPS, read_markups
 from mvest.exchange.surfaces import check_finite
 from mvest.exchange.vtk_legacy import PolyDataFile, read_polydata
 from mvest.reading.bounded import refusing
