@@ -28,7 +28,7 @@ from mvest.exchange.importing.joining import (
     joined,
 )
 from mvest.exchange.importing.parts import Leaflet, write_chords
-from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_batch, read_fem
+from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.regions import RegionSurface
 from mvest.exchange.surfaces import write_surface
 from mvest.typing import FloatArray
@@ -53,6 +53,8 @@ class SlicerheartOptions:
     ----------
     scene : str or None
         Whose files are taken where a folder holds those of several.
+    only : str or None
+        What the names of surfaces must hold, where there are several of one leaflet.
     open, closed : str or None
         Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; MD, ED, CD and MS,
         ES, CS in this order if not given. For folders of ValveFemExport, which name no phase,
@@ -79,6 +81,7 @@ class SlicerheartOptions:
     """
 
     scene: str | None = None
+    only: str | None = None
     open: str | None = None
     closed: str | None = None
     tips: tuple[float, ...] | None = None
@@ -149,23 +152,22 @@ def _chosen(
     source: Path, options: SlicerheartOptions, derived: list[str]
 ) -> list[tuple[SeenPhase, Role]]:
     """The phases that are taken, in the order of time."""
-    if not any(source.rglob("*_atrial_*.vtk")):
-        seen = [(read_fem(source, ""), Role.REFERENCE)]
-        if options.closed is not None:
-            folder = Path(options.closed)
-            if not folder.is_dir():
-                raise InputError(f"closed={options.closed}: no such folder")
-            seen.append((read_fem(folder, ""), Role.CLOSED))
-        return seen
-    by_phase = {seen.phase: seen for seen in read_batch(source, options.scene)}
-    listed = ", ".join(by_phase)
-    for name, phase in (("open", options.open), ("closed", options.closed)):
+    by_phase = {s.phase: s for s in read_folder(source, options.scene, options.only)}
+    closed = options.closed
+    if closed is not None and Path(closed).is_dir():
+        others = read_folder(Path(closed), options.scene, options.only)
+        if len(others) > 1:
+            raise InputError(f"closed={closed}: {len(others)} phases, expected one")
+        closed = others[0].phase or "closed"
+        by_phase[closed] = others[0]
+    listed = ", ".join(by_phase) or "one without a name"
+    for name, phase in (("open", options.open), ("closed", closed)):
         if phase is not None and phase not in by_phase:
             raise InputError(f"{name}={phase}: no such phase, there are {listed}")
-    opened = options.open or next((p for p in OPEN if p in by_phase), None)
+    opened = options.open or next((p for p in ("", *OPEN) if p in by_phase), None)
     if opened is None:
         raise InputError(f"no open phase ({', '.join(OPEN)}) among {listed}; give open=PHASE")
-    closed = options.closed or next((p for p in CLOSED if p in by_phase and p != opened), None)
+    closed = closed or next((p for p in CLOSED if p in by_phase and p != opened), None)
     further = [p for p in CLOSED if p in by_phase and p not in (opened, closed)]
     left = [p for p in by_phase if p not in (opened, closed, *further)]
     if left:
@@ -193,7 +195,7 @@ def _placed(
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")
         name = PHASES.get(seen.phase, label)
         try:
-            derived += seen.notes
+            derived += [f"{label}: {note}" for note in seen.notes]
             tips = _tips_of(seen, role, options, phases, derived, label)
             raw = _join(seen, tips, options, seams, derived, label)
             seams = raw.seams

@@ -201,14 +201,14 @@ def test_other_valves_scenes_and_phases_are_refused(folder):
     refused(folder, r"2 scenes \(P001, P002\); give scene=NAME")
     for file in folder.glob("*_atrial_*"):
         file.rename(file.with_name(file.name.replace("mitral_frame", "tricuspid_frame")))
-    refused(folder, "no surfaces SCENE_mitral.*valves: tricuspid", scene="P001")
+    refused(folder, "no surfaces of mitral leaflets.*; found P001_tricuspid_frame", scene="P001")
 
 
 def test_damaged_and_closed_surfaces_are_refused(folder):
     file = next(iter(folder.glob("*_MD_atrial_mitral_anterior*")))
     content = file.read_bytes()
     file.write_bytes(content[:2000])
-    refused(folder, "anterior_leaflet.vtk: ends within")
+    refused(folder, "anterior_leaflet.vtk: damaged")
     file.write_bytes(content)
     vtk = pytest.importorskip("vtk")
     sphere = vtk.vtkSphereSource()
