@@ -87,6 +87,11 @@ class Leaflet:
         loop = np.searchsorted(used, loops[outer])
         return cls(np.concatenate(points)[used], faces, loop, len(loops) - 1)
 
+    @property
+    def curve(self) -> FloatArray:
+        """``(k, 3)`` mm, the boundary."""
+        return self.vertices[self.loop]
+
     def turned(self) -> Leaflet:
         """The same with its triangles facing the other way."""
         return Leaflet(self.vertices, self.triangles[:, ::-1], self.loop[::-1], self.holes)
@@ -96,7 +101,7 @@ class Leaflet:
 
         Both arcs have both ends.
         """
-        curve = self.vertices[self.loop]
+        curve = self.curve
         start, stop = (
             int(np.argmin(np.linalg.norm(curve - point, axis=1))) for point in (first, second)
         )

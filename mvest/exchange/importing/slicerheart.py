@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,10 @@ from mvest.cases.rims import two_loops
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
-from mvest.exchange.importing.joining import (
-    REGIONS,
-    Commissures,
-    JoinedLeaflets,
-    commissures_on,
-    drawn_anew,
-    joined,
-)
+from mvest.exchange.importing.joining import REGIONS, Joining, commissures_on, joined
 from mvest.exchange.importing.parts import Leaflet, write_chords
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
+from mvest.exchange.markups import TO_LPS
 from mvest.exchange.regions import RegionSurface
 from mvest.exchange.surfaces import write_surface
 from mvest.typing import FloatArray
@@ -103,6 +96,11 @@ class SlicerheartOptions:
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"{name}={getattr(self, name)}, expected {low:g} to {high:g} mm")
 
+    @property
+    def thickness(self) -> tuple[float, ...]:
+        """Of the anterior and the posterior leaflet (mm), stated or generic."""
+        return self.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Phase:
@@ -145,7 +143,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         words = str(fault)
         start = "" if words.startswith(str(source)) else f"{source}: "
         raise type(fault)(f"{start}{words}") from fault
-    return dataclasses.replace(case, sha256="")
+    return replace(case, sha256="")
 
 
 def _chosen(
@@ -183,41 +181,35 @@ def _placed(
     chosen: Sequence[tuple[SeenPhase, Role]], options: SlicerheartOptions, derived: list[str]
 ) -> list[_Phase]:
     phases: list[_Phase] = []
-    thickness = _thickness(options, derived)
-    offset = (0.0, 0.0) if options.midsurface else (thickness[0] / 2, thickness[1] / 2)
+    offset = (0.0, 0.0)
+    if options.thickness_mm is None:
+        derived.append(
+            "thickness: {} mm (anterior), {} mm (posterior) assumed; thickness_mm=[...] states it"
+            "".format(*options.thickness)
+        )
     if not options.midsurface:
+        offset = (options.thickness[0] / 2, options.thickness[1] / 2)
         derived.append(
             "midsurface: the atrial surfaces moved to the ventricle by half the thickness "
             f"({offset[0]:g} and {offset[1]:g} mm); edges that curl by over 30 degrees left out"
         )
-    seams = None
+    how = Joining(options.seam_mm, options.edge_mm, offset)
     for seen, role in chosen:
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")
-        name = PHASES.get(seen.phase, label)
+        notes = list(seen.notes)
         try:
-            derived += [f"{label}: {note}" for note in seen.notes]
-            tips = _tips_of(seen, role, options, phases, derived, label)
-            raw = _join(seen, tips, options, seams, derived, label)
-            seams = raw.seams
-            surface = drawn_anew(raw, options.edge_mm, offset)
+            tips = _tips_of(seen, role, options, phases, notes)
+            surface, seams = _join(seen, tips, options, how, notes)
         except MvestError as fault:
             raise type(fault)(f"{label}: {fault}") from fault
-        phases.append(_Phase(seen, role, name, surface, tips))
+        # The closed edges lie side by side all along, and are joined as far as the open ones.
+        how = replace(how, seams=seams)
+        derived += [f"{label}: {note}" for note in notes]
+        phases.append(_Phase(seen, role, PHASES.get(seen.phase, label), surface, tips))
     derived.append(
         f"surfaces drawn anew on the lines of their coordinates, edges about {options.edge_mm:g} mm"
     )
     return phases
-
-
-def _thickness(options: SlicerheartOptions, derived: list[str]) -> tuple[float, float]:
-    if options.thickness_mm is not None:
-        return options.thickness_mm[0], options.thickness_mm[1]
-    assumed = GENERIC_THICKNESS["anterior"], GENERIC_THICKNESS["posterior"]
-    derived.append(
-        f"thickness: {assumed[0]:g} mm (anterior), {assumed[1]:g} mm (posterior) assumed; "
-        "thickness_mm=[...] states it"
-    )
-    return assumed
 
 
 def _tips_of(
@@ -225,8 +217,7 @@ def _tips_of(
     role: Role,
     options: SlicerheartOptions,
     before: Sequence[_Phase],
-    derived: list[str],
-    label: str,
+    notes: list[str],
 ) -> FloatArray:
     given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
     if given is not None:
@@ -234,7 +225,7 @@ def _tips_of(
     if seen.tips is not None:
         return seen.tips
     if before:
-        derived.append(f"papillary tips of {label}: where they are in {before[0].name}")
+        notes.append(f"papillary tips where they are in {before[0].name}")
         return before[0].tips
     raise InputError(
         "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial, "
@@ -246,10 +237,9 @@ def _join(
     seen: SeenPhase,
     tips: FloatArray,
     options: SlicerheartOptions,
-    seams: FloatArray | None,
-    derived: list[str],
-    label: str,
-) -> JoinedLeaflets:
+    how: Joining,
+    notes: list[str],
+) -> tuple[RegionSurface, FloatArray]:
     leaflets = []
     for name, surface in zip(REGIONS, seen.leaflets, strict=True):
         try:
@@ -257,55 +247,44 @@ def _join(
         except GeometryError as fault:
             raise type(fault)(f"{name} leaflet: {fault}") from fault
         if leaflets[-1].holes:
-            derived.append(f"{label}, {name} leaflet: {leaflets[-1].holes} holes closed")
-    anterior, posterior = leaflets
-    edges = np.concatenate([leaf.vertices[leaf.loop] for leaf in leaflets])
+            notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
+    edges = np.concatenate([leaflet.curve for leaflet in leaflets])
     down = tips.mean(axis=0) - edges.mean(axis=0)
-    _check_axes(seen, edges, down, options)
+    _check_axes(seen, edges, down, options.mirrored)
     if {"ALC", "PMC"} <= set(seen.landmarks):
         points = np.stack([seen.landmarks["ALC"], seen.landmarks["PMC"]])
     elif seen.contour is not None:
-        points = commissures_on(seen.contour, anterior, posterior)
-        derived.append(f"{label}: commissures where the leaflet nearer to the annulus changes")
+        points = commissures_on(seen.contour, leaflets)
+        notes.append("commissures where the leaflet nearer to the annulus changes")
     else:
         raise InputError(
             "neither the landmarks ALC and PMC nor the annulus; export ValveLandmarkPoints.csv or "
             "AnnulusContourPoints.csv"
         )
-    band = joined(
-        anterior, posterior, Commissures(points, seen.contour), down, options.seam_mm, seams
+    surface, seams, gap = joined(leaflets, points, seen.contour, down, how)
+    shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
+    notes.append(
+        f"leaflets joined at the commissures over {shares} % of their free edges, across at most "
+        f"{gap:.1f} mm"
     )
-    shares = ", ".join(f"{100 * share:.0f}" for share in band.seams.ravel())
-    derived.append(
-        f"{label}: leaflets joined at the commissures over {shares} % of their free edges, "
-        f"across at most {band.gap:.1f} mm"
-    )
-    return band
+    return surface, seams
 
 
-def _check_axes(
-    seen: SeenPhase, edges: FloatArray, down: FloatArray, options: SlicerheartOptions
-) -> None:
+def _check_axes(seen: SeenPhase, edges: FloatArray, down: FloatArray, mirrored: bool) -> None:
     """Raise where tables and surfaces have other axes, or the valve is its own mirror image."""
-    if seen.contour is not None:
-        turned = seen.contour * (-1.0, -1.0, 1.0)
-        away, other = _rms(seen.contour, edges), _rms(turned, edges)
-        if away > MAX_RMS:
-            hint = (
-                f" (with x and y turned it would be {other:.1f} mm: one of them is in RAS where "
-                "LPS is stated, or the other way round)"
-                if other < MAX_RMS
-                else ""
-            )
-            raise InputError(
-                f"the annulus lies {away:.1f} mm from the leaflets, expected at most "
-                f"{MAX_RMS:g} mm{hint}"
-            )
+    if seen.contour is not None and (away := _rms(seen.contour, edges)) > MAX_RMS:
+        other = _rms(seen.contour * TO_LPS["RAS"], edges)
+        hint = (
+            f" (with x and y turned it would be {other:.1f} mm: one of them is in RAS where LPS is "
+            "stated, or the other way round)"
+        )
+        raise InputError(
+            f"the annulus lies {away:.1f} mm from the leaflets, expected at most {MAX_RMS:g} mm"
+            f"{hint if other < MAX_RMS else ''}"
+        )
     marks = seen.landmarks
-    if options.mirrored or not {"A", "P"} <= set(marks):
-        return
     for left, right in (("ALC", "PMC"), ("AL", "PM")):
-        if {left, right} <= set(marks):
+        if not mirrored and {"A", "P", left, right} <= set(marks):
             sides = np.stack([marks[left] - marks[right], marks["A"] - marks["P"], down])
             # From the atrium the antero-lateral commissure is on the left of the anterior leaflet.
             if np.linalg.det(sides) < 0:
@@ -313,7 +292,6 @@ def _check_axes(
                     f"the landmarks A, P, {left} and {right} lie as in a mirror: from the atrium "
                     f"{left} is on the right; is one axis turned? (mirrored=true takes it so)"
                 )
-            return
 
 
 def _rms(points: FloatArray, edges: FloatArray) -> float:
@@ -342,7 +320,6 @@ def _document(
     options: SlicerheartOptions,
     derived: list[str],
 ) -> dict[str, Any]:
-    thickness = options.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
     if len(phases) > 1:
         derived.append("times: by the order of the phases in a generic cardiac cycle")
@@ -376,7 +353,7 @@ def _document(
         "source": "SlicerHeart",
         "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
         "regions": list(REGIONS),
-        "thickness": dict(zip(REGIONS, map(float, thickness), strict=True)),
+        "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
         "frames": frames,
         **_chordae(folder, phases[0], derived),
         **(
