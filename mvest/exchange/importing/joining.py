@@ -135,10 +135,9 @@ def joined(
                 f"the {name} leaflet ends {away:.1f} mm from a commissure, expected at most "
                 f"{MAX_GAP:g} mm: do leaflets and annulus have the same axes and phase?"
             )
-    pairs = (tuple(leaflets), tuple(leaflets)[::-1])
-    (front, *arcs), (back, *others) = (
-        _facing_ventricle(*pair, commissures, contour, down, how.max_seam_mm) for pair in pairs
-    )
+    place = (commissures, contour, down, how.max_seam_mm)
+    front, *arcs = _facing_ventricle(leaflets[0], leaflets[1], *place)
+    back, *others = _facing_ventricle(leaflets[1], leaflets[0], *place)
     ends, begins = front.vertices[arcs[0][[-1, 0]]], back.vertices[others[0][[0, -1]]]
     gap = np.linalg.norm(ends - begins, axis=1)
     if gap.sum() > np.linalg.norm(ends - begins[::-1], axis=1).sum():

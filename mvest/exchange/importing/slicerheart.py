@@ -241,9 +241,9 @@ def _join(
     notes: list[str],
 ) -> tuple[RegionSurface, FloatArray]:
     leaflets = []
-    for name, surface in zip(REGIONS, seen.leaflets, strict=True):
+    for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
         try:
-            leaflets.append(Leaflet.of(*surface))
+            leaflets.append(Leaflet.of(vertices, triangles))
         except GeometryError as fault:
             raise type(fault)(f"{name} leaflet: {fault}") from fault
         if leaflets[-1].holes:
@@ -366,10 +366,11 @@ def _document(
 
 
 def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, Any]:
-    if not len(reference.seen.chords):
+    seen, surface = reference.seen, reference.surface
+    if not len(seen.chords):
         return {}
-    vertices = reference.surface.vertices
-    loops = two_loops(vertices, reference.surface.triangles)
-    edge = min((vertices[loop] for loop in loops), key=lambda curve: _rms(curve, reference.tips))
-    seen = reference.seen
-    return write_chords(folder, seen.chords, seen.chord_lengths, reference.tips, edge, derived)
+    loops = [surface.vertices[k] for k in two_loops(surface.vertices, surface.triangles)]
+    edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
+    entry, said = write_chords(folder, (seen.chords, seen.chord_lengths), reference.tips, edge)
+    derived.append(said)
+    return entry
