@@ -162,7 +162,7 @@ def _chosen(
     for name, phase in (("open", options.open), ("closed", closed)):
         if phase is not None and phase not in by_phase:
             raise InputError(f"{name}={phase}: no such phase, there are {listed}")
-    opened = options.open or next((p for p in ("", *OPEN) if p in by_phase), None)
+    opened = options.open or next((p for p in (*OPEN, "") if p in by_phase), None)
     if opened is None:
         raise InputError(f"no open phase ({', '.join(OPEN)}) among {listed}; give open=PHASE")
     closed = closed or next((p for p in CLOSED if p in by_phase and p != opened), None)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ _TABLES = {
 }
 MIN_CONTOUR = 8
 """Points of an annulus."""
-MAX_FILES = 2000
+MAX_FILES = 20_000
 
 
 def words_of(name: str) -> set[str]:
@@ -133,13 +134,17 @@ def read_folder(folder: Path, scene: str | None = None, only: str | None = None)
         No leaflets of a mitral valve, several scenes, several surfaces of a leaflet, a damaged
         file.
     """
-    files = [_File(path) for path in sorted(folder.rglob("*"))[:MAX_FILES] if path.is_file()]
-    lists = [f for f in files if f.path.name.lower().endswith((".fcsv", ".mrk.json"))]
-    models = [f for f in files if f.path.suffix.lower() in SURFACE_SUFFIXES]
+    paths = sorted(islice(folder.rglob("*"), MAX_FILES + 1))
+    if len(paths) > MAX_FILES:
+        raise InputError(f"{folder}: more than {MAX_FILES} files; name one scene's folder")
+    models, lists = (
+        [_File(path) for path in paths if path.name.lower().endswith(ends) and path.is_file()]
+        for ends in (SURFACE_SUFFIXES, (".fcsv", ".mrk.json"))
+    )
     above = [f for f in models if f.path.parent == folder]
     models = above if any(f.leaflet for f in above) else models
     leaflets = [f for f in models if f.leaflet and (only or "").lower() in f.path.name.lower()]
-    scenes = sorted({f.scene for f in leaflets})
+    scenes = sorted({f.scene for f in leaflets} - {""})
     chosen = [f for f in leaflets if scene in (None, f.scene) and f.valve.lower() in ("mitral", "")]
     if not chosen:
         found = one_line(", ".join(f.path.name for f in leaflets or models) or "no models", 150)
@@ -151,11 +156,13 @@ def read_folder(folder: Path, scene: str | None = None, only: str | None = None)
         raise InputError(
             f"{folder}: {len(scenes)} scenes ({', '.join(scenes[:5])}); give scene=NAME"
         )
-    return [
-        _read_phase(folder, mine, models, lists)
-        for phase in ("", *PHASES)
-        if (mine := [f for f in chosen if f.phase == phase])
-    ]
+    of_phase = {phase: [f for f in chosen if f.phase == phase] for phase in PHASES}
+    left = [f for f in chosen if not f.phase]
+    seen = [_read_phase(folder, mine, models, lists) for mine in of_phase.values() if mine]
+    if not seen:
+        return [_read_phase(folder, left, models, lists)]
+    notes = seen[0].notes + (("surfaces that name no phase not used",) if left else ())
+    return [replace(seen[0], notes=notes), *seen[1:]]
 
 
 def _read_phase(
