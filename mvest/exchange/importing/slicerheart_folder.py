@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.importing.parts import chord_lines
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, Mesh, read_mesh
 from mvest.reading.text import numbers, one_line, read_columns
@@ -309,7 +308,40 @@ def _chords(files: Sequence[_File], notes: list[str]) -> tuple[FloatArray, Float
             raise InputError(f"{file.path}: lines of other than two points, expected one a chord")
         ends = np.array(model.lines, dtype=np.int64).reshape(-1, 2)
         segments.append(model.points[ends])
-    return chord_lines(np.concatenate(segments) if segments else np.zeros((0, 2, 3)))
+    return _chord_lines(np.concatenate(segments) if segments else np.zeros((0, 2, 3)))
+
+
+def _chord_lines(segments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chords from papillary tip to insertion of segments that may branch.
+
+    Parameters
+    ----------
+    segments : (k, 2, 3) mm
+        Each from where it begins to where it ends; a branch begins where its trunk ends.
+
+    Returns
+    -------
+    chords : (c, 2, 3) mm
+        From tip to insertion.
+    lengths : (c,) mm
+        Along trunk and branch.
+    tips : (t, 3) mm
+    """
+    joints, number = np.unique(np.round(segments.reshape(-1, 3), 3), axis=0, return_inverse=True)
+    begin, end = number.reshape(-1, 2).T
+    length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    trunk = {int(e): k for k, e in enumerate(end)}
+    last = np.flatnonzero(~np.isin(end, begin))
+    first, total = [], []
+    for k in last.tolist():
+        way, root = {k: None}, k
+        while (before := trunk.get(int(begin[root]))) is not None and before not in way:
+            root = before
+            way[root] = None
+        first.append(root)
+        total.append(length[list(way)].sum())
+    chords = np.stack([segments[first, 0], segments[last, 1]], axis=1)
+    return chords, np.array(total), joints[np.unique(begin[first])]
 
 
 def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
