@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from mvest.cases.folder import read_case
-from mvest.exchange.importing.slicerheart_folder import read_batch
+from mvest.exchange.importing.slicerheart_folder import read_folder
 from mvest.exchange.importing.solid import SolidOptions, import_solid
 from mvest.exchange.regions import read_regions
 from mvest.exchange.surfaces import (
@@ -251,7 +251,7 @@ READERS = (
     ),
     Reader(
         "slicerheart",
-        lambda path: read_batch(path.parent, None),
+        lambda path: read_folder(path.parent, None),
         tuple(
             lambda folder, name=name: slicerheart(folder, name)
             for name in ("AnnulusContourPoints.csv", "ValveLandmarkPoints.csv")

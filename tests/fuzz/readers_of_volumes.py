@@ -9,8 +9,9 @@ import SimpleITK
 
 from mvest.errors import GeometryError
 from mvest.exchange.importing.segmented import LabelsOptions, import_labels
-from mvest.exchange.markups import read_fcsv, read_markups
-from mvest.exchange.volumes import read_labels, read_volume
+from mvest.exchange.markups import read_markups
+from mvest.exchange.volumes.nrrd_file import segment_names
+from mvest.exchange.volumes.reader import read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange.volumes import test_nifti, test_philips
 from tests.exchange.volumes import volumes as v
@@ -128,7 +129,8 @@ def seg_nrrd(folder: Path) -> Path:
 
 
 def segmentation(path: Path) -> object:
-    return read_labels(path)
+    volume = read_volume(path, modality=Modality.CT, labels=True)
+    return volume, segment_names(path)
 
 
 def label_map(path: Path) -> object:
@@ -170,6 +172,6 @@ READERS = (
             lambda folder: philips(folder / "a.dcm", False, False),
         ),
     ),
-    Reader("fcsv", read_fcsv, (fcsv,)),
+    Reader("fcsv", read_markups, (fcsv,)),
     Reader("markups", read_markups, (markups,)),
 )
