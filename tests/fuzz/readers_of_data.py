@@ -179,7 +179,7 @@ READERS = (
     Reader("case", lambda path: read_case(path.parent),
            (case, beside("chordae.csv"), beside("pressure.csv"), beside("errors.npz"))),
     Reader("population", load_population, (population,)),
-    Reader("recording", lambda path: read_recording(path.parent, recorded.NAMES), (deck, frame)),
+    Reader("recording", lambda path: read_recording(path.parent, **recorded.NAMES), (deck, frame)),
     Reader("arrays", read_npz, (arrays, packed)),
     Reader("fields", read_case_fields, (fields,)),
     Reader("record", read_record, (record,)),
