@@ -88,7 +88,7 @@ class Deck:
         Elements, material, and thickness of shells (mm) or cross section of trusses (mm^2), NaN
         where none is given. Of two sections of an element the later one counts.
     laws : dict
-        Material -> ELASTIC or HYPERELASTIC -> its ``options``, ``values``, and where it is (``at``).
+        Material -> ELASTIC or HYPERELASTIC -> its ``options``, ``values`` and line (``at``).
     pressures : list of tuple
         Elements, pressure against their normals at a share of 1, and its amplitude.
     period : float

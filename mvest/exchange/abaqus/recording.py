@@ -27,7 +27,7 @@ from mvest.errors import InputError
 from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
 from mvest.exchange.abaqus.deck import Deck, lookup
 from mvest.exchange.child import in_child
-from mvest.exchange.vtk_xml import read_vtu as read_mesh
+from mvest.exchange.surfaces import read_mesh
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
