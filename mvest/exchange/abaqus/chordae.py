@@ -77,7 +77,7 @@ def trace_cables(
         shape=(len(nodes), len(nodes)),
     )
     distance, predecessor = dijkstra(graph, indices=anchors, return_predecessors=True)
-    reached = np.isfinite(distance).any(axis=0)
+    reached = np.asarray(np.isfinite(distance).any(axis=0))
     loose = np.flatnonzero(~reached[edges].all(axis=1))
     if loose.size:
         raise GeometryError(

@@ -292,7 +292,7 @@ def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float,
 
 def _leaflets(
     deck: Deck, groups: Sequence[IntArray], annulus: str, free_edge: str, *, turned: bool
-) -> tuple[dict[str, IntArray | FloatArray], IntArray, list[IntArray]]:
+) -> tuple[dict[str, Any], IntArray, list[IntArray]]:
     """The leaflets as triangles, whose normals are the shells' or, if ``turned``, against them.
 
     Returns

@@ -68,10 +68,9 @@ def import_abaqus(source: Path, options: AbaqusOptions) -> ValveCase:
         "free_edge=SET": not options.free_edge,
     }
     if any(missing.values()):
-        known = in_child(deck_sets, recording_files(source)[0])
+        known = one_line(", ".join(in_child(deck_sets, recording_files(source)[0])), 400)
         asked = ", ".join(option for option, absent in missing.items() if absent)
-        sets = one_line(", ".join(known), 400)
-        raise InputError(f"{source}: give {asked}; the deck's sets are {sets}")
+        raise InputError(f"{source}: give {asked}; the deck's sets are {known}")
     sets = leaflets, options.annulus or "", options.free_edge or ""
     recording = read_recording(source, *sets, options.toe_strain)
     valve = recording.valve
