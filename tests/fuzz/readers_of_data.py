@@ -18,7 +18,7 @@ from mvest.exchange.external.contract import (
     write_answer,
     write_request,
 )
-from mvest.exchange.febio.positions import read_positions
+from mvest.exchange.febio.document import read_positions
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.problem.fields import read_case_fields
