@@ -228,7 +228,9 @@ def recorded(
     used, of_truss = np.unique(section, return_inverse=True)
     family = of_truss[first // 2][np.searchsorted(ends, insertion)]
     materials = [deck.sections[k][1:] for k in used]
-    stiffness = [truss_stiffness(*one, deck.laws.get(one[0], {}), toe_strain) for one in materials]
+    stiffness = [
+        truss_stiffness(name, area, deck.laws.get(name, {}), toe_strain) for name, area in materials
+    ]
     t = times / times[-1]
     return {
         "nodes": nodes,
