@@ -18,7 +18,7 @@ from mvest.exchange.external.contract import (
     write_answer,
     write_request,
 )
-from mvest.exchange.febio.positions import read_positions
+from mvest.exchange.febio.document import read_positions
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.problem.fields import read_case_fields
@@ -179,7 +179,7 @@ READERS = (
     Reader("case", lambda path: read_case(path.parent),
            (case, beside("chordae.csv"), beside("pressure.csv"), beside("errors.npz"))),
     Reader("population", load_population, (population,)),
-    Reader("recording", lambda path: read_recording(path.parent, recorded.NAMES), (deck, frame)),
+    Reader("recording", lambda path: read_recording(path.parent, **recorded.NAMES), (deck, frame)),
     Reader("arrays", read_npz, (arrays, packed)),
     Reader("fields", read_case_fields, (fields,)),
     Reader("record", read_record, (record,)),
