@@ -10,8 +10,7 @@ import SimpleITK
 from mvest.errors import GeometryError
 from mvest.exchange.importing.segmented import LabelsOptions, import_labels
 from mvest.exchange.markups import read_fcsv, read_markups
-from mvest.exchange.volumes.nrrd_file import segment_names
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange.volumes import test_nifti, test_philips
 from tests.exchange.volumes import volumes as v
@@ -129,8 +128,7 @@ def seg_nrrd(folder: Path) -> Path:
 
 
 def segmentation(path: Path) -> object:
-    volume = read_volume(path, modality=Modality.CT, labels=True)
-    return volume, segment_names(path)
+    return read_labels(path)
 
 
 def label_map(path: Path) -> object:
