@@ -8,7 +8,7 @@ import numpy as np
 import SimpleITK
 
 from mvest.errors import GeometryError
-from mvest.exchange.importing.segmented import LabelsOptions, import_labels
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.markups import read_fcsv, read_markups
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality
@@ -134,7 +134,7 @@ def segmentation(path: Path) -> object:
 def label_map(path: Path) -> object:
     """Labels of leaflets: none of the made-up voxels is a valve, so that a map is refused."""
     try:
-        return import_labels(path, LabelsOptions(tips=(0.0, 9.0, -20.0, 0.0, -9.0, -20.0)))
+        return import_leaflets(path, LeafletsOptions(tips=(0.0, 9.0, -20.0, 0.0, -9.0, -20.0)))
     except GeometryError as fault:
         return fault
 
