@@ -198,6 +198,21 @@ def test_two_labelled_frames_are_the_open_and_the_closed_one(
     assert any("1 is taken as the open one and 4 as the closed" in line for line in both.derived)
 
 
+@pytest.mark.parametrize(
+    ("convention", "words"),
+    [
+        (_annulus, "not recognised among 1, 2, 3: give anterior=N and posterior=N"),
+        (lambda labels: np.minimum(_annulus(labels), 2), "give anterior= and posterior=, or leaf"),
+    ],
+)
+def test_labels_that_are_no_two_leaflets_are_asked_for(
+    small: SimpleITK.Image, tmp_path: Path, convention: Callable[[IntArray], IntArray], words: str
+) -> None:
+    path = _written(small, tmp_path / "valve.nii.gz", convention)
+    with pytest.raises(InputError, match=words):
+        _small(path)
+
+
 def test_exchanged_leaflets_are_called_so(slicer: Path, tips: tuple[float, ...]) -> None:
     swapped = LeafletsOptions(
         anterior="mitral_posterior_leaflet", posterior="1", tips=tips, mirrored=True
