@@ -17,11 +17,17 @@ from typing import Any
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.exchange._images import fault
 from mvest.exchange.segmentations import checked_path
 from mvest.files import write_atomically
 from mvest.reading.bounded import refusing
-from mvest.reading.text import MAX_NUMBER, check_words, number, read_bytes, read_text
+from mvest.reading.text import (
+    MAX_NUMBER,
+    check_words,
+    number,
+    one_line,
+    read_bytes,
+    read_text,
+)
 from mvest.typing import FloatArray
 
 SCHEMA = (
@@ -34,6 +40,11 @@ FCSV_AXES = {"LPS": "LPS", "RAS": "RAS", "0": "RAS", "1": "LPS"}
 """As numbers before Slicer 4.11."""
 FCSV_COLUMNS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
 MAX_BYTES = 2**24
+
+
+def fault(path: Path, field: str, value: object, expected: str) -> InputError:
+    """What to raise where a file's field is not what it must be."""
+    return InputError(f"{path}: {field}: {one_line(value)}, expected {expected}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
