@@ -25,7 +25,6 @@ from mvest.exchange.importing.leaflet_parts import (
 from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
-from mvest.quantities import EdgeLength, Length
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.papillary import HEAD_MM, TALLER, check_tips_of, papillary_tip
@@ -99,10 +98,10 @@ class LeafletsOptions:
     thickness_mm: tuple[float, ...] | None = None
     thickness_range_mm: tuple[float, ...] | None = None
     seam_mm: tuple[float, ...] | None = None
-    edge_mm: EdgeLength = 1.2
-    blur_voxels: Length = 0.5
-    smoothing_mm: Length = 0.0
-    observer_mm: Length = OBSERVER_MM
+    edge_mm: float = 1.2
+    blur_voxels: float = 0.5
+    smoothing_mm: float = 0.0
+    observer_mm: float = OBSERVER_MM
     mirrored: bool = False
 
     def __post_init__(self) -> None:
@@ -114,6 +113,10 @@ class LeafletsOptions:
                 len(given) != count or (name != "muscles" and not np.isfinite(given).all())
             ):
                 raise InputError(f"{name}={list(given)}, expected {count} of them")
+        limits = {"edge_mm": (0.3, 5), "blur_voxels": (0, 2), "smoothing_mm": (0, 10)}
+        for name, (low, high) in (limits | {"observer_mm": (0, 5)}).items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name}={getattr(self, name)}, expected {low} to {high}")
 
     def words(self, name: str) -> tuple[str, ...]:
         """Names, numbers or files of an option that is one or a list of them."""

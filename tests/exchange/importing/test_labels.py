@@ -248,6 +248,15 @@ def test_what_is_missing_is_asked_for_by_name(
     assert str(slicer) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"edge_mm": 9.0}, {"observer_mm": -1.0}, {"smoothing_mm": 20.0}, {"tips": (1.0, 2.0)}],
+)
+def test_options_that_are_none_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(options))):
+        LeafletsOptions(**options)
+
+
 @pytest.mark.parametrize("names", [("AML", "PML"), ("Anterior", "Posterior"), ("A2", "P2")])
 def test_names_of_leaflets_are_recognised(
     small: SimpleITK.Image, tmp_path: Path, names: tuple[str, str]
