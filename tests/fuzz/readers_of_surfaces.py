@@ -7,8 +7,8 @@ import numpy as np
 import yaml
 
 from mvest.cases.folder import read_case
-from mvest.exchange.importing.slicerheart_folder import read_folder
-from mvest.exchange.importing.solid import SolidOptions, import_solid
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
+from mvest.exchange.importing.slicerheart_folder import read_batch
 from mvest.exchange.regions import read_regions
 from mvest.exchange.surfaces import (
     read_surface,
@@ -218,7 +218,7 @@ def thick(folder: Path) -> Path:
 
 def thick_leaflets(path: Path) -> object:
     tips = (-16.0, -0.24, -25.0, 16.0, -0.24, -25.0)
-    return import_solid(path, SolidOptions(units="mm", tips=tips, edge_mm=4.0))
+    return import_leaflets(path, LeafletsOptions(units="mm", tips=tips, edge_mm=4.0))
 
 
 READERS = (
@@ -251,7 +251,7 @@ READERS = (
     ),
     Reader(
         "slicerheart",
-        lambda path: read_folder(path.parent, None),
+        lambda path: read_batch(path.parent, None),
         tuple(
             lambda folder, name=name: slicerheart(folder, name)
             for name in ("AnnulusContourPoints.csv", "ValveLandmarkPoints.csv")

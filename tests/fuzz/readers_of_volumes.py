@@ -8,10 +8,9 @@ import numpy as np
 import SimpleITK
 
 from mvest.errors import GeometryError
-from mvest.exchange.importing.segmented import LabelsOptions, import_labels
-from mvest.exchange.markups import read_markups
-from mvest.exchange.volumes.nrrd_file import segment_names
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
+from mvest.exchange.markups import read_fcsv, read_markups
+from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange.volumes import test_nifti, test_philips
 from tests.exchange.volumes import volumes as v
@@ -129,14 +128,13 @@ def seg_nrrd(folder: Path) -> Path:
 
 
 def segmentation(path: Path) -> object:
-    volume = read_volume(path, modality=Modality.CT, labels=True)
-    return volume, segment_names(path)
+    return read_labels(path)
 
 
 def label_map(path: Path) -> object:
     """Labels of leaflets: none of the made-up voxels is a valve, so that a map is refused."""
     try:
-        return import_labels(path, LabelsOptions(tips=(0.0, 9.0, -20.0, 0.0, -9.0, -20.0)))
+        return import_leaflets(path, LeafletsOptions(tips=(0.0, 9.0, -20.0, 0.0, -9.0, -20.0)))
     except GeometryError as fault:
         return fault
 
@@ -172,6 +170,6 @@ READERS = (
             lambda folder: philips(folder / "a.dcm", False, False),
         ),
     ),
-    Reader("fcsv", read_markups, (fcsv,)),
+    Reader("fcsv", read_fcsv, (fcsv,)),
     Reader("markups", read_markups, (markups,)),
 )

@@ -1,0 +1,349 @@
+"""Thick leaflets as they were segmented: label maps, or closed surfaces of each or of both."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.cases.case import Role, ValveCase
+from mvest.cases.checks import LARGEST_THICKNESS
+from mvest.cases.frames import MM_PER
+from mvest.errors import GeometryError, InputError, MvestError
+from mvest.exchange.importing.leaflet_parts import (
+    REGIONS,
+    Content,
+    Tissue,
+    filled_frames,
+    tissue_of,
+)
+from mvest.exchange.importing.written import FoundFrame, case_of_frames
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
+from mvest.exchange.volumes import LabelMap, read_labels
+from mvest.typing import FloatArray
+from mvest.valve.geometry.midsurface import Midsurface, midsurface
+from mvest.valve.geometry.papillary import HEAD_MM, TALLER, check_tips_of, papillary_tip
+from mvest.valve.geometry.segmented import (
+    BEND_MM,
+    masks_midsurface,
+    segmentation_std,
+    without_crossings,
+)
+
+OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
+"""Standard deviation of where a person or a network draws a leaflet's wall, and over which length
+along the leaflets such errors are alike; those which a case has without any statement."""
+CLOSED_AT = 0.35
+"""s after the open frame, in a generic cardiac cycle."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeafletsOptions:
+    """What a label map or surfaces do not say.
+
+    Attributes
+    ----------
+    anterior, posterior : name, number or file, or list of names and numbers
+        Segments, labels or objects of a leaflet (``anterior=2``, ``posterior=[P1,P2,P3]``), or its
+        file. Else SlicerHeart's terminology, names or, of two nameless labels, the anatomy.
+    leaflets : name or number, or list of them
+        What both leaflets are together.
+    open, closed : number, file, or list of two files
+        Frames of a map over time, or layers of a segmentation; the closed frame may be another
+        file, or the files of its anterior and of its posterior leaflet.
+    units : str or None
+        Of lengths in surfaces and of the points given here: mm, cm or m. Maps are in mm.
+    tips, tips_closed : tuple of float or None
+        Papillary tips, antero-lateral and postero-medial: six numbers, LPS.
+    muscles : list of two names or files
+        Papillary muscles in the same order, from whose shape the tips follow.
+    commissures, anterior_point : tuple of float or None
+        Six numbers, and a point of the anterior annulus, of leaflets that are one label or surface.
+        Else these are shortest at the commissures, and the anterior one is the taller one.
+    pressure_mmHg : float or None
+        Transmitral pressure on the closed valve.
+    thickness_mm, thickness_range_mm : tuple of float or None
+        Thickness of the anterior and of the posterior leaflet instead of that between the walls;
+        the smallest and the largest one that is kept.
+    seam_mm : tuple of float or None
+        How far down from the annulus the leaflets are one piece at the two commissures, where the
+        open frame does not show it.
+    edge_mm : float
+        Of the triangles of the case.
+    blur_voxels, smoothing_mm : float
+        Standard deviations of the smoothing of voxels, and of the midsurface round the valve.
+    observer_mm : float
+        Standard deviation of where the walls were drawn; 0 for a voxelised model.
+    mirrored : bool
+        Take the valve although it lies as in a mirror.
+    """
+
+    anterior: Any = None
+    posterior: Any = None
+    leaflets: Any = None
+    open: int | None = None
+    closed: Any = None
+    units: str | None = None
+    tips: tuple[float, ...] | None = None
+    tips_closed: tuple[float, ...] | None = None
+    muscles: tuple[str, ...] | None = None
+    commissures: tuple[float, ...] | None = None
+    anterior_point: tuple[float, ...] | None = None
+    pressure_mmHg: float | None = None
+    thickness_mm: tuple[float, ...] | None = None
+    thickness_range_mm: tuple[float, ...] | None = None
+    seam_mm: tuple[float, ...] | None = None
+    edge_mm: float = 1.2
+    blur_voxels: float = 0.5
+    smoothing_mm: float = 0.0
+    observer_mm: float = OBSERVER_MM
+    mirrored: bool = False
+
+    def __post_init__(self) -> None:
+        six, pairs = ("tips", "tips_closed", "commissures"), ("muscles", "thickness_mm")
+        counts = dict.fromkeys(six, 6) | {"anterior_point": 3, "thickness_range_mm": 2}
+        for name, count in (counts | dict.fromkeys((*pairs, "seam_mm"), 2)).items():
+            given = getattr(self, name)
+            if given is not None and (
+                len(given) != count or (name != "muscles" and not np.isfinite(given).all())
+            ):
+                raise InputError(f"{name}={list(given)}, expected {count} of them")
+        limits = {"edge_mm": (0.3, 5), "blur_voxels": (0, 2), "smoothing_mm": (0, 10)}
+        for name, (low, high) in (limits | {"observer_mm": (0, 5)}).items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name}={getattr(self, name)}, expected {low} to {high}")
+
+    def words(self, name: str) -> tuple[str, ...]:
+        """Names, numbers or files of an option that is one or a list of them."""
+        given = getattr(self, name)
+        many = given if isinstance(given, list | tuple) else [] if given is None else [given]
+        return tuple(map(str, many))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """A frame: its role, its file or the files of both leaflets, and its number there."""
+
+    role: Role
+    files: tuple[Path, ...]
+    contents: tuple[Content, ...]
+    frame: int | None
+
+    @property
+    def name(self) -> str:
+        """What the frame is called."""
+        return "open" if self.role is Role.REFERENCE else "closed"
+
+
+def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
+    """Make a case of the leaflets of an open valve, or of an open and a closed one.
+
+    Parameters
+    ----------
+    source : Path
+        Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; LPS as the file states it) or closed
+        surfaces (STL, PLY, OBJ, GLB, VTK). If its name says ``anterior``, the file beside it that
+        says ``posterior`` is the other leaflet, and the other way round.
+    options : LeafletsOptions
+
+    Raises
+    ------
+    InputError, GeometryError
+        In one line what is missing, by the name of its option, or wrong: leaflets that are not
+        recognised, with holes, in pieces, open, that meet nowhere, or without an orifice.
+    """
+    derived: list[str] = []
+    frames: list[FoundFrame] = []
+    with _named(source):
+        seen = _seen(source, options, derived)
+        scale = _scale(seen[0].contents[0], options)
+    anterior, commissures = (
+        None if at is None else scale * np.squeeze(np.reshape(at, (-1, 3)))
+        for at in (options.anterior_point, options.commissures)
+    )
+    known: dict[str, Any] = {"commissures": commissures, "edge_mm": options.edge_mm}
+    seams: Any = options.seam_mm
+    exchanged, voxel = False, 0.0
+    for one in seen:
+        with _named(*one.files):
+            given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
+            tissue = tissue_of(one.contents, one.frame, given, scale, derived)
+            stated = options.tips_closed if frames else options.tips
+            if stated is not None:
+                tips = scale * np.reshape(stated, (2, 3))
+            else:
+                tips = frames[0].tips if frames else _tips(one, tissue, options, scale, derived)
+            known |= {"tips": tips, "anterior": anterior}
+            if tissue.surface is None:
+                voxel = float(np.prod(tissue.grid[0]) ** (1 / 3))
+                how = {"blur": options.blur_voxels, "seams": seams}
+                surface, seams = masks_midsurface(tissue.masks, tissue.grid, **how, **known)
+            else:
+                surface = midsurface(*tissue.surface, **known)
+            derived += [line for line in surface.derived if line not in derived]
+            if not frames and (tissue.nameless or (anterior is None and len(tissue.masks) < 2)):
+                exchanged = _posterior_first(surface, tissue.nameless, derived)
+            surface = surface.exchanged() if exchanged and tissue.nameless else surface
+            check_tips_of(surface, tips, handedness=not options.mirrored)
+            surface = _thick(surface, options, derived)
+            surface, done = without_crossings(
+                surface, options.smoothing_mm, thickened=one.role is Role.REFERENCE
+            )
+            derived += [f"{one.name} frame: {done}"] * bool(done)
+            anterior = surface.vertices[surface.annulus[len(surface.annulus) // 4]]
+            load = (CLOSED_AT, options.pressure_mmHg or 0.0) if frames else (0.0, 0.0)
+            frames.append(FoundFrame(one.name, one.role, *load, surface, tips, surface.thickness))
+    if len(frames) > 1:
+        derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
+        if options.tips_closed is None:
+            derived.append("papillary tips of the closed frame: where they are in the open one")
+    std = segmentation_std(voxel, options.blur_voxels * voxel, options.observer_mm)
+    correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
+    derived.append(
+        f"observation: {std:.3g} mm by voxels, smoothing and observer_mm={options.observer_mm:g}, "
+        f"alike over {correlated:g} mm"
+    )
+    document = {
+        "name": "segmented valve",  # names of files may be those of patients
+        "regions": list(REGIONS),
+        "thickness": {"point_data": "thickness"},
+        "observation": {"std_mm": std, "correlation_length_mm": correlated},
+        "derived": derived,
+    }
+    with _named(source):
+        return case_of_frames(frames, document)
+
+
+@contextmanager
+def _named(*files: Path) -> Iterator[None]:
+    """Put the first file before what is wrong with it, unless one is named already."""
+    try:
+        yield
+    except MvestError as fault:
+        known = any(str(fault).startswith(str(file)) for file in files)
+        raise type(fault)(str(fault) if known else f"{files[0]}: {fault}") from fault
+
+
+def _read(files: tuple[Path, ...]) -> tuple[Content, ...]:
+    return tuple(
+        (read_surface if file.suffix.lower() in SURFACE_SUFFIXES else read_labels)(file)
+        for file in files
+    )
+
+
+def _paired(source: Path) -> tuple[Path, ...]:
+    """A file, or those of the anterior and of the posterior leaflet beside each other."""
+    pair = [source.with_name(re.sub("|".join(REGIONS), name, source.name)) for name in REGIONS]
+    return tuple(pair) if pair[0] != pair[1] and all(p.is_file() for p in pair) else (source,)
+
+
+def _scale(content: Content, options: LeafletsOptions) -> float:
+    """Millimetres per unit of a source and of what the options state."""
+    if isinstance(content, LabelMap) and options.units not in (None, "mm"):
+        raise InputError(f"units={options.units}, but a label map is in mm")
+    if not isinstance(content, LabelMap) and options.units not in MM_PER:
+        raise InputError("surfaces state no unit of length; give units=mm, cm or m")
+    return MM_PER[options.units or "mm"]
+
+
+def _seen(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Seen]:
+    """The open frame, and the closed one if there is one."""
+    anterior, posterior, closed = map(options.words, (*REGIONS, "closed"))
+    if len(posterior) == 1 and Path(*posterior).is_file():
+        files: tuple[Path, ...] = (Path(*anterior) if anterior else source, Path(*posterior))
+    else:
+        files = (source,) if anterior or posterior or options.leaflets else _paired(source)
+    if closed and options.pressure_mmHg is None:
+        raise InputError("no pressure of the closed frame; give pressure_mmHg=...")
+    opened = Seen(Role.REFERENCE, files, _read(files), options.open)
+    content, number = opened.contents[0], None
+    if isinstance(content, LabelMap):
+        number = int(*closed) if len(closed) == 1 and closed[0].isdecimal() else None
+        filled = [0] if content.is_layers else filled_frames(content)
+        if options.open is None and not closed and len(filled) == 2:
+            number = filled[1]
+            if options.pressure_mmHg is None:
+                raise InputError(
+                    f"frames {filled} hold labels: give pressure_mmHg=... of the second, the "
+                    f"closed one, or open={filled[0]} for the open one alone"
+                )
+        if options.open is None and (number is not None or not content.is_layers):
+            opened = replace(opened, frame=filled[0])
+        if len(content.frames) > 1 and not content.is_layers:
+            derived.append(
+                f"of the frames with labels, {filled}, {opened.frame} is taken as the open one"
+                + ("" if number is None else f" and {number} as the closed one")
+            )
+    if number is not None:
+        return [opened, replace(opened, role=Role.CLOSED, frame=number)]
+    if not closed:
+        return [opened]
+    files = _paired(Path(*closed)) if len(closed) == 1 else tuple(map(Path, closed))
+    with _named(*files):
+        shut = Seen(Role.CLOSED, files, _read(files), None)
+        if type(shut.contents[0]) is not type(content):
+            raise InputError("a label map beside surfaces, expected both frames of one kind")
+    return [opened, shut]
+
+
+def _tips(
+    seen: Seen, tissue: Tissue, options: LeafletsOptions, scale: float, derived: list[str]
+) -> FloatArray:
+    """Papillary tips ``(2, 3)`` mm from the muscles."""
+    if options.muscles is None:
+        raise InputError("no papillary tips; give tips=[x,y,z,x,y,z] in LPS, or muscles=[...]")
+    derived.append(
+        f"papillary tips: the middle of the last {HEAD_MM:g} mm of each muscle along its axis"
+    )
+    tips = []
+    for word in options.muscles:
+        own = Path(word).is_file()
+        contents = _read((Path(word),)) if own else seen.contents[:1]
+        named = {} if own else {"leaflets": (word,)}
+        muscle = tissue_of(contents, seen.frame, named, scale, [])
+        tips.append(papillary_tip(muscle.points, tissue.points))
+    return np.stack(tips)
+
+
+def _posterior_first(surface: Midsurface, nameless: Sequence[str], derived: list[str]) -> bool:
+    """Whether the second of two leaflets is the anterior one, which is the taller one."""
+    heights = surface.heights
+    said = f"{heights.max():.1f} mm tall, the other {heights.min():.1f} mm"
+    if heights.max() < TALLER * heights.min():
+        options = "anterior=N posterior=N" if nameless else "anterior_point=[x,y,z]"
+        raise InputError(f"which leaflet is the anterior one? one is {said}; give {options}")
+    second = bool(heights[1] > heights[0])
+    if nameless:
+        derived.append(
+            f"{nameless[second]} taken as the anterior and {nameless[not second]} as the posterior "
+            f"leaflet: it is {said}, and on the anterior side of the tips"
+        )
+    return second
+
+
+def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) -> Midsurface:
+    """The same with the thickness that is stated, that of the posterior leaflet on their border."""
+    thickness = surface.thickness
+    if options.thickness_mm is not None:
+        of_vertex = np.ones(len(thickness), dtype=np.int64)
+        of_vertex[surface.triangles[surface.region == 0]] = 0
+        thickness = np.array(options.thickness_mm)[of_vertex]
+    if options.thickness_range_mm is not None:
+        low, high = options.thickness_range_mm
+        thin, thick = (100 * np.mean(outside) for outside in (thickness < low, thickness > high))
+        derived.append(
+            f"thickness: kept between {low:g} mm ({thin:.0f} % of the vertices are thinner) and "
+            f"{high:g} mm ({thick:.0f} % are thicker, up to {thickness.max():.1f} mm)"
+        )
+        thickness = np.clip(thickness, low, high)
+    if thickness.max() > LARGEST_THICKNESS:
+        raise GeometryError(
+            f"thickness of {thickness.max():.1f} mm, expected at most {LARGEST_THICKNESS:g} mm of "
+            "leaflets; thickness_range_mm=[LOW,HIGH] keeps it between two"
+        )
+    return replace(surface, thickness=thickness)
