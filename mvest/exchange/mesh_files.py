@@ -60,6 +60,7 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     field_data = _arrays(data.GetFieldData())
     with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
         words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
+    space = words[1].decode() if words else str(field_data.get("SPACE"))
     return {
         "points": points,
         "triangles": triangles,
@@ -68,7 +69,7 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},
         "field_data": field_data,
-        "space": words[1].decode() if words else field_data.get("SPACE"),
+        "space": space if space in ("LPS", "RAS") else None,
         "groups": [groups[row] for row in rows.tolist()] if groups else [],
     }
 
