@@ -7,6 +7,7 @@ drawn as tissue, and what is left open in the colour of blood.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,10 @@ from mvest.reporting.case.drawing import (
     draw_valve,
     leaflet_colours,
     name_leaflets,
-    paint_gap,
+    paint_leak,
     same_scale,
 )
-from mvest.reporting.figures import ATRIUM, COLOURS
-from mvest.reporting.style import SMALL, TEXT, plain_axes
+from mvest.reporting.figures import ATRIUM, COLOURS, SMALL, TEXT, plain_axes
 
 Row = Mapping[str, Any]
 
@@ -63,7 +63,7 @@ def scenarios_figure(
     InputError
         If the fields cannot be read.
     """
-    valve = read_case_fields(fields, turned=False)
+    valve = replace(read_case_fields(fields, turned=False), reach_mm=reach_mm)
     if valve.fitted is None:
         raise InputError(f"{fields}: no closed valves")
     figure = Figure(figsize=(max(2.7 * len(valve.frames), 8.0), 8.6), layout="constrained")
@@ -83,7 +83,7 @@ def scenarios_figure(
             axes.set_title(f"{title}\nnot closed: {failed.get(title, '')}", fontsize=SMALL)
             continue
         draw_valve(axes, valve, shape, colours, ATRIUM, 0)
-        paint_gap(axes, valve, shape, 0, reach_mm)
+        paint_leak(axes, valve, shape, 0)
         axes.set_title(f"{title}\ngap {gaps[title]:.1f} mm²", fontsize=TEXT)
     name_leaflets(panels[0], valve, ("anterior", "posterior"))
     known = [shape for shape in valve.fitted if np.isfinite(shape).all()]

@@ -13,7 +13,7 @@ from mvest.reporting.tables import Column, Table, table
 
 HIDDEN = Column(hidden=True)
 
-UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}
+UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "s": "s", "ratio": ""}
 """End of the name of a measure -> its unit."""
 
 FRAME_MEASURES = {
@@ -181,11 +181,14 @@ def _chosen(rows: Sequence[Row]) -> Table:
     return table(({name: row.get(name) for name in names} for row in rows), **columns)
 
 
+def unit_of_measure(name: str) -> str:
+    """``mm²`` for ``annulus_area_mm2``; empty for what has no unit."""
+    return UNITS.get(name.rpartition("_")[2], "")
+
+
 def _measured(name: str) -> str:
     """``annulus_area_mm2`` as ``annulus area [mm²]``."""
     words, _, unit = name.rpartition("_")
-    if unit == "s":
-        return f"{words} [s]"
     if unit not in UNITS or not words:
         return name.replace("_", " ")
     text = re.sub(r"\bap\b", "AP", words.replace("_", " "))
