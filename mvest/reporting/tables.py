@@ -209,8 +209,8 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     rows : iterable or DataFrame
         NumPy scalars become plain numbers, numbers that are not finite None.
     **columns : Column or str
-        What columns mean; a text is ``unit`` or ``unit:digits``, for example ``"mm:.2f"``. Named
-        columns come first, in this order.
+        What columns mean; a text is ``unit:digits:label``, for example ``"mm:.2f"``, of which what
+        follows may be missing. Named columns come first, in this order.
 
     Raises
     ------
@@ -252,8 +252,8 @@ def joined(tables: Mapping[str, Table], key: str = "run") -> Table:
 def _column(spec: Column | str) -> Column:
     if isinstance(spec, Column):
         return spec
-    unit, _, digits = spec.partition(":")
-    return Column(unit, digits)
+    unit, digits, label = [*spec.split(":", 2), "", ""][:3]
+    return Column(unit, digits, label=label)
 
 
 def _plain_rows(rows: Iterable[Any] | DataFrame) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
-from mvest.problem.fields import CaseFields, read_case_fields, turn_of
+from mvest.problem.fields import CaseFields, case_fields, read_case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     UNSEEN,
@@ -110,30 +110,30 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
 
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
-    shapes, none = [], np.zeros(0, dtype=np.int64)
+    shapes = []
     insertion = (chordae.insertion - middle) @ axes
     for frame in case.frames:
         at_rest, shut = frame.role is Role.REFERENCE, frame.role is Role.CLOSED
         vertices, annulus = ((x - middle) @ axes for x in (frame.vertices, frame.annulus))
         ring = cKDTree(annulus)
-        loops = sorted(
-            boundary_loops(frame.triangles),
-            key=lambda loop: float(np.mean(ring.query(vertices[loop])[0])),
-        )
-        fields = CaseFields(
-            frame.triangles,
-            frame.region,
-            vertices,
-            loops[0],
-            loops[-1],
-            (frame.name,),
-            np.array([True]),
-            np.stack([(frame.papillary_tips - middle) @ axes] * 2),
-            chordae.tip if at_rest else none,
-            np.asarray(cKDTree(vertices).query(insertion)[1]) if at_rest else none,
-            {},
-            reach_mm=reach_mm if shut else None,
-        )
+        loops = boundary_loops(frame.triangles)
+        loops.sort(key=lambda loop: float(np.mean(ring.query(vertices[loop])[0])))
+        arrays: dict[str, Any] = {
+            "triangles": frame.triangles,
+            "region": frame.region,
+            "rest": vertices,
+            "annulus": loops[0],
+            "free_edge": loops[-1],
+            "frames": [frame.name],
+            "seen": [True],
+            "tips": np.stack([(frame.papillary_tips - middle) @ axes] * 2),
+        }
+        if at_rest:
+            arrays["chord_tip"] = chordae.tip
+            arrays["chord_insertion"] = cKDTree(vertices).query(insertion)[1]
+        if shut:
+            arrays["reach_mm"] = reach_mm
+        fields = case_fields(arrays, turned=False)
         title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         # Of a closed one the gap is drawn, as of a frame that is not the reference.
         shapes.append(_Shape(title, fields, vertices, int(shut)))

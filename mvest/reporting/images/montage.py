@@ -6,7 +6,7 @@ has its own coordinates: mm to the right and up from its origin.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -212,7 +212,9 @@ def montage_figure(
         for frame, named in planes.items()
         for name, plane in named.items()
     }
-    window = _window(list(slices.values()))
+    # Grey values drawn black and white: all but the darkest and brightest 0.5 %.
+    values = np.concatenate([np.zeros(0), *(image.ravel() for image in slices.values())])
+    window = np.nanquantile(values, [0.005, 0.995]) if planes else (0.0, 1.0)
     widths = [right - left for left, right, _, _ in extents.values()]
     tallest = max(top - bottom for _, _, bottom, top in extents.values())
     size = ROW_INCHES / tallest * sum(widths) + 1.3, (ROW_INCHES + 0.18) * len(frames) + 1.15
@@ -260,15 +262,6 @@ def _extent(
     left, bottom = np.floor((every.min(axis=0) - MARGIN_MM) / STEP_MM) * STEP_MM
     right, top = np.ceil((every.max(axis=0) + MARGIN_MM) / STEP_MM) * STEP_MM
     return float(left), float(right), float(bottom), float(top)
-
-
-def _window(slices: Sequence[FloatArray]) -> tuple[float, float]:
-    """Grey values drawn black and white: all but the darkest and brightest 0.5 %."""
-    values = np.concatenate([one[np.isfinite(one)] for one in slices]) if slices else np.zeros(0)
-    if not len(values):
-        return 0.0, 1.0
-    low, high = np.quantile(values, [0.005, 0.995])
-    return float(low), float(max(high, low + 1e-6))
 
 
 def _bare(axes: Any, extent: Extent, *, marked: bool) -> None:
