@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from pandas import json_normalize
 
 from mvest.cases.from_images.detected import DetectedValve
 from mvest.errors import InputError, cannot_write
@@ -135,7 +136,7 @@ def _write_page(
             missing[row["file"]] = str(error)
     scene, buttons = case_view(shapes, names)
     labels = {one.name: one.label or one.name for one in record.unknowns}
-    rows = _flat(provenance) | {"case files, SHA-256": sha256}
+    rows = json_normalize(dict(provenance)).assign(**{"case files, SHA-256": sha256})
     page = rendered(
         "case_report.html.jinja",
         scripts=_policy(scene, SCRIPT.read_text(encoding="utf-8")),
@@ -154,7 +155,12 @@ def _write_page(
         confounded=[alike_words(group, labels) for group in record.confounded],
         number=number,
         ended=ended,
-        provenance=[{"": name, "value": str(value)} for name, value in rows.items() if value],
+        provenance=[
+            {"": name, "value": str(value)}
+            for row in rows.to_dict("records")
+            for name, value in row.items()
+            if value
+        ],
     )
     return [write_atomically(folder / REPORT, page), *written]
 
@@ -170,12 +176,3 @@ def _policy(scene: str, script: str) -> str:
     own = re.findall(r"<script[^>]*>(.*?)</script>", scene, re.DOTALL)
     digests = (hashlib.sha256(text.encode()).digest() for text in [*own, script])
     return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
-
-
-def _flat(values: Mapping[str, Any], name: str = "") -> dict[str, Any]:
-    """Nested values under dotted names."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        full = f"{name}.{key}" if name else str(key)
-        flat |= _flat(value, full) if isinstance(value, Mapping) else {full: value}
-    return flat

@@ -53,11 +53,10 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> tuple[Markup, list[di
     states = states_of(fields, names)
     start = PERSONALISED if PERSONALISED in states else next(iter(states))
     owner = np.array([label for label, parts in states.items() for _ in parts])
-    traces = [trace for parts in states.values() for trace in parts]
-    for trace, label in zip(traces, owner, strict=True):
+    scene = go.Figure([trace for parts in states.values() for trace in parts])
+    for trace, label in zip(scene.data, owner, strict=True):
         trace.visible = bool(label == start)
     axis = {"visible": False, "showbackground": False}
-    scene = go.Figure(traces)
     scene.update_layout(
         template=None,
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
@@ -86,27 +85,23 @@ def states_of(fields: CaseFields, names: Sequence[str]) -> dict[str, list[Any]]:
     states = {"open": _anatomy(fields, fields.rest, 0, names)}
     seen = []
     if (cloud := fields.observed_points.get(fields.frames[k])) is not None:
-        seen = [_dots(cloud, GHOST, 2.2, hoverinfo="skip")]
-        states["closed, observed"] = [_dots(cloud, GHOST, 2.2, hoverinfo="skip")]
+        seen = states["closed, observed"] = [_dots(cloud, GHOST, 2.2, hoverinfo="skip")]
     if fields.observed is not None:
         ghost = _mesh(fields.observed[k], fields.triangles, color=GHOST, hoverinfo="skip")
         seen = [ghost.update(opacity=0.45)]
         states["closed, observed"] = _anatomy(fields, fields.observed[k], frame, names)
-    models = {
-        label: (shape[k], None if off is None else off[k])
-        for label, shape, off in (
-            ("generic", fields.generic, fields.distance_generic),
-            ("personalised", fields.fitted, fields.distance_fitted),
-        )
-        if shape is not None
-    }
-    for label, (shape, _) in models.items():
-        states[f"closed, {label}"] = _anatomy(fields, shape, frame, names)
-    known = [distance for _, distance in models.values() if distance is not None]
-    for label, (shape, distance) in models.items():
-        if distance is not None:
+    models = (
+        ("generic", fields.generic, fields.distance_generic),
+        ("personalised", fields.fitted, fields.distance_fitted),
+    )
+    for label, shape, _ in models:
+        if shape is not None:
+            states[f"closed, {label}"] = _anatomy(fields, shape[k], frame, names)
+    known = [off[k] for _, shape, off in models if shape is not None and off is not None]
+    for label, shape, off in models:
+        if shape is not None and off is not None:
             top = distance_top(*known)
-            states[f"distance, {label}"] = _coloured(fields, shape, frame, distance, top)
+            states[f"distance, {label}"] = _coloured(fields, shape[k], frame, off[k], top)
     if fields.fitted is not None and seen:
         model = _anatomy(fields, fields.fitted[k], frame, names)
         states["observed (grey) over personalised"] = [*model, *seen]

@@ -70,19 +70,14 @@ def write_image_step(
         As `mvest.cases.from_images.image_step` has it.
     """
     files = write_detected(detected, folder)
+    volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
     name, low = detected.case.name, detected.settings.min_confidence
     drawn = {
-        "montage": montage_figure(
-            detected.volume,
-            detected.valve,
-            title=name,
-            closed=detected.frames.closed,
-            low_confidence=low,
-        ),
+        "montage": montage_figure(volume, valve, title=name, closed=closed, low_confidence=low),
         "measures_over_time": measures_figure(detected.rows, title=name, low_confidence=low),
     }
     for key, figure in drawn.items():
-        save_figure_with(folder / key, figure, called(detected.volume))
+        save_figure_with(folder / key, figure, called(volume))
     pictures = [{"file": f"{key}.png", "caption": CAPTIONS[key]} for key in drawn]
     return image_step(detected, files, pictures)
 
@@ -92,10 +87,8 @@ def draw_candidate(
 ) -> Path:
     """Draw a candidate that was not accepted, marked as such; returns the picture."""
     folder.mkdir(parents=True, exist_ok=True)
-    name = called(volume)
-    figure = montage_figure(
-        volume, candidate, title=name, low_confidence=low_confidence, accepted=False
-    )
+    name, low = called(volume), low_confidence
+    figure = montage_figure(volume, candidate, title=name, low_confidence=low, accepted=False)
     return save_figure_with(folder / "candidate", figure, name)[0]
 
 
