@@ -156,21 +156,11 @@ def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
 
 
 def leak_of(fields: CaseFields, points: FloatArray, frame: int) -> tuple[Gap, FloatArray] | None:
-    """The gap of a closed valve, and where the corners of its pixels lie.
+    """The gap of a valve at ``points (n, 3)`` mm, and where the corners of its pixels lie.
 
-    Parameters
-    ----------
-    fields : CaseFields
-    points : ndarray
-        ``(n, 3)`` mm.
-    frame : int
-        Whose papillary tips are below the valve.
-
-    Returns
-    -------
-    gap, corners : Gap, ndarray
-        Corners ``(rows + 1, columns + 1, 3)`` mm, about as deep as the nearest leaflets. None if
-        it is not known within which distance leaflets touch, or some of the points were not seen.
+    Corners ``(rows + 1, columns + 1, 3)`` mm are about as deep as the nearest leaflets. Papillary
+    tips are those of the frame. None if it is not known within which distance leaflets touch, or
+    some of the points were not seen.
     """
     if fields.reach_mm is None or not np.isfinite(points).all():
         return None
