@@ -21,7 +21,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence, landmarks
 from mvest.imaging.volume import VolumeSequence
 from mvest.reporting.figures import BAD, LEAFLET_COLOURS, SMALL, headline
-from mvest.typing import FloatArray
+from mvest.typing import BoolArray, FloatArray
 from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.measure.annulus import annulus_plane, unit_vector
 
@@ -213,17 +213,20 @@ def montage_figure(
         for name, plane in named.items()
     }
     # Grey values drawn black and white: all but the darkest and brightest 0.5 %.
-    values = np.concatenate([np.zeros(0), *(image.ravel() for image in slices.values())])
-    window = np.nanquantile(values, [0.005, 0.995]) if planes else (0.0, 1.0)
+    seen = [image[np.isfinite(image)] for image in slices.values()]
+    values = np.concatenate([np.zeros(0), *seen])
+    window = np.quantile(values, [0.005, 0.995]) if len(values) else (0.0, 1.0)
     widths = [right - left for left, right, _, _ in extents.values()]
     tallest = max(top - bottom for _, _, bottom, top in extents.values())
     size = ROW_INCHES / tallest * sum(widths) + 1.3, (ROW_INCHES + 0.18) * len(frames) + 1.15
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(frames), len(COLUMNS), squeeze=False, width_ratios=widths)
     for row, frame in zip(grid, frames, strict=True):
-        words = f"frame {frame}, {1e3 * valve.times[frame]:.0f} ms{', closed' * (frame == closed)}"
+        words = f"frame {frame}, {1e3 * valve.times[frame]:.0f} ms"
+        words += ", closed" if frame == closed else ""
         words += f"\nconfidence {valve.frame_confidence[frame]:.2f}"
-        row[0].set_ylabel(words + "\nLOW CONFIDENCE" * bool(low[frame]), fontsize=SMALL)
+        words += "\nLOW CONFIDENCE" if low[frame] else ""
+        row[0].set_ylabel(words, fontsize=SMALL)
         for axes, name in zip(row, COLUMNS, strict=True):
             _bare(axes, extents[name], marked=bool(low[frame]))
             if frame in planes:
@@ -239,15 +242,19 @@ def montage_figure(
         _scale_bar(axes, extents[name])
     if not accepted:
         title = f"NO VALVE FOUND; best candidate, not accepted: {title}"
-    note = f"All {count} frames have a confidence of {low_confidence:g} or more."
-    if low.any():
-        named = ", ".join(map(str, np.flatnonzero(low)[:12])) + ", ..." * bool(low.sum() > 12)
-        note = f"Confidence below {low_confidence:g} in {low.sum()} of {count} frames: {named}."
-    headline(figure, title, note)
+    headline(figure, title, _note(low, low_confidence))
     if planes:
         keys = grid[frames.index(min(planes)), 0].get_legend_handles_labels()
         figure.legend(*keys, loc="outside lower center", ncols=4, fontsize=SMALL, frameon=False)
     return figure
+
+
+def _note(low: BoolArray, low_confidence: float) -> str:
+    """Which of all frames are not trusted, shown or not."""
+    if not low.any():
+        return f"All {len(low)} frames have a confidence of {low_confidence:g} or more."
+    named = ", ".join(map(str, np.flatnonzero(low)[:12])) + (", ..." if low.sum() > 12 else "")
+    return f"Confidence below {low_confidence:g} in {low.sum()} of {len(low)} frames: {named}."
 
 
 def _extent(

@@ -140,7 +140,7 @@ def measures_figure(
             )  # fmt: skip
         else:
             # Limits that neither magnify noise nor let the legend cover a curve.
-            low, high = (float(of(shown)) for of in (np.nanmin, np.nanmax))
+            low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
             span = max(high - low, 0.1 * max(abs(high), abs(low)), 0.5)
             middle = 0.5 * (high + low)
             axes.set_ylim(middle - 0.6 * span, middle + 0.95 * span)

@@ -164,6 +164,13 @@ def test_a_frame_without_a_valve_keeps_its_row(volume):
     assert not panel(figure, 1, 2).images
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_valve_outside_its_volume_is_drawn_on_nothing(valve, volume):
+    far = dataclasses.replace(volume, origin=volume.origin + 500.0)
+    (image,) = panel(montage_figure(far, valve, title="made up"), 0, 0).images
+    assert not np.isfinite(image.get_array().filled(np.nan)).any()
+
+
 @pytest.mark.parametrize(
     ("count", "closed", "expected"),
     [
