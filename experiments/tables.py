@@ -75,7 +75,9 @@ def _section(path: Path, pictures: list[Path]) -> dict[str, Any]:
         "anchor": path.stem,
         "title": title,
         "body": Markup(html),
-        "pictures": [embedded(one, captions.get(one.stem, one.stem)) for one in pictures],
+        "pictures": [
+            embedded(one) | {"caption": captions.get(one.stem, one.stem)} for one in pictures
+        ],
     }
 
 

@@ -22,7 +22,7 @@ from .estimation.transform import Identity as Identity
 from .estimation.transform import Log as Log
 from .imaging.detection.tracking import detect_valve as detect_valve
 from .imaging.detection.trained_model import default_model as default_model
-from .imaging.reading.reader import read_volume as read_volume
+from .exchange.volumes import read_volume as read_volume
 from .imaging.volume import Modality as Modality
 from .mechanics.body import simulate_body as simulate_body
 from .mechanics.law.moduli import TransverselyIsotropic as TransverselyIsotropic

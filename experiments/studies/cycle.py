@@ -327,8 +327,7 @@ def _over_seeds(rows: Sequence[Row]) -> Table:
 
 def figure(results: Results) -> Figure:
     """What sets of frames could tell, beside the estimates if there are any."""
-    from mvest.reporting.figures import COLOURS, MARKERS
-    from mvest.reporting.style import SMALL, log_axis, panels
+    from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 
     estimated = "estimates" in results.table_names
     drawn, (axes,) = panels(1, 1 + estimated, 4.6)

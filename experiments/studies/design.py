@@ -439,7 +439,7 @@ def _deviations_figure(results: Results) -> Figure:
     """A panel for each knowledge of the nuisances: what is seen against frames."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    from mvest.reporting.style import SMALL, panels, plain_number
+    from mvest.reporting.figures import SMALL, panels, plain_number
 
     worse, target = _worse(results), float(results.first.numbers["target_percent"] or 0.0)
     norm = BoundaryNorm([0.0, *(m * target for m in MULTIPLES), np.inf], len(SHADES))
@@ -464,7 +464,7 @@ def _deviations_figure(results: Results) -> Figure:
 
 def _left_figure(results: Results) -> Figure:
     """A panel for each kind of error of the pressures and each geometry."""
-    from mvest.reporting.style import SMALL, levels, panels
+    from mvest.reporting.figures import SMALL, levels, panels
 
     medians = _medians(results)
     geometries = list(medians.index.unique("geometry"))

@@ -336,8 +336,7 @@ def check_external(values: Values, folder: Path) -> str:
 
 def figure(results: Results) -> Figure | None:
     """Each parameter, iterate by iterate, with each model."""
-    from mvest.reporting.figures import COLOURS, MARKERS
-    from mvest.reporting.style import GREY, SMALL, panels
+    from mvest.reporting.figures import COLOURS, GREY, MARKERS, SMALL, panels
 
     drawn = [one for one in results.first.estimates if one.iterates]
     if not drawn:

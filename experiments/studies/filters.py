@@ -268,7 +268,7 @@ def figure(results: Results) -> Figure:
     """95 % interval that each filter gives each unknown, on that of the reference."""
     from textwrap import fill
 
-    from mvest.reporting.style import BAD, GOOD, SMALL, headline, panels
+    from mvest.reporting.figures import BAD, GOOD, SMALL, headline, panels
 
     rows, references = results.table().rows, results.table("reference").rows
     methods = list(dict.fromkeys(row["filter"] for row in rows))

@@ -195,8 +195,7 @@ def _moments(orifice: FloatArray) -> list[int]:
 
 def _draw_curves(part: Any, values: Mapping[str, Any], moments: list[int], at_rest: bool) -> None:
     """Measures over time, the drawn moments marked; the equilibrium is at no time, so apart."""
-    from mvest.reporting.figures import COLOURS
-    from mvest.reporting.style import plain_axes
+    from mvest.reporting.figures import COLOURS, plain_axes
 
     time = np.array(values["time"], dtype=float)
     moving = len(time) - at_rest

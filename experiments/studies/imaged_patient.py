@@ -472,7 +472,7 @@ def figure(results: Results) -> dict[str, Figure]:
 
 def budget_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """What is left of each modulus' uncertainty without each part, and with it alone."""
-    from mvest.reporting.style import SMALL, headline, panels
+    from mvest.reporting.figures import SMALL, headline, panels
 
     moduli = dict.fromkeys(row["modulus"] for row in rows)
     parts = [part for part in dict.fromkeys(row["part"] for row in rows) if part != EVERYTHING]

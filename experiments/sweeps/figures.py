@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.runs import Z95, factors_of, good_of, is_number, runs_of, values_of
 from mvest.problem.registration import unit_of
-from mvest.reporting.figures import COLOURS
-from mvest.reporting.style import (
+from mvest.reporting.figures import (
     BAD,
+    COLOURS,
     GOOD,
     SEQUENTIAL,
     SMALL,

@@ -11,7 +11,6 @@ from mvest.problem.expectation import Expectation
 from mvest.problem.record import Confounded, confounded
 from mvest.problem.registration import unit_of
 from mvest.reporting.markup import MISSING, listed, number
-from mvest.typing import FloatArray
 
 MEASURED = {
     "pressure_scale": (0.02, "2 % (2.4 mmHg of 120)"),
@@ -25,7 +24,7 @@ MEASURED = {
 GAIN = 0.1
 """Least part of a modulus' standard deviation that a measurement worth naming takes away."""
 
-ALL_APART = "The data tell all parameters apart."
+ALL_APART, UNTOLD = "The data tell all parameters apart.", "not determined"
 
 
 def expectation_text(title: str, expected: Expectation, noise: str) -> str:
@@ -45,6 +44,8 @@ def expectation_text(title: str, expected: Expectation, noise: str) -> str:
         return unknown_text(title, expected.reason)
     assumed, prior = expected.assumed, expected.problem.prior
     low, high = (None, None) if informed is None else expected.interval()
+    sized = (assumed != 0.0) & np.isfinite(data.std)
+    shares = np.divide(data.std, abs(assumed), out=np.full(len(sized), np.nan), where=sized)
     rows = [
         {
             "parameter": name,
@@ -52,7 +53,7 @@ def expectation_text(title: str, expected: Expectation, noise: str) -> str:
             "assumed": number(float(assumed[k])),
             "± beforehand": number(float(prior.std[k]), 2),
             "± from the data alone": _width(float(data.std[k])),
-            "[%]": _percent(data, k, assumed),
+            "[%]": number(100.0 * float(shares[k]), 2),
             "± with both": MISSING if informed is None else _width(float(informed.std[k])),
             "95 % interval to expect": MISSING
             if low is None or high is None
@@ -88,26 +89,22 @@ def unknown_text(title: str, reason: str) -> str:
 
 def measurement_words(data: Identifiability) -> list[str]:
     """What to measure besides, how well, and what that gains; the largest gain first."""
-    moduli = [k for k, name in enumerate(data.names) if unit_of(name) == "MPa"]
+    moduli = np.array([k for k, name in enumerate(data.names) if unit_of(name) == "MPa"], dtype=int)
     found = []
     for name in data.names:
         accuracy, words = MEASURED.get(name.partition(".")[0], (0.0, ""))
-        if not accuracy or not moduli:
+        if not accuracy or not moduli.size:
             continue
-        std = data.measured(name, accuracy)
-        left = [std[k] / data.std[k] if np.isfinite(data.std[k]) else 0.0 for k in moduli]
+        now, then = data.std[moduli], data.measured(name, accuracy)[moduli]
+        left = np.divide(then, now, out=np.zeros(len(moduli)), where=np.isfinite(now))
         best = int(np.argmin(left))
-        if left[best] <= 1 - GAIN and np.isfinite(std[moduli[best]]):
-            k = moduli[best]
-            now, then = (100 * float(value[k] / data.scale[k]) for value in (data.std, std))
-            before = f"{number(now, 2)} %" if np.isfinite(now) else "not determined"
-            found.append(
-                (
-                    left[best],
-                    f"Measure {name} to {words}: {data.names[k]} would be known to "
-                    f"{number(then, 2)} % (now {before}).",
-                )
+        k = int(moduli[best])
+        if left[best] <= 1 - GAIN and np.isfinite(then[best]):
+            before, after = (
+                _percent(float(std[best]), float(data.scale[k])) for std in (now, then)
             )
+            known = f"{data.names[k]} would be known to {after} (now {before})"
+            found.append((left[best], f"Measure {name} to {words}: {known}."))
     return [words for _, words in sorted(found)]
 
 
@@ -141,12 +138,8 @@ def _change(name: str, change: float, relative: float) -> str:
 
 
 def _width(std: float) -> str:
-    return number(std, 2) if np.isfinite(std) else "not determined"
+    return number(std, 2) if np.isfinite(std) else UNTOLD
 
 
-def _percent(data: Identifiability, k: int, assumed: FloatArray) -> str:
-    """Of the assumed value; a dash for a parameter without size."""
-    std = float(data.std[k])
-    if assumed[k] == 0.0 or not np.isfinite(std):
-        return MISSING
-    return number(100.0 * std / abs(float(assumed[k])), 2)
+def _percent(std: float, size: float) -> str:
+    return f"{number(100.0 * std / size, 2)} %" if np.isfinite(std) else UNTOLD

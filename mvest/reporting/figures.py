@@ -1,7 +1,9 @@
-"""Figures of a run: how the estimate came about, and what all figures have in common.
+"""What all figures have in common: colours, sizes, axes, directions, and how they are written.
 
-Colours are those of Okabe and Ito, which people with colour-blindness can tell apart; every line is
-also distinguished by its marker. Nothing touches matplotlib's global state or needs a display.
+Sizes are meant for a page about 800 pixels wide, where a figure of 8.3 inches shows 9-point text at
+about 12 pixels. Colours are those of Okabe and Ito, which people with colour-blindness can tell
+apart, and every line is also distinguished by its marker; colour maps run evenly in lightness.
+Nothing touches matplotlib's global state or needs a display.
 """
 
 from __future__ import annotations
@@ -12,10 +14,13 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter, NullFormatter
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -26,14 +31,19 @@ from mvest.typing import FloatArray
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008)."""
+GOOD, BAD, GREY = COLOURS[0], COLOURS[1], "0.45"
 
 LEAFLET_COLOURS = np.array([[0.45, 0.70, 0.83], [0.91, 0.65, 0.45], [0.45, 0.79, 0.70]])
 """Of leaflets in the order of their regions, ``(3, 3)``: tints of the first of `COLOURS`, in which
 curves show their moduli, light enough to be shaded."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
-DISTANCE_MAP = "viridis"
+SEQUENTIAL, DISTANCE_MAP = "cividis", "viridis"
 DPI = 140
+WIDTH = 8.3
+"""Inches."""
+TEXT, SMALL = 10, 8.5
+"""Points, of titles and of everything else."""
 CHARACTERS_AN_INCH = 23
 """Of the line at the foot."""
 
@@ -70,12 +80,63 @@ VIEWS = (ATRIUM, SIDE)
 """The atrium is at positive z."""
 
 
+def panels(
+    rows: int, columns: int, height: float, *, sharex: Any = False, sharey: Any = False
+) -> tuple[Figure, Any]:
+    """A figure of the common width and its axes ``(rows, columns)``; height in inches."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
+    for one in axes.flat:
+        plain_axes(one)
+    return figure, axes
+
+
+def plain_axes(axes: Any) -> None:
+    """No frame on top and right, a faint grid behind the data, readable ticks."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=SMALL)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.label.set_size(SMALL + 0.5)
+
+
+def headline(figure: Figure, text: str, note: str) -> None:
+    """What the figure shows, left above everything, and below it how to read it."""
+    size = TEXT + 0.5
+    room = "\n" * (note.count("\n") + 1)
+    figure.suptitle(text + room, fontsize=size, x=0.01, ha="left", fontweight="bold")
+    # The empty lines of the title keep this place free.
+    below = 1.0 - (4.0 + 1.45 * size) / 72.0 / figure.get_figheight()
+    figure.text(0.01, below, note, fontsize=SMALL, color="0.25", va="top")
+
+
+def plain_number(value: float) -> str:
+    """A number for an axis or a cell: two digits, powers of ten only where they are shorter."""
+    if value == 0:
+        return "0"
+    if abs(value) < 1e-3 or abs(value) >= 1e5:
+        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{value:.2g}" if abs(value) < 10 else f"{value:.0f}"
+
+
+def log_axis(axis: Any) -> None:
+    """Label a logarithmic axis with 0.01, 0.1, 1 instead of powers of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def levels(n: int) -> Any:
+    """N colours in order from dark to light, light enough to part and dark enough to see."""
+    return colormaps["viridis"](np.linspace(0.0, 0.85, n))
+
+
 def iterates_figure(
     title: str,
     parameters: Sequence[str],
     iterates: Sequence[Sequence[float | None]],
     std: Sequence[Sequence[float | None]],
-    truth: Sequence[float | None] | None = None,
+    truth: Sequence[float | None],
 ) -> Figure:
     """Each parameter against the iteration, with its band of two standard deviations and the truth.
 
@@ -85,7 +146,8 @@ def iterates_figure(
     parameters : sequence of str, (p,)
     iterates, std : (i, p)
         At least one.
-    truth : (p,), optional
+    truth : (p,)
+        None where it is not known.
 
     Raises
     ------
@@ -94,21 +156,19 @@ def iterates_figure(
     """
     if not iterates:
         raise InputError(f"{title}: a run without iterates has nothing to draw")
-    m, s = (np.array(values, dtype=np.float64) for values in (iterates, std))
+    m, s, known = (np.array(values, dtype=np.float64) for values in (iterates, std, truth))
     figure = Figure(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.subplots()
     rounds = np.arange(len(m))
     for k, name in enumerate(parameters):
         colour = COLOURS[k % len(COLOURS)]
-        low, high = (m[:, k] + side * 2 * s[:, k] for side in (-1, 1))
+        low, high = m[:, k] - 2 * s[:, k], m[:, k] + 2 * s[:, k]
         axes.fill_between(rounds, low, high, color=colour, alpha=0.2, linewidth=0)
         axes.plot(rounds, m[:, k], color=colour, marker=MARKERS[k % len(MARKERS)], label=name)
-        known = None if truth is None else truth[k]
-        if known is not None:
-            axes.axhline(known, color=colour, linestyle="--", linewidth=1)
+        axes.axhline(known[k], color=colour, linestyle="--", linewidth=1)
     axes.set_xlabel("iteration")
-    units = {"MPa" for name in parameters if name.startswith("E_f.")}
-    axes.set_ylabel(f"modulus [{units.pop()}]" if units else "parameter")
+    is_modulus = any(name.startswith("E_f.") for name in parameters)
+    axes.set_ylabel("modulus [MPa]" if is_modulus else "parameter")
     axes.set_xticks(rounds if len(rounds) <= 12 else rounds[:: len(rounds) // 8])
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
@@ -131,10 +191,9 @@ def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False
     line = shown_text(line, LONGEST_LINE)
     foot = textwrap.fill(line, int(CHARACTERS_AN_INCH * figure.get_figwidth()))
     note = figure.supxlabel(foot, fontsize=5, color="grey", ha="center", parse_math=False)
-    written, layout = [], figure.get_layout_engine()
-    written.append(
-        write_atomically(Path(f"{base}.png"), lambda file: _save_png(figure, file, line))
-    )
+    layout = figure.get_layout_engine()
+    png = Path(f"{base}.png")
+    written = [write_atomically(png, lambda file: _save_png(figure, file, line))]
     # What is laid out need not be once more, which takes as long as drawing it.
     figure.set_layout_engine(None)
     if pdf:
@@ -168,8 +227,7 @@ def _show_texts(figure: Figure) -> None:
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_text(_printed(text.get_text()))
-    names = ("xaxis", "yaxis", "zaxis")
-    for axis in [getattr(a, name) for a in figure.axes for name in names if hasattr(a, name)]:
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
         if any(label.get_text() != _printed(label.get_text()) for label in axis.get_ticklabels()):
             before = axis.get_major_formatter()
             # Where names stand at the ticks.

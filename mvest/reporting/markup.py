@@ -19,30 +19,12 @@ ACTING = re.compile(
 )
 """Characters that turn others round, hide or cannot be written; no tab and no end of a line."""
 
+LATEX_WORDS = ("backslash", "asciitilde", "asciicircum", "less", "greater", "bar")
 LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "{": r"\{",
-        "}": r"\}",
-        "$": r"\$",
-        "%": r"\%",
-        "_": r"\_",
-        "&": r"\&",
-        "#": r"\#",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "<": r"\textless{}",
-        ">": r"\textgreater{}",
-        "|": r"\textbar{}",
-        "±": r"$\pm$",
-        "–": "--",
-        "×": r"$\times$",
-        "≤": r"$\leq$",
-        "≥": r"$\geq$",
-        "²": r"$^2$",
-        "\n": " ",
-        "\r": " ",
-    }
+    {character: f"\\{character}" for character in "{}$%_&#"}
+    | {name: rf"\text{word}{{}}" for name, word in zip("\\~^<>|", LATEX_WORDS, strict=True)}
+    | {"±": r"$\pm$", "–": "--", "×": r"$\times$", "≤": r"$\leq$", "≥": r"$\geq$", "²": r"$^2$"}
+    | dict.fromkeys("\n\r", " ")
 )
 
 
@@ -87,26 +69,8 @@ def markdown_rows(rows: Sequence[Mapping[str, str]]) -> str:
     )
 
 
-def latex_rows(rows: Sequence[Mapping[str, str]]) -> str:
-    r"""A booktabs table (``\usepackage{booktabs}``): first column left, the others right."""
-    header = [latex_text(name) for name in rows[0]]
-    body = [" & ".join(_cell(text) for text in row.values()) + r" \\" for row in rows]
-    return "\n".join(
-        [
-            r"\begin{tabular}{l" + "r" * (len(header) - 1) + "}",
-            r"\toprule",
-            " & ".join(header) + r" \\",
-            r"\midrule",
-            *body,
-            r"\bottomrule",
-            r"\end{tabular}",
-            "",
-        ]
-    )
-
-
-def _cell(text: str) -> str:
-    """Text in which numbers have a true minus and powers of ten."""
+def latex_cell(text: str) -> str:
+    """The same with a true minus of numbers, and their powers of ten."""
     signed = re.sub(r"(?<![\w$.-])-(?=\d)", "$-$", latex_text(text))
     return re.sub(
         r"(?<![\w.])(\d(?:\.\d+)?)e([+-]\d+)(?!\w)",

@@ -20,13 +20,13 @@ WEBP_QUALITY = 85
 """Thin lines and small print stay clean from about 80 on."""
 
 
-def embedded(path: Path, caption: str) -> dict[str, Any]:
+def embedded(path: Path) -> dict[str, Any]:
     """A picture within a page, no larger than it can be seen there.
 
     Returns
     -------
     dict
-        ``source`` (a data address), ``caption``, ``width`` and ``height`` in pixels.
+        ``source`` (a data address), ``width`` and ``height`` in pixels.
 
     Raises
     ------
@@ -40,18 +40,12 @@ def embedded(path: Path, caption: str) -> dict[str, Any]:
             image.paste(full, mask=full)
     except OSError as error:
         raise InputError(f"cannot read the picture {path}: {error}") from error
-    if image.width > WIDEST_PIXELS:
-        height = round(image.height * WIDEST_PIXELS / image.width)
-        image = image.resize((WIDEST_PIXELS, height), Image.Resampling.LANCZOS)
+    image.thumbnail((WIDEST_PIXELS, image.height), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
     image.save(stream, "WEBP", quality=WEBP_QUALITY, method=6)
     data = base64.b64encode(stream.getvalue()).decode("ascii")
-    return {
-        "source": Markup(f"data:image/webp;base64,{data}"),
-        "caption": caption,
-        "width": image.width,
-        "height": image.height,
-    }
+    source = Markup(f"data:image/webp;base64,{data}")
+    return {"source": source, "width": image.width, "height": image.height}
 
 
 TEMPLATES = Path(__file__).parent / "templates"

@@ -7,12 +7,14 @@ drawn as tissue, and what is left open in the colour of blood.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from pandas import DataFrame
 
 from mvest.errors import InputError
 from mvest.problem.fields import read_case_fields
@@ -22,11 +24,10 @@ from mvest.reporting.case.drawing import (
     draw_valve,
     leaflet_colours,
     name_leaflets,
-    paint_gap,
+    paint_leak,
     same_scale,
 )
-from mvest.reporting.figures import ATRIUM, COLOURS
-from mvest.reporting.style import SMALL, TEXT, plain_axes
+from mvest.reporting.figures import ATRIUM, COLOURS, SMALL, TEXT, plain_axes
 
 Row = Mapping[str, Any]
 
@@ -63,74 +64,68 @@ def scenarios_figure(
     InputError
         If the fields cannot be read.
     """
-    valve = read_case_fields(fields, turned=False)
+    valve = replace(read_case_fields(fields, turned=False), reach_mm=reach_mm)
     if valve.fitted is None:
         raise InputError(f"{fields}: no closed valves")
     figure = Figure(figsize=(max(2.7 * len(valve.frames), 8.0), 8.6), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=[1.0, 1.75])
     upper, lower = parts
-    panels = np.atleast_1d(upper.subplots(1, len(valve.frames)))
+    panels = upper.subplots(1, len(valve.frames), squeeze=False)[0]
     colours = leaflet_colours(valve.region)
-    patients = list(dict.fromkeys(row["patient"] for row in rows))
-    gaps = {
-        row["scenario"]: row["estimate"]
-        for row in rows
-        if row["measure"] == "gap_mm2" and row["patient"] == patients[0]
-    }
+    every = DataFrame(list(rows))
+    patients = list(every["patient"].unique())
+    first = every[(every["patient"] == patients[0]) & (every["measure"] == "gap_mm2")]
+    gaps = first.set_index("scenario")["estimate"]
     for axes, title, shape in zip(panels, valve.frames, valve.fitted, strict=True):
         if not np.isfinite(shape).all():
             axes.set_axis_off()
             axes.set_title(f"{title}\nnot closed: {failed.get(title, '')}", fontsize=SMALL)
             continue
         draw_valve(axes, valve, shape, colours, ATRIUM, 0)
-        paint_gap(axes, valve, shape, 0, reach_mm)
+        paint_leak(axes, valve, shape, 0)
         axes.set_title(f"{title}\ngap {gaps[title]:.1f} mm²", fontsize=TEXT)
     name_leaflets(panels[0], valve, ("anterior", "posterior"))
     known = [shape for shape in valve.fitted if np.isfinite(shape).all()]
-    same_scale(list(panels), [*known, valve.rest], ATRIUM)
+    same_scale(panels, [*known, valve.rest], ATRIUM)
     names = {"gap": BLOOD, "leaflets touch (between midsurfaces)": TISSUE}
     handles = [Patch(color=colour, label=label) for label, colour in names.items()]
     upper.legend(handles=handles, loc="lower right", fontsize=SMALL, frameon=False, ncols=2)
-    grid: Any = lower.subplots(2, 3)
+    grid = lower.subplots(2, 3)
     for axes, (measure, label) in zip(grid.flat, labels.items(), strict=False):
-        _draw_measure(axes, [r for r in rows if r["measure"] == measure], valve.frames, patients)
+        _draw_measure(axes, every[every["measure"] == measure], valve.frames, patients)
         axes.set_title(label, fontsize=SMALL, loc="left")
-    _draw_legend(lower, grid.flat[0])
+    keys, where = grid[0, 0].get_legend_handles_labels(), "outside lower center"
+    lower.legend(*keys, loc=where, fontsize=SMALL, frameon=False, ncols=4)
     title = "An estimated valve as observed and under changed conditions (simulated)"
     figure.suptitle(f"{title}\n", fontsize=TEXT + 2)
     return figure
 
 
 def _draw_measure(
-    axes: Any, rows: Sequence[Row], titles: Sequence[str], patients: Sequence[Any]
+    axes: Any, rows: DataFrame, titles: Sequence[str], patients: Sequence[Any]
 ) -> None:
+    """Draw one measure of all patients; matplotlib leaves out what is missing."""
     plain_axes(axes)
-    for row in rows:
-        number = patients.index(row["patient"])
-        x = titles.index(row["scenario"]) - 0.12 + (0.14 + 0.13 * number if number else 0.0)
-        colour = OTHER if number else COLOURS[0]
-        for low, high, width in (("wide_low", "wide_high", 0.8), ("low", "high", 2.5)):
-            if row[low] is not None:
-                axes.plot([x, x], [row[low], row[high]], color=colour, lw=width)
-        axes.plot(x, row["estimate"], "o", color=colour, ms=5)
-        for truth, marker, shade, size in (
-            ("truth_own_mesh", "x", COLOURS[1], 6),
-            ("truth_same_mesh", "_", "black", 9),
-        ):
-            if row[truth] is not None:
-                axes.plot(x, row[truth], marker, color=shade, ms=size, zorder=4)
+    further = rows["patient"].map(patients.index)
+    x = rows["scenario"].map(titles.index) - 0.12 + (0.14 + 0.13 * further) * (further > 0)
+    numbers = rows.filter(regex="low|high|estimate|truth").astype(float)
+    for own, colour, label in (
+        (
+            further == 0,
+            COLOURS[0],
+            "estimate (drawn above), 95 %: thick samples, thin with the mesh",
+        ),
+        (further > 0, OTHER, "further simulated patients"),
+    ):
+        at, of = x[own], numbers[own]
+        axes.vlines(at, of["wide_low"], of["wide_high"], color=colour, lw=0.8)
+        axes.vlines(at, of["low"], of["high"], color=colour, lw=2.5)
+        axes.plot(at, of["estimate"], "o", color=colour, ms=5)
+        axes.errorbar([], [], yerr=[], fmt="o", color=colour, label=label)
+    for truth, label, marker, colour, size in (
+        ("truth_own_mesh", "true valve (its own mesh)", "x", COLOURS[1], 6),
+        ("truth_same_mesh", "true valve (same mesh)", "_", "black", 9),
+    ):
+        axes.plot(x, numbers[truth], marker, color=colour, ms=size, zorder=4, label=label)
     axes.set_xticks(range(len(titles)), titles, fontsize=SMALL, rotation=20, ha="right")
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-
-
-def _draw_legend(figure: Any, axes: Any) -> None:
-    for label, colour in (
-        ("estimate (drawn above), 95 %: thick samples, thin with the mesh", COLOURS[0]),
-        ("further simulated patients", OTHER),
-    ):
-        axes.errorbar([], [], yerr=[], fmt="o", color=colour, label=label)
-    axes.plot([], [], "x", color=COLOURS[1], label="true valve (its own mesh)")
-    axes.plot([], [], "_", color="black", label="true valve (same mesh)")
-    handles, labels = axes.get_legend_handles_labels()
-    where = "outside lower center"
-    figure.legend(handles, labels, loc=where, fontsize=SMALL, frameon=False, ncols=4)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.skill import GENERIC, skill
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
@@ -53,12 +55,8 @@ def stated(estimate: EstimateRecord) -> list[Unknown]:
 
 def interval(label: str, unknown: Unknown | None) -> dict[str, Any]:
     """Cells of an estimate with its 95 % interval."""
-    return {
-        label: unknown and unknown.estimate,
-        f"{label} low": unknown and unknown.low,
-        f"{label} high": unknown and unknown.high,
-        f"{label} inside": unknown and unknown.inside,
-    }
+    cells = {label: "estimate"} | {f"{label} {end}": end for end in ("low", "high", "inside")}
+    return {cell: getattr(unknown, name, None) for cell, name in cells.items()}
 
 
 def interval_columns(label: str, *, hidden: bool = False) -> dict[str, Column]:
@@ -134,13 +132,11 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure
 
 def _draw_modulus(axes: Any, at: float, own: Unknown, trust: str) -> None:
     """One estimate over its truth, and the generic guess."""
-    assert own.truth is not None
+    numbers = np.array([own.low, own.estimate, own.high, own.prior_mean], dtype=float)
+    low, middle, high, guess = numbers / float(own.truth or np.nan)
     colour = COLOURS[trust]
-    if own.prior_mean is not None:
-        axes.plot(own.prior_mean / own.truth, at, "|", color="0.6", ms=5, zorder=1)
-    if own.estimate is None or own.low is None or own.high is None:
+    axes.plot(guess, at, "|", color="0.6", ms=5, zorder=1)
+    axes.plot([low, high], [at, at], color=colour, lw=1.3)
+    axes.plot(middle, at, "o", color=colour, mfc="white" if trust == NONE else colour, ms=3.5)
+    if own.estimate is None:
         axes.text(1.0, at, "no estimate", fontsize=7, ha="center", va="center")
-        return
-    axes.plot([own.low / own.truth, own.high / own.truth], [at, at], color=colour, lw=1.3)
-    fill = "white" if trust == NONE else colour
-    axes.plot(own.estimate / own.truth, at, "o", color=colour, mfc=fill, ms=3.5)

@@ -9,12 +9,13 @@ LaTeX) round, and join what belongs together.
 from __future__ import annotations
 
 import math
+from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 from mvest.errors import InputError
-from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
+from mvest.reporting.markup import MISSING, latex_cell, latex_text, markdown_rows, number
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -98,30 +99,23 @@ class Table:
         import pandas as pd
 
         # Not with another type for whole numbers where one is missing: 3 stays 3 in a file.
-        whole = {
-            name: "Int64"
-            for name, values in self.values.items()
-            if None in values and _kinds(values) == {int}
-        }
+        kinds = {name: {*map(type, values)} for name, values in self.values.items()}
+        whole = {name: "Int64" for name, kind in kinds.items() if kind == {int, type(None)}}
         return pd.DataFrame(dict(self.values)).astype(whole)
 
     def csv(self) -> str:
         """The table for programs: a heading says its unit as ``name [unit]``."""
-        frame = self.frame
-        headings = {
-            name: f"{name} [{self._column(name).unit}]" if self._column(name).unit else name
-            for name in self.values
-        }
-        return str(frame.rename(columns=headings).to_csv(index=False))
+        units = {name: self._column(name).unit for name in self.values}
+        headings = [f"{name} [{unit}]" if unit else name for name, unit in units.items()]
+        return str(self.frame.to_csv(index=False, header=headings))
 
     def readable(self) -> list[dict[str, str]]:
         """Rows as readers see them: rounded, and joined with what belongs to a column."""
         joined = {
             other
-            for name in self.values
-            for column in [self._column(name)]
+            for name, column in self.columns.items()
             for other in (column.std, column.low, column.high)
-            if other and other != name
+            if name in self.values and other != name
         }
         shown = [n for n in self.values if n not in joined and not self._column(n).hidden]
         return [{self._heading(name): self._cell(name, row) for name in shown} for row in self.rows]
@@ -132,9 +126,17 @@ class Table:
         return markdown_rows(rows) if rows else "No rows."
 
     def latex(self) -> str:
-        """The readable table in LaTeX."""
-        rows = self.readable()
-        return latex_rows(rows) if rows else "% no rows\n"
+        r"""The readable table in LaTeX, with ``\usepackage{booktabs}``; first column left."""
+        import pandas as pd
+
+        rows = [
+            {latex_text(name): latex_cell(text) for name, text in row.items()}
+            for row in self.readable()
+        ]
+        if not rows:
+            return "% no rows\n"
+        sides = "l" + "r" * (len(rows[0]) - 1)
+        return str(pd.DataFrame(rows).to_latex(index=False, escape=False, column_format=sides))
 
     def text(self) -> str:
         """The readable table for a terminal; few wide rows stand beside each other."""
@@ -183,8 +185,8 @@ class Table:
         return f"{label} ({column.unit})" if column.unit else label
 
     def _cell(self, name: str, row: Mapping[str, Any]) -> str:
-        column, value = self._column(name), row[name]
-        text = column.text(value)
+        column = self._column(name)
+        text = column.text(row[name])
         if text == MISSING:
             return text
         std, low, high, truth = (
@@ -195,8 +197,7 @@ class Table:
             text += f" ± {shown if column.digits else number(std, 2)}"
         if low is not None and high is not None:
             text += f" ({column.text(low)} to {column.text(high)})"
-            if truth is not None and not low <= truth <= high:
-                text += " ✗"
+            text += " ✗" if truth is not None and not low <= truth <= high else ""
         return text
 
 
@@ -208,8 +209,8 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     rows : iterable or DataFrame
         NumPy scalars become plain numbers, numbers that are not finite None.
     **columns : Column or str
-        What columns mean; a text is ``unit`` or ``unit:digits``, for example ``"mm:.2f"``. Named
-        columns come first, in this order.
+        What columns mean; a text is ``unit:digits:label``, for example ``"mm:.2f"``, of which what
+        follows may be missing. Named columns come first, in this order.
 
     Raises
     ------
@@ -243,9 +244,7 @@ def joined(tables: Mapping[str, Table], key: str = "run") -> Table:
         Its name.
     """
     names = list(dict.fromkeys(name for part in tables.values() for name in part.values))
-    columns: dict[str, Column] = {}
-    for part in tables.values():
-        columns = {**part.columns, **columns}
+    columns = dict(ChainMap(*(dict(part.columns) for part in tables.values())))
     rows = [{key: label, **row} for label, part in tables.items() for row in part.rows]
     return Table({name: [row.get(name) for row in rows] for name in [key, *names]}, columns)
 
@@ -253,29 +252,21 @@ def joined(tables: Mapping[str, Table], key: str = "run") -> Table:
 def _column(spec: Column | str) -> Column:
     if isinstance(spec, Column):
         return spec
-    unit, _, digits = spec.partition(":")
-    return Column(unit, digits)
+    unit, digits, label = [*spec.split(":", 2), "", ""][:3]
+    return Column(unit, digits, label=label)
 
 
 def _plain_rows(rows: Iterable[Any] | DataFrame) -> list[dict[str, Any]]:
     given: Iterable[Any] = rows.to_dict("records") if hasattr(rows, "to_dict") else rows
     found = []
     for row in given:
-        values = asdict(row) if is_dataclass(row) and not isinstance(row, type) else dict(row)
+        values = asdict(row) if is_dataclass(row) and not isinstance(row, type) else row
         found.append({str(name): _plain(value) for name, value in values.items()})
     return found
 
 
 def _plain(value: Any) -> Any:
     value = value.item() if hasattr(value, "item") else value
-    if isinstance(value, float) and not math.isfinite(value):
+    if type(value).__name__ == "NAType" or (isinstance(value, float) and not math.isfinite(value)):
         return None
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if type(value).__name__ == "NAType":
-        return None
-    return str(value)
-
-
-def _kinds(values: Sequence[Any]) -> set[type]:
-    return {type(value) for value in values if value is not None}
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)

@@ -319,4 +319,4 @@ def test_the_code_that_closes_valves_is_part_of_what_decides_them():
     parts = SOURCES.reached("mvest.closure.model")
     reached = ("elements", "closure.anchors", "mechanics.law.biot", "valve.mesh.solid_mesh")
     assert parts >= {f"mvest.{name}" for name in reached}
-    assert "mvest.reporting.style" not in parts
+    assert "mvest.reporting.figures" not in parts

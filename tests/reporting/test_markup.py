@@ -2,12 +2,12 @@ import pytest
 from markdown_it import MarkdownIt
 
 from mvest.reporting.markup import (
-    latex_rows,
     latex_text,
     markdown_rows,
     markdown_text,
     number,
 )
+from mvest.reporting.tables import table
 
 HOSTILE = r"<script>alert('x')</script> | `a` *b* [c](javascript:d) _e_ 5 % & $x$ \input{f} #1 ~"
 
@@ -38,7 +38,7 @@ def test_latex_prints_every_special_character() -> None:
 
 
 def test_latex_table_has_equal_rows_and_true_numbers() -> None:
-    tex = latex_rows([{"a": "P & Q", "b": "-3.5e-05 ± 1.0e-06"}, {"a": "x-y", "b": "–"}])
+    tex = table([{"a": "P & Q", "b": "-3.5e-05 ± 1.0e-06"}, {"a": "x-y", "b": "–"}]).latex()
     lines = [line for line in tex.splitlines() if line.endswith(r"\\")]
     assert [line.count(" & ") for line in lines] == [1, 1, 1]
     assert r"P \& Q & $-$$3.5\times10^{-5}$ $\pm$ $1.0\times10^{-6}$ \\" in tex

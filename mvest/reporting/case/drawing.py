@@ -17,7 +17,7 @@ from mvest.problem.fields import CaseFields
 from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, View
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
-from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane
+from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import Gap, find_gap
 
 BLOOD = (0.70, 0.05, 0.10)
@@ -43,8 +43,8 @@ MAX_SPLITS = 2
 LINE_PIECES = 6
 SCALE_MM = 10.0
 
-Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Triangles ``(k, 3, 2)`` on the page, their depth ``(k,)``, colour ``(k, 3)`` and line width."""
+Part: TypeAlias = tuple[FloatArray, FloatArray, float]
+"""Corners of triangles ``(k, 3, 3)`` mm, their colours ``(k, 3)`` and their width of line."""
 
 
 def leaflet_colours(region: IntArray) -> FloatArray:
@@ -83,21 +83,20 @@ def draw_valve(
     known = np.isfinite(points[fields.triangles]).all(axis=(1, 2))
     parts = [_surface(points, fields.triangles[known], colours[known], view, strength)]
     for loop, width in ((fields.annulus, 1.8), (fields.free_edge, 0.7)):
-        if len(loop):
-            start, end = points[loop], points[np.roll(loop, -1)]
-            parts.append(_lines(start, end, view, LINE, width))
-    if chords and len(fields.chord_tip):
-        ends = fields.chords(points, frame)
-        parts.append(_lines(ends[:, 0], ends[:, 1], view, CHORD, 0.6))
-    if chords and fields.tips.shape[1]:
+        ends = np.stack([points[loop], points[np.roll(loop, -1)]], axis=1)
+        parts.append(_lines(ends, view, LINE, width))
+    if chords:
+        parts.append(_lines(fields.chords(points, frame), view, CHORD, 0.6))
         parts.append(_dots(fields.tips[frame], view, TIP))
-    polygons, depth, colour, widths = (np.concatenate(of) for of in zip(*parts, strict=True))
-    order = np.argsort(depth, kind="stable")
+    seen = np.concatenate([corners @ view.axes for corners, _, _ in parts])
+    order = np.argsort(seen[..., 2].mean(axis=1), kind="stable")
+    colour = np.concatenate([colour for _, colour, _ in parts])[order]
+    widths = np.repeat([width for *_, width in parts], [len(corners) for corners, *_ in parts])
     axes.add_collection(
         PolyCollection(
-            list(polygons[order]),
-            facecolors=colour[order],
-            edgecolors=colour[order],
+            list(seen[order, :, :2]),
+            facecolors=colour,
+            edgecolors=colour,
             linewidths=widths[order],
             capstyle="round",
             joinstyle="round",
@@ -127,13 +126,7 @@ def _surface(
     light = view.axes @ np.array([-0.40, 0.45, 0.80])
     # Both sides are lit alike.
     shade = 1.0 - strength * (1.0 - np.abs(direction @ light))
-    seen = corner @ view.axes
-    return (
-        seen[..., :2],
-        seen[..., 2].mean(axis=1),
-        np.clip(colours.mean(axis=1) * shade[:, None], 0, 1),
-        np.full(len(seen), 0.3),
-    )
+    return corner, np.clip(colours.mean(axis=1) * shade[:, None], 0, 1), 0.3
 
 
 def quartered(values: FloatArray) -> FloatArray:
@@ -144,107 +137,65 @@ def quartered(values: FloatArray) -> FloatArray:
     return np.concatenate([np.stack(triangle, axis=1) for triangle in corners])
 
 
-def _lines(
-    start: FloatArray, end: FloatArray, view: View, colour: FloatArray, width: float
-) -> Part:
-    """Straight lines in pieces, each a triangle without area; NaN are left out."""
-    known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+def _lines(ends: FloatArray, view: View, colour: FloatArray, width: float) -> Part:
+    """Straight lines ``(k, 2, 3)`` in pieces, each a triangle without area; NaN are left out."""
+    start, end = ends[np.isfinite(ends).all(axis=(1, 2))].swapaxes(0, 1)
     share = np.linspace(0, 1, LINE_PIECES + 1)[:, None, None]
-    beads = (start[known] + share * (end[known] - start[known])) @ view.axes
+    beads = start + share * (end - start) + LIFT_MM * view.axes[:, 2]
     a, b = beads[:-1].reshape(-1, 3), beads[1:].reshape(-1, 3)
-    return (
-        np.stack([a, b, a], axis=1)[..., :2],
-        (a[:, 2] + b[:, 2]) / 2 + LIFT_MM,
-        np.tile(colour, (len(a), 1)),
-        np.full(len(a), width),
-    )
+    return np.stack([a, b, a], axis=1), np.tile(colour, (len(a), 1)), width
 
 
 def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
     """Discs that face the eye, of triangles around their centres."""
     angle = np.linspace(0, 2 * np.pi, 25)
-    rim = TIP_RADIUS_MM * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    seen = centres @ view.axes
+    rim = TIP_RADIUS_MM * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ view.axes[:, :2].T
     disc = np.stack([0 * rim[:-1], rim[:-1], rim[1:]], axis=1)
-    polygons = (seen[:, None, None, :2] + disc).reshape(-1, 3, 2)
-    count = len(polygons)
-    return (
-        polygons,
-        np.repeat(seen[:, 2], len(disc)),
-        np.tile(colour, (count, 1)),
-        np.full(count, 0.3),
-    )
+    corners = (centres[:, None, None] + disc).reshape(-1, 3, 3)
+    return corners, np.tile(colour, (len(corners), 1)), 0.3
 
 
-def gap_of(
-    fields: CaseFields, points: FloatArray, frame: int, reach_mm: float
-) -> tuple[Gap, AnnulusPlane]:
-    """The gap of a valve at ``points (n, 3)`` mm, and the plane of its annulus; see `paint_gap`."""
+def leak_of(fields: CaseFields, points: FloatArray, frame: int) -> tuple[Gap, FloatArray] | None:
+    """The gap of a valve at ``points (n, 3)`` mm, and where the corners of its pixels lie.
+
+    Corners ``(rows + 1, columns + 1, 3)`` mm are about as deep as the nearest leaflets. Papillary
+    tips are those of the frame. None if it is not known within which distance leaflets touch, or
+    some of the points were not seen.
+    """
+    if fields.reach_mm is None or not np.isfinite(points).all():
+        return None
     annulus = points[fields.annulus]
     first = annulus[fields.vertex_region[fields.annulus] == 0]
     plane = annulus_plane(annulus, fields.tips[frame].mean(axis=0), first.mean(axis=0))
-    return find_gap(points, fields.triangles, annulus, plane, reach_mm), plane
-
-
-def gap_corners(gap: Gap, plane: AnnulusPlane, coarser: int = 1) -> FloatArray:
-    """Where the corners ``(rows + 1, columns + 1, 3)`` mm of a gap's pixels lie.
-
-    They are about as deep as the nearest leaflets. Of ``coarser`` pixels along both directions
-    there is one.
-    """
+    gap = find_gap(points, fields.triangles, annulus, plane, fields.reach_mm)
     between = (gap.slit | gap.open).astype(np.float64)
     width = SMOOTHED_MM / gap.resolution
     near = gaussian_filter(between, width)
     smooth = gaussian_filter(np.where(between > 0, gap.level, 0.0), width)
     level = np.divide(smooth, near, out=gap.level.copy(), where=near > NEGLIGIBLE)
-    level = np.pad(level[::coarser, ::coarser], ((0, 1), (0, 1)), mode="edge")
-    anterior, lateral = (
-        first + gap.resolution * coarser * (np.arange(count) - 0.5)
+    level = np.pad(level, ((0, 1), (0, 1)), mode="edge")
+    across = (
+        first + gap.resolution * (np.arange(count) - 0.5)
         for first, count in zip((gap.anterior[0], gap.lateral[0]), level.shape, strict=True)
     )
-    corners: FloatArray = (
-        plane.origin
-        + anterior[:, None, None] * plane.anterior
-        + lateral[:, None] * plane.lateral
-        + level[..., None] * plane.normal
-    )
-    return corners
-
-
-def paint_gap(
-    axes: Any, fields: CaseFields, points: FloatArray, frame: int, reach_mm: float = 0.0
-) -> None:
-    """Draw what is open of a valve seen from the atrium, and the slit where leaflets touch.
-
-    Parameters
-    ----------
-    axes : matplotlib Axes
-    fields : CaseFields
-    points : ndarray
-        ``(n, 3)`` mm.
-    frame : int
-        Whose papillary tips are below the valve.
-    reach_mm : float
-        Distance of midsurfaces within which leaflets touch.
-    """
-    gap, plane = gap_of(fields, points, frame, reach_mm)
-    between = gap.slit | gap.open
-    if not between.any():
-        return
-    away, nearest = distance_transform_edt(~between, return_indices=True)
-    image = np.where(gap.open[tuple(nearest)][..., None], (*BLOOD, 1.0), (*TISSUE, 1.0))
-    image[gap.resolution * away > UNDER_MM, 3] = 0.0
-    x, y, _ = np.moveaxis(gap_corners(gap, plane), 2, 0)
-    axes.pcolormesh(x, y, image, zorder=0, rasterized=True)
+    places = np.stack([*np.meshgrid(*across, indexing="ij"), level], axis=-1)
+    corners = plane.origin + places @ np.stack([plane.anterior, plane.lateral, plane.normal])
+    return gap, corners
 
 
 def paint_leak(axes: Any, fields: CaseFields, points: FloatArray, frame: int) -> None:
-    """Draw the gap of a closed valve, and the slit where leaflets touch, if it knows their reach.
+    """Draw what is open of a valve seen from the atrium, and the slit where leaflets touch.
 
-    Nothing is drawn where some of the ``points (n, 3)`` were not seen; see `paint_gap`.
+    Nothing is drawn where `leak_of` is not known; its parameters are the same.
     """
-    if fields.reach_mm is not None and np.isfinite(points).all():
-        paint_gap(axes, fields, points, frame, fields.reach_mm)
+    leak = leak_of(fields, points, frame)
+    if leak is None or not (between := leak[0].slit | leak[0].open).any():
+        return
+    gap, corners = leak
+    away, nearest = distance_transform_edt(~between, return_indices=True)
+    image = np.where(gap.open[tuple(nearest)][..., None], (*BLOOD, 1.0), (*TISSUE, 1.0))
+    image[gap.resolution * away > UNDER_MM, 3] = 0.0
+    axes.pcolormesh(corners[..., 0], corners[..., 1], image, zorder=0, rasterized=True)
 
 
 def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str]) -> None:

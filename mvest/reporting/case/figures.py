@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
-from mvest.problem.fields import CaseFields, read_case_fields, turn_of
+from mvest.problem.fields import CaseFields, case_fields, read_case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     UNSEEN,
@@ -23,7 +23,7 @@ from mvest.reporting.case.drawing import (
     paint_leak,
     same_scale,
 )
-from mvest.reporting.figures import ATRIUM, COLOURS, DISTANCE_MAP, SIDE, VIEWS
+from mvest.reporting.figures import ATRIUM, COLOURS, DISTANCE_MAP, SIDE, TEXT, VIEWS
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
@@ -36,41 +36,63 @@ TWO_SIDED = 1.96
 """Standard deviations within which 95 % of a normal distribution lie."""
 
 
+class _Shape(NamedTuple):
+    """A valve at ``points (n, 3)`` mm with the papillary tips of a frame.
+
+    Where it has ``colours (m, 3, 3)`` of the corners of its triangles, neither chordae nor tips are
+    drawn, so that they are seen.
+    """
+
+    title: str
+    fields: CaseFields
+    points: FloatArray
+    frame: int
+    colours: FloatArray | None = None
+
+
 def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     """The valve at rest and in the closed frame (observed, personalised), from two sides."""
-    k = fields.closed
-    shapes: list[tuple[str, FloatArray, int]] = [("open (reference)", fields.rest, 0)]
-    if fields.observed is not None:
-        shapes.append(("closed, observed", fields.observed[k], k + 1))
-    if fields.fitted is not None:
-        shapes.append(("closed, personalised model", fields.fitted[k], k + 1))
-    elif fields.generic is not None:
-        shapes.append(("closed, generic model", fields.generic[k], k + 1))
-    return _views_figure([(title, fields, points, frame) for title, points, frame in shapes], names)
+    k, model = fields.closed, "generic" if fields.fitted is None else "personalised"
+    closed = {
+        "closed, observed": fields.observed,
+        f"closed, {model} model": fields.generic if fields.fitted is None else fields.fitted,
+    }
+    shapes = [_Shape("open (reference)", fields, fields.rest, 0)]
+    for title, points in closed.items():
+        if points is not None:
+            shapes.append(_Shape(title, fields, points[k], k + 1))
+    return _views_figure(shapes, names, (3.0 * len(shapes), 5.9), 1.15)[0]
 
 
 def _views_figure(
-    shapes: Sequence[tuple[str, CaseFields, FloatArray, int]], names: Sequence[str]
-) -> Figure:
-    """Shapes of valves from two sides: title, valve, positions ``(n, 3)`` mm and whose tips."""
-    figure = Figure(figsize=(3.0 * len(shapes), 5.9), layout="constrained")
-    grid = figure.subplots(2, len(shapes), squeeze=False, height_ratios=[1.0, 1.15])
-    for row, view in enumerate(VIEWS):
+    shapes: Sequence[_Shape], names: Sequence[str], size: tuple[float, float], lower: float
+) -> tuple[Figure, Any]:
+    """Shapes of valves from two sides, the lower row so many times as high as the upper one."""
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(2, len(shapes), squeeze=False, height_ratios=[1.0, lower])
+    for row, view in zip(grid, VIEWS, strict=True):
         reach = []
-        for axes, (title, fields, points, frame) in zip(grid[row], shapes, strict=True):
-            colours = leaflet_colours(fields.region)
+        for axes, (title, fields, points, frame, colours) in zip(row, shapes, strict=True):
             shut = view is ATRIUM and frame > 0
-            # Seen from the atrium, a closed valve hides them.
-            draw_valve(axes, fields, points, colours, view, frame, chords=not shut)
+            reach.append(points)
+            if colours is not None:
+                draw_valve(axes, fields, points, colours, view, frame, strength=0.3)
+            else:
+                # Seen from the atrium, a closed valve hides its chordae and tips.
+                own = leaflet_colours(fields.region)
+                draw_valve(axes, fields, points, own, view, frame, chords=not shut)
+                reach += [fields.tips[frame]] if view is SIDE else []
             if shut:
                 paint_leak(axes, fields, points, frame)
-            reach += [points, fields.tips[frame]] if view is SIDE else [points]
-            if row == 0:
-                axes.set_title(title, fontsize=10, pad=10)
+            if view is ATRIUM:
+                axes.set_title(title, fontsize=TEXT, pad=10)
                 name_leaflets(axes, fields, names)
-        same_scale(grid[row], reach, view)
-        _say_view(grid[row, 0], f"seen {view.name}")
-    return figure
+        same_scale(row, reach, view)
+        row[0].text(
+            -0.03, 0.5, f"seen {view.name}", transform=row[0].transAxes, rotation=90, ha="right",
+            va="center", fontsize=9,
+        )  # fmt: skip
+    return figure, grid
 
 
 def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
@@ -88,33 +110,34 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
 
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
-    shapes, none = [], np.zeros(0, dtype=np.int64)
+    shapes = []
+    insertion = (chordae.insertion - middle) @ axes
     for frame in case.frames:
         at_rest, shut = frame.role is Role.REFERENCE, frame.role is Role.CLOSED
         vertices, annulus = ((x - middle) @ axes for x in (frame.vertices, frame.annulus))
         ring = cKDTree(annulus)
-        gaps = [(np.mean(ring.query(vertices[loop])[0]), loop) for loop in
-                boundary_loops(frame.triangles)]  # fmt: skip
-        loops = [loop for _, loop in sorted(gaps, key=lambda one: float(one[0]))]
-        insertion = (chordae.insertion - middle) @ axes
-        fields = CaseFields(
-            frame.triangles,
-            frame.region,
-            vertices,
-            loops[0],
-            loops[-1],
-            (frame.name,),
-            np.array([True]),
-            np.stack([(frame.papillary_tips - middle) @ axes] * 2),
-            chordae.tip if at_rest else none,
-            np.asarray(cKDTree(vertices).query(insertion)[1]) if at_rest else none,
-            {},
-            reach_mm=reach_mm if shut else None,
-        )
+        loops = boundary_loops(frame.triangles)
+        loops.sort(key=lambda loop: float(np.mean(ring.query(vertices[loop])[0])))
+        arrays: dict[str, Any] = {
+            "triangles": frame.triangles,
+            "region": frame.region,
+            "rest": vertices,
+            "annulus": loops[0],
+            "free_edge": loops[-1],
+            "frames": [frame.name],
+            "seen": [True],
+            "tips": np.stack([(frame.papillary_tips - middle) @ axes] * 2),
+        }
+        if at_rest:
+            arrays["chord_tip"] = chordae.tip
+            arrays["chord_insertion"] = cKDTree(vertices).query(insertion)[1]
+        if shut:
+            arrays["reach_mm"] = reach_mm
+        fields = case_fields(arrays, turned=False)
         title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         # Of a closed one the gap is drawn, as of a frame that is not the reference.
-        shapes.append((title, fields, vertices, int(shut)))
-    return _views_figure(shapes, surface.region_names)
+        shapes.append(_Shape(title, fields, vertices, int(shut)))
+    return _views_figure(shapes, surface.region_names, (3.0 * len(shapes), 5.9), 1.15)[0]
 
 
 def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
@@ -139,53 +162,26 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
         raise InputError("Figure 3 needs the generic and the personalised closed valve")
     if fields.distance_generic is None or fields.distance_fitted is None:
         raise InputError("Figure 3 needs the distances of the generic and the personalised valve")
-    panels = (
-        ("generic stiffness", fields.generic[k], fields.distance_generic[k]),
-        ("personalised stiffness", fields.fitted[k], fields.distance_fitted[k]),
-    )
-    top = distance_top(*(distance for _, _, distance in panels))
+    distances = fields.distance_generic[k], fields.distance_fitted[k]
+    top = distance_top(*distances)
     scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
-    figure = Figure(figsize=(8.6, 6.6), layout="constrained")
-    grid = figure.subplots(2, 2, height_ratios=[1.25, 1.0])
-    for row, view in enumerate(VIEWS):
-        for column, (title, points, distance) in enumerate(panels):
-            axes = grid[row, column]
-            colours = corner_colours(scale, distance, fields.triangles)
-            draw_valve(axes, fields, points, colours, view, k + 1, strength=0.3)
-            if row == 0:
-                paint_leak(axes, fields, points, k + 1)
-                axes.set_title(f"{title}\n{Spread.of(distance)} mm", fontsize=11, pad=10)
-                name_leaflets(axes, fields, names)
-        same_scale(grid[row], [points for _, points, _ in panels], view)
-        _say_view(grid[row, 0], f"seen {view.name}")
-    beyond = any(np.nanmax(distance) > top for _, _, distance in panels)
-    bar = figure.colorbar(
-        scale, ax=grid, shrink=0.7, pad=0.02, extend="max" if beyond else "neither"
-    )
+    shapes = [
+        _Shape(
+            f"{title} stiffness\n{Spread.of(distance)} mm",
+            fields,
+            points[k],
+            k + 1,
+            corner_colours(scale, distance, fields.triangles),
+        )
+        for title, points, distance in zip(
+            ("generic", "personalised"), (fields.generic, fields.fitted), distances, strict=True
+        )
+    ]
+    figure, grid = _views_figure(shapes, names, (8.6, 6.6), 0.8)
+    beyond = "max" if np.nanmax(distances) > top else "neither"
+    bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.02, extend=beyond)
     bar.set_label("distance from the observed closed valve [mm]")
     return figure
-
-
-MIDSURFACES = (
-    "Drawn are midsurfaces: leaflets that touch lie a thickness apart. What opens between them "
-    "without a leak is grey or, where their reach is not known, white; a gap is red."
-)
-
-
-def figure3_caption(fields: CaseFields) -> str:
-    """What Figure 3 shows, with the mean ± SD of both panels."""
-    k = fields.closed
-    if fields.distance_generic is None or fields.distance_fitted is None:
-        raise InputError("Figure 3 needs the distances of the generic and the personalised valve")
-    generic, fitted = Spread.of(fields.distance_generic[k]), Spread.of(fields.distance_fitted[k])
-    count = np.isfinite(fields.distance_fitted[k]).sum()
-    return (
-        f"The closed valve (frame “{fields.frames[k]}”), coloured by the distance of each point "
-        f"from where the valve was observed; mean ± standard deviation over {count} points. "
-        f"Left: generic stiffness, {generic} mm (largest {generic.max:.2f} mm). Right: "
-        f"personalised stiffness, {fitted} mm (largest {fitted.max:.2f} mm). Both on one colour "
-        "scale; black line: annulus. Grey: not observed. " + MIDSURFACES
-    )
 
 
 def fitted_figure(fields: Path) -> Figure:
@@ -209,27 +205,20 @@ def fitted_figure(fields: Path) -> Figure:
     if valve.fitted is None or valve.distance_fitted is None:
         raise InputError(f"{fields}: no fields of a fitted valve")
     k = valve.closed
-    largest = float(np.nanmax(valve.distance_fitted[k]))
+    distance = valve.distance_fitted[k]
+    largest = float(np.nanmax(distance))
     # In the unit in which the largest is a number above 0.1.
     unit, factor = next(
         ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * largest >= 0.1), ("nm", 1e6)
     )
     scale = ScalarMappable(Normalize(0.0, max(factor * largest, 1e-3)), DISTANCE_MAP)
-    coloured = corner_colours(scale, factor * valve.distance_fitted[k], valve.triangles)
+    coloured = corner_colours(scale, factor * distance, valve.triangles)
     shapes = (
-        ("open", valve.rest, leaflet_colours(valve.region), 0),
-        ("closed", valve.fitted[k], coloured, k + 1),
+        _Shape("open", valve, valve.rest, 0, leaflet_colours(valve.region)),
+        _Shape("closed", valve, valve.fitted[k], k + 1, coloured),
     )
-    figure = Figure(figsize=(8.4, 6.4), layout="constrained")
-    panels = figure.subplots(2, 2)
-    for row, view in zip(panels, VIEWS, strict=True):
-        for axes, (name, points, colours, frame) in zip(row, shapes, strict=True):
-            draw_valve(axes, valve, points, colours, view, frame, strength=0.3)
-            if view is ATRIUM and frame:
-                paint_leak(axes, valve, points, frame)
-            axes.set_title(f"{name}, {view.name}", fontsize=10)
-        same_scale(row, [points for _, points, _, _ in shapes], view)
-    bar = figure.colorbar(scale, ax=panels[:, 1], shrink=0.6, pad=0.02)
+    figure, grid = _views_figure(shapes, (), (8.4, 6.4), 1.0)
+    bar = figure.colorbar(scale, ax=grid[:, 1], shrink=0.6, pad=0.02)
     bar.set_label(f"distance, fitted to observed [{unit}]")
     return figure
 
@@ -254,12 +243,6 @@ def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArra
     return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
-def _say_view(axes: Any, text: str) -> None:
-    axes.text(
-        -0.03, 0.5, text, transform=axes.transAxes, rotation=90, ha="right", va="center", fontsize=9
-    )
-
-
 def estimates_figure(record: EstimateRecord) -> Figure:
     """Each unknown with its 95 % intervals: prior, estimate, and the truth if it is known.
 
@@ -279,10 +262,11 @@ def estimates_figure(record: EstimateRecord) -> Figure:
     rows = [len(group) + 0.6 for group in groups]
     figure = Figure(figsize=(8.2, 1.5 + 0.62 * sum(rows)), layout="constrained")
     panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=rows)[:, 0]
+    handles: dict[str, Any] = {}
     for axes, group in zip(panels, groups, strict=True):
         in_sd = group is nuisances
-        for row, unknown in enumerate(group):
-            _intervals(axes, row, unknown, without.get(unknown.name), in_sd)
+        others = [without.get(one.name, Unknown(name=one.name)) for one in group]
+        _draw_intervals(axes, group, others, in_sd)
         axes.set_yticks(range(len(group)), [p.label for p in group])
         axes.set_ylim(len(group) - 0.45, -0.55)
         axes.spines[["top", "right", "left"]].set_visible(False)
@@ -292,11 +276,8 @@ def estimates_figure(record: EstimateRecord) -> Figure:
             axes.axvline(0.0, color="0.6", linewidth=0.8)
             axes.set_xlabel("nuisances: prior standard deviations from the prior mean")
         else:
-            units = dict.fromkeys(p.unit for p in group)
-            axes.set_xlabel(f"modulus [{', '.join(units)}]")
+            axes.set_xlabel(f"modulus [{', '.join(dict.fromkeys(p.unit for p in group))}]")
             axes.set_xlim(left=0.0)
-    handles: dict[str, Any] = {}
-    for axes in panels:
         handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     figure.legend(
         handles.values(), handles.keys(), loc="outside upper center", ncols=2, frameon=False,
@@ -305,28 +286,30 @@ def estimates_figure(record: EstimateRecord) -> Figure:
     return figure
 
 
-def _intervals(axes: Any, row: int, unknown: Unknown, without: Unknown | None, in_sd: bool) -> None:
-    mean, std = unknown.prior_mean or 0.0, unknown.prior_std or 0.0
-    shift, scale = (mean, std or 1.0) if in_sd else (0.0, 1.0)
+def _draw_intervals(
+    axes: Any, unknowns: Sequence[Unknown], without: Sequence[Unknown], in_sd: bool
+) -> None:
+    """A row for each unknown; what is None is NaN, which matplotlib leaves out."""
 
-    def place(*values: Any) -> Any:
-        return (np.array(values, dtype=float) - shift) / scale
+    def values(source: Sequence[Unknown], name: str) -> FloatArray:
+        return np.array([getattr(one, name) for one in source], dtype=float)
 
-    ends = place(mean - TWO_SIDED * std, mean + TWO_SIDED * std)
-    axes.plot(ends, [row, row], color=PRIOR, linewidth=11, solid_capstyle="butt",
-              label="prior, 95 %")  # fmt: skip
-    shown: tuple[tuple[Unknown | None, str, float, str, str], ...] = (
-        (unknown, POSTERIOR, -0.09, "o", "estimate with its 95 % interval"),
+    rows = np.arange(len(unknowns))
+    mean, std = (np.nan_to_num(values(unknowns, f"prior_{name}")) for name in ("mean", "std"))
+    shift, scale = (mean, np.where(std > 0, std, 1.0)) if in_sd else (0.0, 1.0)
+    low, high = ((mean + side * TWO_SIDED * std - shift) / scale for side in (-1, 1))
+    axes.hlines(rows, low, high, color=PRIOR, linewidth=11, label="prior, 95 %", zorder=2)
+    for source, colour, offset, marker, label in (
+        (unknowns, POSTERIOR, -0.09, "o", "estimate with its 95 % interval"),
         (without, WITHOUT, 0.17, "s", "estimate if the nuisances were taken as known"),
-    )
-    for source, colour, offset, marker, label in shown:
-        if source is None or source.estimate is None:
-            continue
-        if source.low is not None and source.high is not None:
-            axes.plot(place(source.low, source.high), [row + offset] * 2, color=colour,
-                      linewidth=2.2, solid_capstyle="butt")  # fmt: skip
-        axes.plot(place(source.estimate), [row + offset], marker, color=colour, markersize=6,
-                  label=label)  # fmt: skip
-    if unknown.truth is not None:
-        axes.plot(place(unknown.truth), [row], "x", color="black", markersize=9,
-                  markeredgewidth=2, label="truth of the simulation", zorder=5)  # fmt: skip
+    ):
+        low, place, high = (
+            (values(source, n) - shift) / scale for n in ("low", "estimate", "high")
+        )
+        if np.isfinite(place).any():
+            axes.plot(place, rows + offset, marker, color=colour, ms=6, label=label)
+            axes.hlines(rows + offset, low, high, color=colour, linewidth=2.2, zorder=2)
+    truth = (values(unknowns, "truth") - shift) / scale
+    if np.isfinite(truth).any():
+        label = "truth of the simulation"
+        axes.plot(truth, rows, "x", color="black", ms=9, mew=2, label=label, zorder=5)

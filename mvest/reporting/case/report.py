@@ -10,11 +10,12 @@ import base64
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from pandas import json_normalize
 
 from mvest.cases.from_images.detected import DetectedValve
 from mvest.errors import InputError, cannot_write
@@ -22,16 +23,10 @@ from mvest.files import write_atomically
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Personalised
 from mvest.problem.fields import CaseFields, case_fields
-from mvest.problem.record import EstimateRecord
-from mvest.reporting.case.figures import (
-    MIDSURFACES,
-    case_figure,
-    estimates_figure,
-    figure3_caption,
-    shapes_figure,
-)
+from mvest.problem.record import EstimateRecord, Spread
+from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure
 from mvest.reporting.case.tables import report_tables, unknown_table
-from mvest.reporting.case.view import case_view
+from mvest.reporting.case.view import CAMERAS, case_view
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.images.step import write_image_step
@@ -109,58 +104,61 @@ def _write_page(
     regions, known = int(shapes.region.max()) + 1, about["regions"] or ()
     names = known if len(known) == regions else [f"leaflet {k + 1}" for k in range(regions)]
     sha256 = about["sha256"] or ""
-    note = ", ".join(
-        filter(
-            None,
-            (
-                about["description"] or record.case,
-                "simulated" if record.simulated else "",
-                f"case {sha256[:HASH_DIGITS]}" if sha256 else "",
-                line,
-            ),
-        )
+    parts = (
+        about["description"] or record.case,
+        "simulated" if record.simulated else "",
+        f"case {sha256[:HASH_DIGITS]}" if sha256 else "",
+        line,
     )
-    marked = " Simulated." if record.simulated else ""
+    note = ", ".join(filter(None, parts))
     written: list[Path] = []
     pictures: dict[str, dict[str, Any]] = {}
     missing: dict[str, str] = {}
-    for name, make, caption in _figures(record, shapes, names):
+    drawn: dict[str, Callable[[], Figure]] = {
+        "shapes": lambda: shapes_figure(shapes, names),
+        "figure3": lambda: case_figure(shapes, names),
+        "estimates": lambda: estimates_figure(record),
+    }
+    for name, draw in drawn.items():
         try:
-            figure, text = make(), caption()
+            figure = draw()
         except InputError as error:
-            missing[name] = f"Not shown: {error}."
+            missing[name] = str(error)
             continue
-        paths = save_figure_with(folder / name, figure, note)
+        written += save_figure_with(folder / name, figure, note)
         share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
-        pictures[name] = embedded(paths[0], text + marked) | {"percent": round(100 * share)}
-        written += paths
+        pictures[name] = embedded(written[-1]) | {"percent": round(100 * share)}
     for row in record.detail_rows("pictures"):
         # Drawn with the volume at hand, and kept beside the page.
         try:
-            pictures[row["file"]] = embedded(folder / row["file"], row["caption"])
-            pictures[row["file"]]["percent"] = 100
+            pictures[row["file"]] = embedded(folder / row["file"]) | {"percent": 100}
         except InputError as error:
-            missing[row["file"]] = f"Not shown: {error}."
-    view = case_view(shapes, names)
+            missing[row["file"]] = str(error)
+    scene, buttons = case_view(shapes, names)
     labels = {one.name: one.label or one.name for one in record.unknowns}
+    rows = json_normalize(dict(provenance)).assign(**{"case files, SHA-256": sha256})
     page = rendered(
         "case_report.html.jinja",
-        scripts=_policy(view.markup, SCRIPT.read_text(encoding="utf-8")),
+        scripts=_policy(scene, SCRIPT.read_text(encoding="utf-8")),
         pictures=pictures,
         missing=missing,
-        view=view,
+        scene=scene,
+        buttons=buttons,
+        cameras=CAMERAS,
         files=[path.name for path in written],
         record=record,
         about=about,
+        shapes=shapes,
+        spread=Spread.of,
         step=_first(record, "image_step"),
         tables=defaultdict(list, {k: one.readable() for k, one in report_tables(record).items()}),
         confounded=[alike_words(group, labels) for group in record.confounded],
-        labels=labels,
         number=number,
         ended=ended,
         provenance=[
             {"": name, "value": str(value)}
-            for name, value in (_flat(provenance) | {"case files, SHA-256": sha256}).items()
+            for row in rows.to_dict("records")
+            for name, value in row.items()
             if value
         ],
     )
@@ -170,7 +168,7 @@ def _write_page(
 def _first(record: EstimateRecord, name: str) -> Mapping[str, Any]:
     """The only row of a detail, in which what is missing is None."""
     rows = record.detail_rows(name)
-    return defaultdict(lambda: None, rows[0]) if rows else defaultdict(lambda: None)
+    return defaultdict(lambda: None, rows[0] if rows else {})
 
 
 def _policy(scene: str, script: str) -> str:
@@ -178,35 +176,3 @@ def _policy(scene: str, script: str) -> str:
     own = re.findall(r"<script[^>]*>(.*?)</script>", scene, re.DOTALL)
     digests = (hashlib.sha256(text.encode()).digest() for text in [*own, script])
     return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
-
-
-def _flat(values: Mapping[str, Any], name: str = "") -> dict[str, Any]:
-    """Nested values under dotted names."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        full = f"{name}.{key}" if name else str(key)
-        flat |= _flat(value, full) if isinstance(value, Mapping) else {full: value}
-    return flat
-
-
-def _figures(
-    record: EstimateRecord, shapes: CaseFields, names: Sequence[str]
-) -> list[tuple[str, Callable[[], Figure], Callable[[], str]]]:
-    """Name, drawing and caption of each picture; they raise where something is missing."""
-    return [
-        (
-            "shapes",
-            lambda: shapes_figure(shapes, names),
-            lambda: (
-                "The valve open and closed, from the atrium and from the side. Colours tell the "
-                "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary "
-                f"tips. {MIDSURFACES}"
-            ),
-        ),
-        ("figure3", lambda: case_figure(shapes, names), lambda: figure3_caption(shapes)),
-        (
-            "estimates",
-            lambda: estimates_figure(record),
-            lambda: "What was known before the images (grey) and what they add (blue).",
-        ),
-    ]

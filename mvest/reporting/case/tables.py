@@ -13,7 +13,7 @@ from mvest.reporting.tables import Column, Table, table
 
 HIDDEN = Column(hidden=True)
 
-UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}
+UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "s": "s", "ratio": ""}
 """End of the name of a measure -> its unit."""
 
 FRAME_MEASURES = {
@@ -34,10 +34,10 @@ def unknown_table(unknowns: Iterable[Unknown]) -> Table:
     return table(
         rows,
         name=HIDDEN,
-        label=Column(label="unknown"),
-        unit=Column(),
-        kind=Column(),
-        treatment=Column(),
+        label="::unknown",
+        unit="",
+        kind="",
+        treatment="",
         prior_mean=Column(std="prior_std", label="prior"),
         estimate=Column(
             std="std", low="low", high="high", truth="truth", label="estimate (95 % interval)"
@@ -59,7 +59,7 @@ def frame_table(frames: Sequence[FrameFit]) -> Table:
                     columns[what] = Column("mm", ".2f", std=f"{what}_std")
                     columns[f"{what}_max"] = Column("mm", ".2f", hidden=True)
         rows.append(row)
-    return table(rows, frame=Column(), seen=Column(label="shown to the filter"), **columns)
+    return table(rows, frame="", seen="::shown to the filter", **columns)
 
 
 def report_tables(record: EstimateRecord) -> dict[str, Table]:
@@ -68,7 +68,6 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
     alone = record.alternatives.get("moduli_only")
     moduli = [one for one in record.unknowns if one.kind != "nuisance"]
     free = [one for one in record.unknowns if one.kind != "derived"]
-    spans = {"believed": ("believed_low", "believed_high"), "learned": ("low", "high")}
     tables = {
         "moduli": unknown_table(moduli if record.is_stated else ()),
         "unknowns": unknown_table(free),
@@ -79,36 +78,29 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
         "narrower": _narrower(rows("narrower"), record.moduli),
         "errors": table(
             rows("errors"),
-            name=Column(label="errors of the closed frame"),
-            unit=Column(),
-            **{name: Column(low=low, high=high) for name, (low, high) in spans.items()},
-            stretch=Column(label="moved by [SD]"),
+            name="::errors of the closed frame",
+            unit="",
+            believed=Column(low="believed_low", high="believed_high"),
+            learned=Column(low="low", high="high"),
+            stretch="::moved by [SD]",
         ),
         "geometry": table(
             rows("geometry"),
-            name=Column(label="geometry"),
-            size=Column(label="expected error"),
-            unit=Column(),
-            stretch=Column(label="largest [SD]"),
+            name="::geometry",
+            size="::expected error",
+            unit="",
+            stretch="::largest [SD]",
         ),
-        "whiteness": table(
-            rows("whiteness"),
-            name=Column(label="test"),
-            statistic=Column(),
-            p_value=Column("", ".2g"),
-        ),
+        "whiteness": table(rows("whiteness"), name="::test", statistic="", p_value=":.2g"),
         "budget": table(
             rows("budget"),
-            part=Column(label="source of error"),
-            modulus=Column(),
-            without=Column(label="SD without it"),
-            alone=Column(label="SD of it alone"),
+            part="::source of error",
+            modulus="",
+            without="::SD without it",
+            alone="::SD of it alone",
         ),
         "image_errors": table(
-            rows("image_errors"),
-            parameter=Column(label="modulus"),
-            samples=HIDDEN,
-            share_of_variance=Column(digits=".2f"),
+            rows("image_errors"), parameter="::modulus", samples=HIDDEN, share_of_variance=":.2f"
         ),
         "image_frames": _chosen(rows("image_frames")),
         "settings": table(rows("settings")),
@@ -136,33 +128,31 @@ def _narrower(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
     """A row for each measurement: how wide each modulus' interval would be, in % of now."""
     shares: dict[str, dict[str, float]] = {}
     labels = {one.name: one.label or one.name for one in moduli}
-    columns: dict[str, Column] = {}
+    columns: dict[str, Column | str] = {"what": "::if this were known"}
     for row in rows:
         label = labels.get(row["parameter"]) or str(row["parameter"])
-        columns[label] = Column("%", ".0f")
         what = str(row["what"]).removeprefix(f"{label}, ")
-        shares.setdefault(what, {})[label] = 100.0 * row["std_if_known"] / row["std_now"]
+        share = 100.0 * row["std_if_known"] / row["std_now"]
+        columns[label] = "%:.0f"
+        shares.setdefault(what, {})[label] = share
     ordered = sorted(shares.items(), key=lambda one: min(one[1].values()))
-    known = Column(label="if this were known")
-    return table(({"what": what, **share} for what, share in ordered), what=known, **columns)
+    return table(({"what": what, **share} for what, share in ordered), **columns)
 
 
 def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:
     """A row for each unknown and the objective, a column for each step of the filter."""
-    width = len(record.iterates[0]) if record.iterates else 0
     own = [one for one in free if one.treatment == "estimated"]
-    if not own or len(own) != width:
+    if not record.iterates or not own or len(own) != len(record.iterates[0]):
         return table(())
     numbers = ["start", *map(str, range(1, len(record.iterates)))]
     rows: list[dict[str, Any]] = [
         {"unknown": one.label or one.name, "unit": one.unit}
-        | {n: m[k] for n, m in zip(numbers, record.iterates, strict=True)}
-        for k, one in enumerate(own)
+        | dict(zip(numbers, values, strict=True))
+        for one, values in zip(own, zip(*record.iterates, strict=True), strict=True)
     ]
     objective = dict(zip(numbers, record.objective, strict=False))
-    return table(
-        [*rows, {"unknown": "misfit plus departure from the prior", "unit": ""} | objective]
-    )
+    rows.append({"unknown": "misfit plus departure from the prior", "unit": ""} | objective)
+    return table(rows)
 
 
 def _measurements(rows: Sequence[Row]) -> Table:
@@ -176,16 +166,20 @@ def _measurements(rows: Sequence[Row]) -> Table:
 
 
 def _chosen(rows: Sequence[Row]) -> Table:
+    """The measures of frames that a report shows, as far as there are any."""
     names = [name for name in FRAME_MEASURES if any(name in row for row in rows)]
-    columns = {name: Column("", FRAME_MEASURES[name], label=_measured(name)) for name in names}
+    columns = {name: f":{FRAME_MEASURES[name]}:{_measured(name)}" for name in names}
     return table(({name: row.get(name) for name in names} for row in rows), **columns)
+
+
+def unit_of_measure(name: str) -> str:
+    """``mm²`` for ``annulus_area_mm2``; empty for what has no unit."""
+    return UNITS.get(name.rpartition("_")[2], "")
 
 
 def _measured(name: str) -> str:
     """``annulus_area_mm2`` as ``annulus area [mm²]``."""
     words, _, unit = name.rpartition("_")
-    if unit == "s":
-        return f"{words} [s]"
     if unit not in UNITS or not words:
         return name.replace("_", " ")
     text = re.sub(r"\bap\b", "AP", words.replace("_", " "))

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
+from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.case.drawing import BLOOD, TISSUE, gap_corners, gap_of
+from mvest.reporting.case.drawing import BLOOD, TISSUE, leak_of
 from mvest.reporting.case.figures import distance_top
 from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.reporting.markup import shown_text
@@ -21,15 +21,11 @@ from mvest.typing import FloatArray, IntArray
 
 DECIMALS = 2
 """Positions are stored to 0.01 mm, a fiftieth of what is seen of a valve."""
-ELEMENT = "valve"
 LINE, CHORD, TIP = "#1a1a1a", "#8a817c", "#59382f"
 GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
-SCALE = "Viridis"
-
-COARSER = 2
-"""Of so many pixels of a gap along both directions one is shown."""
 
 PERSONALISED = "closed, personalised"
+"""The state that is shown first, if there is an estimate."""
 
 CAMERAS: Mapping[str, Any] = {
     "obliquely": {"eye": {"x": 0.48, "y": -1.04, "z": 1.25}, "up": {"x": 0, "y": 0, "z": 1}},
@@ -39,29 +35,7 @@ CAMERAS: Mapping[str, Any] = {
 """In perspective: plotly lights no surface from the front in an orthographic scene."""
 
 
-@dataclass(frozen=True, slots=True)
-class CaseView:
-    """A scene within a page, and what its buttons show.
-
-    Attributes
-    ----------
-    markup : Markup
-        The scene with plotly's script.
-    states : tuple of (str, tuple of bool)
-        Label of each button, and which traces of the scene it shows.
-    start : int
-        The state that is shown first.
-    cameras : mapping
-        Camera of the scene by label.
-    """
-
-    markup: Markup
-    states: tuple[tuple[str, tuple[bool, ...]], ...]
-    start: int
-    cameras: Mapping[str, Any]
-
-
-def case_view(fields: CaseFields, names: Sequence[str]) -> CaseView:
+def case_view(fields: CaseFields, names: Sequence[str]) -> tuple[Markup, list[dict[str, Any]]]:
     """The valve open and closed, as observed and as models have it, one of them shown at a time.
 
     Parameters
@@ -69,90 +43,101 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> CaseView:
     fields : CaseFields
     names : sequence of str
         Of the leaflets, for what is shown under the pointer.
+
+    Returns
+    -------
+    markup, buttons : Markup, list of mapping
+        The scene with plotly's script; and for each button its ``label``, which traces of the scene
+        it ``shows``, and whether it is ``pressed`` at first.
     """
-    states = _states(fields, names)
-    labels = [label for label, _ in states]
-    start = labels.index(PERSONALISED) if PERSONALISED in labels else 0
-    owner = np.repeat(np.arange(len(states)), [len(parts) for _, parts in states])
-    traces = [trace for _, parts in states for trace in parts]
-    for trace, at in zip(traces, owner, strict=True):
-        trace.visible = bool(at == start)
+    states = states_of(fields, names)
+    start = PERSONALISED if PERSONALISED in states else next(iter(states))
+    owner = np.array([label for label, parts in states.items() for _ in parts])
+    scene = go.Figure([trace for parts in states.values() for trace in parts])
+    for trace, label in zip(scene.data, owner, strict=True):
+        trace.visible = bool(label == start)
     axis = {"visible": False, "showbackground": False}
-    scene = go.Figure(traces)
     scene.update_layout(
         template=None,
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         paper_bgcolor="white",
         showlegend=False,
-        scene={
-            "aspectmode": "data",
-            "camera": CAMERAS["obliquely"],
-            "xaxis": axis,
-            "yaxis": axis,
-            "zaxis": axis,
-        },
+        scene={"aspectmode": "data", "camera": CAMERAS["obliquely"]}
+        | {f"{name}axis": axis for name in "xyz"},
     )
     markup = scene.to_html(
         full_html=False,
         include_plotlyjs=True,
-        div_id=ELEMENT,
+        div_id="valve",
         default_height="100%",
         config={"displaylogo": False, "displayModeBar": False, "responsive": True},
     )
-    shown = tuple((label, tuple((owner == k).tolist())) for k, label in enumerate(labels))
-    return CaseView(Markup(markup), shown, start, CAMERAS)
+    buttons = [
+        {"label": label, "shows": (owner == label).tolist(), "pressed": label == start}
+        for label in states
+    ]
+    return Markup(markup), buttons
 
 
-def _states(fields: CaseFields, names: Sequence[str]) -> list[tuple[str, list[Any]]]:
-    k = fields.closed
-    states = [("open", _anatomy(fields, fields.rest, 0, names))]
+def states_of(fields: CaseFields, names: Sequence[str]) -> dict[str, list[Any]]:
+    """Traces of the scene by the label of the state that they belong to."""
+    k, frame = fields.closed, fields.closed + 1
+    states = {"open": _anatomy(fields, fields.rest, 0, names)}
+    seen = []
+    if (cloud := fields.observed_points.get(fields.frames[k])) is not None:
+        seen = states["closed, observed"] = [_dots(cloud, GHOST, 2.2, hoverinfo="skip")]
     if fields.observed is not None:
-        states.append(("closed, observed", _anatomy(fields, fields.observed[k], k + 1, names)))
-    points = fields.observed_points.get(fields.frames[k])
-    if points is not None:
-        states.append(("closed, observed", [_cloud(points)]))
-    for label, shape in (("generic", fields.generic), ("personalised", fields.fitted)):
-        if shape is not None:
-            states.append((f"closed, {label}", _anatomy(fields, shape[k], k + 1, names)))
-    pairs = (
+        ghost = _mesh(fields.observed[k], fields.triangles, color=GHOST, hoverinfo="skip")
+        seen = [ghost.update(opacity=0.45)]
+        states["closed, observed"] = _anatomy(fields, fields.observed[k], frame, names)
+    models = (
         ("generic", fields.generic, fields.distance_generic),
         ("personalised", fields.fitted, fields.distance_fitted),
     )
-    known = [(label, s[k], d[k]) for label, s, d in pairs if s is not None and d is not None]
-    if known:
-        top = distance_top(*(distance for _, _, distance in known))
-        for label, shape, distance in known:
-            states.append((f"distance, {label}", _coloured(fields, shape, k + 1, distance, top)))
-    seen = None if points is None else _cloud(points)
-    if fields.observed is not None:
-        seen = _ghost(fields, fields.observed[k])
-    if fields.fitted is not None and seen is not None:
-        model = _anatomy(fields, fields.fitted[k], k + 1, names)
-        states.append(("observed (grey) over personalised", [*model, seen]))
+    for label, shape, _ in models:
+        if shape is not None:
+            states[f"closed, {label}"] = _anatomy(fields, shape[k], frame, names)
+    known = [off[k] for _, shape, off in models if shape is not None and off is not None]
+    for label, shape, off in models:
+        if shape is not None and off is not None:
+            top = distance_top(*known)
+            states[f"distance, {label}"] = _coloured(fields, shape[k], frame, off[k], top)
+    if fields.fitted is not None and seen:
+        model = _anatomy(fields, fields.fitted[k], frame, names)
+        states["observed (grey) over personalised"] = [*model, *seen]
     return states
 
 
 def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence[str]) -> list[Any]:
     """One mesh for each leaflet, lines, chordae and papillary tips."""
     parts = []
-    for r in range(int(fields.region.max()) + 1):
-        colour = 255 * LEAFLET_COLOURS[r % len(LEAFLET_COLOURS)]
-        mesh = _mesh(points, fields.triangles[fields.region == r])
-        mesh.color = f"rgb({','.join(str(round(c)) for c in colour)})"
-        name = names[r] if r < len(names) else f"leaflet {r + 1}"
+    for r, name in enumerate(names):
+        triangles = fields.triangles[fields.region == r]
+        colour = to_hex(LEAFLET_COLOURS[r % len(LEAFLET_COLOURS)])
         # plotly reads tags in its texts.
-        mesh.update(name=escape(shown_text(str(name))), hoverinfo="name")
-        parts.append(mesh)
-    return parts + _leak(fields, points, frame) + _lines(fields, points, frame)
+        text = escape(shown_text(str(name)))
+        parts.append(_mesh(points, triangles, color=colour, name=text, hoverinfo="name"))
+    parts += [*_leak(fields, points, frame), *_rings(fields, points)]
+    if len(fields.chord_tip):
+        ends = fields.chords(points, frame)
+        # A gap after each chord, so that all of them are one line.
+        broken = np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1)
+        parts.append(_line(broken.reshape(-1, 3), CHORD, 2))
+    if fields.tips.shape[1]:
+        parts.append(_dots(fields.tips[frame], TIP, 6, hoverinfo="name", name="papillary tip"))
+    return parts
 
 
 def _coloured(
     fields: CaseFields, points: FloatArray, frame: int, distance: FloatArray, top: float
 ) -> list[Any]:
+    """A mesh coloured by distance, and grey where that is not known."""
     known = np.isfinite(distance[fields.triangles]).all(axis=1)
-    mesh = _mesh(points, fields.triangles[known], distance)
-    mesh.update(
-        colorscale=SCALE,
+    mesh = _mesh(
+        points,
+        fields.triangles[known],
+        distance,
+        colorscale="Viridis",
         cmin=0.0,
         cmax=top,
         colorbar={"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
@@ -160,90 +145,64 @@ def _coloured(
     )
     parts = [mesh, *_leak(fields, points, frame), *_rings(fields, points)]
     if not known.all():
-        unseen = _mesh(points, fields.triangles[~known])
-        unseen.update(color=UNOBSERVED, hoverinfo="skip")
-        parts.append(unseen)
+        unseen = fields.triangles[~known]
+        parts.append(_mesh(points, unseen, color=UNOBSERVED, hoverinfo="skip"))
     return parts
 
 
 def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
     """The gap of a closed valve, and the slit where leaflets touch, as high as what is nearest."""
-    if not frame or fields.reach_mm is None or not np.isfinite(points).all():
+    if not frame or (leak := leak_of(fields, points, frame)) is None:
         return []
-    gap, plane = gap_of(fields, points, frame, fields.reach_mm)
-    corners = gap_corners(gap, plane, COARSER)
+    # Of two pixels along both directions there is one.
+    gap, corners = leak[0], leak[1][::2, ::2]
     parts = []
     for name, pixels, colour in (("touching", gap.slit, TISSUE), ("gap", gap.open, BLOOD)):
-        row, column = np.nonzero(pixels[::COARSER, ::COARSER])
+        row, column = np.nonzero(pixels[:-1:2, :-1:2])
         a = row * corners.shape[1] + column
         b = a + corners.shape[1]
-        triangles = np.concatenate(
-            [np.stack([a, a + 1, b], axis=1), np.stack([a + 1, b + 1, b], axis=1)]
-        )
-        if len(triangles):
-            mesh = _mesh(corners.reshape(-1, 3), triangles)
-            red, green, blue = (round(255 * channel) for channel in colour)
-            mesh.update(color=f"rgb({red},{green},{blue})", name=name, hoverinfo="name")
-            parts.append(mesh)
+        halves = [np.stack([a, a + 1, b], axis=1), np.stack([a + 1, b + 1, b], axis=1)]
+        if len(a):
+            mesh = _mesh(corners.reshape(-1, 3), np.concatenate(halves), color=to_hex(colour))
+            parts.append(mesh.update(name=name, hoverinfo="name"))
     return parts
 
 
-def _ghost(fields: CaseFields, points: FloatArray) -> Any:
-    mesh = _mesh(points, fields.triangles)
-    mesh.update(color=GHOST, opacity=0.45, hoverinfo="skip")
-    return mesh
-
-
-def _mesh(points: FloatArray, triangles: IntArray, values: FloatArray | None = None) -> Any:
+def _mesh(
+    points: FloatArray, triangles: IntArray, values: FloatArray | None = None, **style: Any
+) -> Any:
     """A mesh of the triangles whose corners were all seen, of the vertices that they use."""
     known = np.isfinite(points[triangles]).all(axis=(1, 2))
     used, corner = np.unique(triangles[known], return_inverse=True)
     i, j, k = corner.reshape(-1, 3).T.astype(np.min_scalar_type(len(used)))
     x, y, z = small(points[used]).T
-    mesh = go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, flatshading=False)
-    if values is not None:
-        mesh.intensity = small(values[used])
-    mesh.lighting = {"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "roughness": 0.6}
-    mesh.lightposition = {"x": -4e4, "y": -4e4, "z": 1e5}
-    return mesh
+    return go.Mesh3d(
+        x=x, y=y, z=z, i=i, j=j, k=k,
+        intensity=None if values is None else small(values[used]),
+        flatshading=False,
+        lighting={"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "roughness": 0.6},
+        lightposition={"x": -4e4, "y": -4e4, "z": 1e5},
+        **style,
+    )  # fmt: skip
 
 
 def _rings(fields: CaseFields, points: FloatArray) -> list[Any]:
-    rings = []
-    for loop, width in ((fields.annulus, 6), (fields.free_edge, 2)):
-        if len(loop):
-            x, y, z = small(points[np.append(loop, loop[0])]).T
-            rings.append(_line(x, y, z, LINE, width))
-    return rings
+    loops = ((fields.annulus, 6), (fields.free_edge, 2))
+    return [
+        _line(points[np.append(loop, loop[0])], LINE, width) for loop, width in loops if len(loop)
+    ]
 
 
-def _lines(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
-    lines = _rings(fields, points)
-    if len(fields.chord_tip):
-        ends = fields.chords(points, frame)
-        # A gap after each chord, so that all of them are one line.
-        broken = np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1)
-        x, y, z = small(broken.reshape(-1, 3)).T
-        lines.append(_line(x, y, z, CHORD, 2))
-    if fields.tips.shape[1]:
-        x, y, z = small(fields.tips[frame]).T
-        marker = {"size": 6, "color": TIP}
-        lines.append(
-            go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="name",
-                         name="papillary tip")
-        )  # fmt: skip
-    return lines
-
-
-def _line(x: Any, y: Any, z: Any, colour: str, width: int) -> Any:
+def _line(points: FloatArray, colour: str, width: int) -> Any:
+    x, y, z = small(points).T
     line = {"color": colour, "width": width}
     return go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, hoverinfo="skip")
 
 
-def _cloud(points: FloatArray) -> Any:
+def _dots(points: FloatArray, colour: str, size: float, **style: Any) -> Any:
     x, y, z = small(points).T
-    marker = {"size": 2.2, "color": GHOST}
-    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip")
+    marker = {"size": size, "color": colour}
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **style)
 
 
 def small(values: FloatArray) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from experiments.run import main
 from experiments.studies.filters import Settings, figure, run
 from mvest.errors import ConfigurationError
 from mvest.estimation import EnsembleFilter, ExtendedFilter, ImportanceFilter, UnscentedFilter
-from mvest.reporting.style import BAD, GOOD
+from mvest.reporting.figures import BAD, GOOD
 from mvest.reporting.tables import table
 from tests.experiments.configured import composed
 from tests.experiments.studies.test_gate import SMALL

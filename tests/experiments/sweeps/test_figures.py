@@ -3,7 +3,7 @@
 import pytest
 
 from experiments.sweeps.figures import figures_of
-from mvest.reporting.style import plain_number
+from mvest.reporting.figures import plain_number
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,
     failed_run,

@@ -111,6 +111,16 @@ def test_what_the_data_hardly_tell_apart_is_named(html) -> None:
     ) in Page(html).text
 
 
+def test_the_caption_of_figure_3_tells_which_panel_is_which(case, html) -> None:
+    with np.load(case[1]) as stored:
+        off = [stored[f"distance_{name}"][0] for name in ("generic", "fitted")]
+    told, spreads = Page(html).text, [f"{np.nanmean(d):.2f} ± {np.nanstd(d):.2f} mm" for d in off]
+    assert "frame “closed”" in told
+    assert f"over {np.isfinite(off[1]).sum()} points" in told
+    assert f"Left: generic stiffness, {spreads[0]}" in told
+    assert f"Right: personalised stiffness, {spreads[1]}" in told
+
+
 def test_the_page_loads_nothing_and_is_not_too_large(written, html) -> None:
     local = {path.name for path in written}
     outside = [

@@ -5,7 +5,8 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.reporting.images.figures import confidence_figure, errors_figure, measures_figure
+from mvest.reporting.images.figures import confidence_figure, errors_figure
+from mvest.reporting.images.step import measures_figure
 
 
 def measures(t, **changes):
@@ -31,7 +32,7 @@ def test_measures_over_time_have_gaps_and_hollow_frames():
         measures(2, coaptation_length_mm=None),
     ]
     rows = [row | {"coaptation_length_mm": None} for row in rows]
-    figure = measures_figure(rows, title="made up")
+    figure = measures_figure(rows, title="made up", low_confidence=0.7)
     assert len(figure.axes) == 8
     area = panel(figure, "Annulus area")
     curves = {line.get_label(): line for line in area.lines}
@@ -49,14 +50,14 @@ def test_measures_over_time_have_gaps_and_hollow_frames():
     assert [text.get_text() for text in nothing.texts] == ["not measured in any frame"]
     assert any("1 of 3 frames" in text.get_text() for text in figure.texts)
     with pytest.raises(InputError, match="no frames"):
-        measures_figure([], title="made up")
+        measures_figure([], title="made up", low_confidence=0.7)
 
 
 def test_bands_are_drawn_where_measures_have_bounds():
     bounds = {"ap_diameter_mm_low": 20.0, "ap_diameter_mm_high": 31.0}
     rows = [measures(0) | bounds, measures(1) | dict.fromkeys(bounds), measures(2) | bounds]
     rows.append(measures(3) | bounds)
-    figure = measures_figure(rows, title="made up")
+    figure = measures_figure(rows, title="made up", low_confidence=0.7)
     diameters = panel(figure, "Annulus diameters")
     (band,) = diameters.collections
     corners = np.concatenate([path.vertices for path in band.get_paths()])
@@ -67,7 +68,7 @@ def test_bands_are_drawn_where_measures_have_bounds():
     assert high > 36.0
     assert not panel(figure, "Annulus area").collections
     assert any("Bands: 95 %" in text.get_text() for text in figure.texts)
-    plain = measures_figure([measures(0)], title="made up")
+    plain = measures_figure([measures(0)], title="made up", low_confidence=0.7)
     assert not any("Bands" in text.get_text() for text in plain.texts)
 
 
