@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.quantities import (
     Angle,
     AxisCount,
@@ -30,6 +30,9 @@ from mvest.quantities import (
 
 SPEED_OF_SOUND = 1540.0
 """m/s, mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
+
+LARGEST = 1000.0
+"""Size of any setting, in its unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,46 +131,32 @@ class Acquisition:
     shape: tuple[AxisCount, AxisCount, AxisCount] = (160, 128, 160)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if not math.isfinite(number):
-                    self._refuse(field.name, "a finite number")
-        for name in (
-            "frequency_mhz", "axial_mm", "dynamic_range_db", "scatterers_per_cell", "voxel_mm",
-            "haze_mm",
-        ):  # fmt: skip
-            if not getattr(self, name) > 0:
-                self._refuse(name, "> 0")
-        for name in (
-            "attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
-            "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
-            "beat_turn_deg",
-        ):  # fmt: skip
-            if not getattr(self, name) >= 0:
-                self._refuse(name, ">= 0")
-        for name in ("side_lobe_db", "angle_floor_db", "dropout_db"):
-            if not getattr(self, name) <= 0:
-                self._refuse(name, "<= 0 dB")
-        for name in ("azimuth_deg", "elevation_span_deg"):
-            if not 10 <= getattr(self, name) <= 120:
-                self._refuse(name, "10 to 120 degrees")
-        for name, span in (
-            ("lateral_deg", self.azimuth_deg),
-            ("elevation_deg", self.elevation_span_deg),
-        ):
-            if not 0.2 <= getattr(self, name) <= span / 4:
-                self._refuse(name, "0.2 degrees to a quarter of the opening")
-        if not 0 <= self.dropout <= 0.6:
-            self._refuse("dropout", "0 to 0.6")
-        if len(self.depth_mm) != 2 or not 0 < self.depth_mm[0] < self.depth_mm[1]:
+        require_numbers(
+            self, "acquisition", "frequency_mhz", "axial_mm", "dynamic_range_db",
+            "scatterers_per_cell", "voxel_mm", "haze_mm",
+        )  # fmt: skip
+        if len(self.depth_mm) != 2 or not 0 < self.depth_mm[0] < self.depth_mm[1] < math.inf:
             self._refuse("depth_mm", "two increasing distances > 0")
-        if self.axial_mm > (self.depth_mm[1] - self.depth_mm[0]) / 4:
-            self._refuse("axial_mm", "a quarter of the depth range at most")
-        if not 1 <= self.beats <= 12:
-            self._refuse("beats", "1 to 12")
         if len(self.shape) != 3 or min(self.shape) < 8:
             self._refuse("shape", "three numbers of voxels >= 8")
+        bounds = {
+            **dict.fromkeys(
+                ("attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
+                 "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
+                 "beat_turn_deg"), (0.0, LARGEST),
+            ),
+            **dict.fromkeys(("side_lobe_db", "angle_floor_db", "dropout_db"), (-LARGEST, 0.0)),
+            **dict.fromkeys(("azimuth_deg", "elevation_span_deg"), (10.0, 120.0)),
+            "lateral_deg": (0.2, self.azimuth_deg / 4),
+            "elevation_deg": (0.2, self.elevation_span_deg / 4),
+            "axial_mm": (0.0, (self.depth_mm[1] - self.depth_mm[0]) / 4),
+            "dropout": (0.0, 0.6),
+            "beats": (1.0, 12.0),
+        }  # fmt: skip
+        for name in (f.name for f in fields(self) if f.name not in ("depth_mm", "shape")):
+            low, high = bounds.get(name, (-LARGEST, LARGEST))
+            if not low <= getattr(self, name) <= high:
+                self._refuse(name, f"{low:g} to {high:g}")
 
     def _refuse(self, name: str, expected: str) -> None:
         raise InputError(f"acquisition {name} = {getattr(self, name)}, expected {expected}")
@@ -189,142 +178,61 @@ SMALL = Acquisition(
 """Coarse and fast, for tests."""
 
 
+Setting: TypeAlias = Literal["training", "wide", "shifted"]
+"""From which ranges an acquisition is drawn."""
+
 Interval: TypeAlias = tuple[float, float]
 
+RANGES: dict[str, tuple[Literal["times", "plus"], Interval, tuple[Interval, ...]]] = {
+    "frequency_mhz": ("times", (0.8, 1.2), ((0.65, 0.75), (1.25, 1.4))),
+    "axial_mm": ("times", (0.75, 1.3), ((1.35, 1.6),)),
+    "lateral_deg": ("times", (0.75, 1.3), ((1.35, 1.6),)),
+    "elevation_deg": ("times", (0.75, 1.3), ((1.35, 1.6),)),
+    "side_lobe_db": ("plus", (-5.0, 4.0), ((4.5, 7.0),)),
+    "dynamic_range_db": ("plus", (-6.0, 8.0), ((-10.0, -7.0), (9.0, 13.0))),
+    "gain_db": ("plus", (-5.0, 5.0), ((-7.0, -5.5), (5.5, 7.0))),
+    "attenuation_db_per_cm_mhz": ("times", (0.7, 1.3), ((1.35, 1.6),)),
+    "compensation_db_per_cm_mhz": ("plus", (-0.05, 0.05), ((-0.05, 0.05),)),
+    "shadow_db_per_cm": ("times", (0.0, 1.5), ((1.6, 2.2),)),
+    "angle_exponent": ("times", (0.6, 1.4), ((0.4, 0.55), (1.45, 1.7))),
+    "angle_floor_db": ("plus", (-5.0, 4.0), ((-7.0, -5.5), (4.5, 7.0))),
+    "dropout": ("plus", (-0.08, 0.08), ((0.09, 0.16),)),
+    "blood_db": ("plus", (-5.0, 5.0), ((5.5, 8.0),)),
+    "electronics_db": ("plus", (-5.0, 5.0), ((5.5, 9.0),)),
+    "haze_db": ("plus", (-10.0, 5.0), ((5.5, 8.0),)),
+    "contact_db": ("times", (0.3, 1.5), ((1.6, 1.9),)),
+    "wall_db": ("plus", (-4.0, 4.0), ((-6.0, 6.0),)),
+    "leaflet_db": ("plus", (-4.0, 3.0), ((-6.0, -4.2),)),
+    "annulus_db": ("plus", (-4.0, 3.0), ((-6.0, -4.2),)),
+    "chord_db": ("plus", (-5.0, 5.0), ((-5.0, 5.0),)),
+    "papillary_db": ("plus", (-4.0, 4.0), ((-4.0, 4.0),)),
+    "vessel_db": ("plus", (-4.0, 4.0), ((-4.0, 4.0),)),
+    "beat_shift_mm": ("times", (0.0, 1.5), ((1.6, 2.5),)),
+    "beat_turn_deg": ("times", (0.0, 1.5), ((1.6, 2.5),)),
+}
+"""How each setting varies about that of the base: whether what is drawn multiplies it or is added
+to it, within which interval in training, and within which shifted ones.
 
-@dataclass(frozen=True, slots=True)
-class Range:
-    """How one setting varies about that of the base.
-
-    Attributes
-    ----------
-    setting : str
-        Name of a number in :class:`Acquisition`.
-    how : "times" or "plus"
-        Whether what is drawn multiplies the setting or is added to it.
-    intervals : tuple of (float, float)
-        One is chosen with equal chances, then a value in it.
-    """
-
-    setting: str
-    how: Literal["times", "plus"]
-    intervals: tuple[Interval, ...]
-
-    def __post_init__(self) -> None:
-        numbers = {f.name for f in fields(Acquisition) if f.name not in ("depth_mm", "shape")}
-        if self.setting not in numbers or self.setting == "beats":
-            raise InputError(f"range of {self.setting!r}, expected a number of an acquisition")
-        if self.how not in ("times", "plus"):
-            raise InputError(f"range of {self.setting}: {self.how!r}, expected times or plus")
-        if not self.intervals or any(not low <= high for low, high in self.intervals):
-            raise InputError(
-                f"range of {self.setting}: {self.intervals}, expected intervals (low, high)"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class AcquisitionRanges:
-    """Ranges of settings, drawn independently of each other."""
-
-    name: str
-    ranges: tuple[Range, ...]
-
-
-def _range(setting: str, how: Literal["times", "plus"], *intervals: Interval) -> Range:
-    return Range(setting, how, intervals)
-
-
-TRAINING = AcquisitionRanges(
-    "training",
-    (
-        _range("frequency_mhz", "times", (0.8, 1.2)),
-        _range("axial_mm", "times", (0.75, 1.3)),
-        _range("lateral_deg", "times", (0.75, 1.3)),
-        _range("elevation_deg", "times", (0.75, 1.3)),
-        _range("side_lobe_db", "plus", (-5.0, 4.0)),
-        _range("dynamic_range_db", "plus", (-6.0, 8.0)),
-        _range("gain_db", "plus", (-5.0, 5.0)),
-        _range("attenuation_db_per_cm_mhz", "times", (0.7, 1.3)),
-        _range("compensation_db_per_cm_mhz", "plus", (-0.05, 0.05)),
-        _range("shadow_db_per_cm", "times", (0.0, 1.5)),
-        _range("angle_exponent", "times", (0.6, 1.4)),
-        _range("angle_floor_db", "plus", (-5.0, 4.0)),
-        _range("dropout", "plus", (-0.08, 0.08)),
-        _range("blood_db", "plus", (-5.0, 5.0)),
-        _range("electronics_db", "plus", (-5.0, 5.0)),
-        _range("haze_db", "plus", (-10.0, 5.0)),
-        _range("contact_db", "times", (0.3, 1.5)),
-        _range("wall_db", "plus", (-4.0, 4.0)),
-        _range("leaflet_db", "plus", (-4.0, 3.0)),
-        _range("annulus_db", "plus", (-4.0, 3.0)),
-        _range("chord_db", "plus", (-5.0, 5.0)),
-        _range("papillary_db", "plus", (-4.0, 4.0)),
-        _range("vessel_db", "plus", (-4.0, 4.0)),
-        _range("beat_shift_mm", "times", (0.0, 1.5)),
-        _range("beat_turn_deg", "times", (0.0, 1.5)),
-    ),
-)
-"""What detectors are trained on; widths of ranges are a choice."""
-
-SHIFTED = AcquisitionRanges(
-    "shifted",
-    (
-        _range("frequency_mhz", "times", (0.65, 0.75), (1.25, 1.4)),
-        _range("axial_mm", "times", (1.35, 1.6)),
-        _range("lateral_deg", "times", (1.35, 1.6)),
-        _range("elevation_deg", "times", (1.35, 1.6)),
-        _range("side_lobe_db", "plus", (4.5, 7.0)),
-        _range("dynamic_range_db", "plus", (-10.0, -7.0), (9.0, 13.0)),
-        _range("gain_db", "plus", (-7.0, -5.5), (5.5, 7.0)),
-        _range("attenuation_db_per_cm_mhz", "times", (1.35, 1.6)),
-        _range("compensation_db_per_cm_mhz", "plus", (-0.05, 0.05)),
-        _range("shadow_db_per_cm", "times", (1.6, 2.2)),
-        _range("angle_exponent", "times", (0.4, 0.55), (1.45, 1.7)),
-        _range("angle_floor_db", "plus", (-7.0, -5.5), (4.5, 7.0)),
-        _range("dropout", "plus", (0.09, 0.16)),
-        _range("blood_db", "plus", (5.5, 8.0)),
-        _range("electronics_db", "plus", (5.5, 9.0)),
-        _range("haze_db", "plus", (5.5, 8.0)),
-        _range("contact_db", "times", (1.6, 1.9)),
-        _range("wall_db", "plus", (-6.0, 6.0)),
-        _range("leaflet_db", "plus", (-6.0, -4.2)),
-        _range("annulus_db", "plus", (-6.0, -4.2)),
-        _range("chord_db", "plus", (-5.0, 5.0)),
-        _range("papillary_db", "plus", (-4.0, 4.0)),
-        _range("vessel_db", "plus", (-4.0, 4.0)),
-        _range("beat_shift_mm", "times", (1.6, 2.5)),
-        _range("beat_turn_deg", "times", (1.6, 2.5)),
-    ),
-)
-"""What detectors never saw: apart from echo strengths and compensation, every range is disjoint
-from that of training, and mostly on the worse side."""
-
-
-WIDE = AcquisitionRanges(
-    "wide",
-    tuple(
-        Range(own.setting, own.how, tuple(dict.fromkeys((*own.intervals, *beyond.intervals))))
-        for own, beyond in zip(TRAINING.ranges, SHIFTED.ranges, strict=True)
-    ),
-)
-"""Each setting by itself inside the ranges of training or outside: half and half, or with chances
-of one to two where both sides lie outside."""
+Shifted acquisitions are what detectors never saw: apart from echo strengths and compensation, every
+range is disjoint from that of training, and mostly on the worse side. The widths are a choice.
+"""
 
 
 def draw_acquisition(
     rng: np.random.Generator,
     base: Acquisition | None = None,
-    spread: AcquisitionRanges | str = "training",
+    spread: Setting = "training",
 ) -> Acquisition:
-    """An acquisition drawn about a base; the result records every value.
+    """An acquisition drawn about a base, each setting by itself; the result records every value.
 
     Parameters
     ----------
     rng : numpy Generator
     base : Acquisition, optional
         The default one if none is given.
-    spread : AcquisitionRanges or its name, "training", "wide" or "shifted"
-        What is drawn, and from where.
+    spread : "training", "wide" or "shifted"
+        In `RANGES`: within the ranges of training, outside of them, or wide: each setting inside or
+        outside, half and half, or with chances of one to two where both sides lie outside.
 
     Raises
     ------
@@ -332,14 +240,13 @@ def draw_acquisition(
         If no spread has that name, or a value drawn makes no sense as an acquisition's.
     """
     base = base or Acquisition()
-    if isinstance(spread, str):
-        known = {s.name: s for s in (TRAINING, WIDE, SHIFTED)}
-        if spread not in known:
-            raise InputError(f"spread {spread!r}, expected one of {', '.join(known)}")
-        spread = known[spread]
+    if spread not in (known := get_args(Setting)):
+        raise InputError(f"spread {spread!r}, expected one of {', '.join(known)}")
     drawn: dict[str, float] = {}
-    for entry in spread.ranges:
-        low, high = entry.intervals[int(rng.integers(len(entry.intervals)))]
-        value, before = float(rng.uniform(low, high)), float(getattr(base, entry.setting))
-        drawn[entry.setting] = before * value if entry.how == "times" else before + value
+    for name, (how, within, outside) in RANGES.items():
+        wide = tuple(dict.fromkeys((within, *outside)))
+        intervals = {"training": (within,), "wide": wide, "shifted": outside}[spread]
+        low, high = intervals[int(rng.integers(len(intervals)))]
+        value, before = float(rng.uniform(low, high)), float(getattr(base, name))
+        drawn[name] = before * value if how == "times" else before + value
     return replace(base, **drawn)  # type: ignore[arg-type]

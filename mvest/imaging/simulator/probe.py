@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,17 +12,11 @@ from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.typing import FloatArray
 
 
-def _zero() -> FloatArray:
-    return np.zeros(3)
-
-
-def _unit(axis: int) -> FloatArray:
-    return np.eye(3)[axis]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Probe:
-    """Pose of the valve and of the probe in world coordinates (LPS, mm).
+    """Pose of the valve as seen from the probe, which scans from the world's origin along z.
+
+    The axes of the world (LPS, mm) are azimuth, in which beats are stitched, elevation and beam.
 
     Attributes
     ----------
@@ -30,64 +24,38 @@ class Probe:
         Its columns are the x, y and z axes of the valve in the world; a proper rotation.
     translation : (3,) mm
         World position of the valve's origin.
-    apex : (3,) mm
-        Of the pyramid that the probe scans.
-    beam : (3,)
-        Unit vector along the middle of the pyramid.
-    azimuth : (3,)
-        Unit vector across it, in which beats are stitched; elevation is ``beam x azimuth``.
 
     Raises
     ------
     InputError
-        If the rotation is none, or beam and azimuth are not perpendicular unit vectors.
+        If the rotation is none, or a position is not finite.
     """
 
     rotation: FloatArray
     translation: FloatArray
-    apex: FloatArray = field(default_factory=_zero)
-    beam: FloatArray = field(default_factory=lambda: _unit(2))
-    azimuth: FloatArray = field(default_factory=lambda: _unit(0))
 
     def __post_init__(self) -> None:
-        for name in ("rotation", "translation", "apex", "beam", "azimuth"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            shape = (3, 3) if name == "rotation" else (3,)
-            if value.shape != shape or not np.isfinite(value).all():
-                raise InputError(f"probe {name}: {value.tolist()}, expected finite {shape}")
-            object.__setattr__(self, name, value)
-        if not _proper(self.rotation):
+        orthonormal = np.allclose(self.rotation.T @ self.rotation, np.eye(3), atol=1e-6)
+        if not (orthonormal and np.linalg.det(self.rotation) > 0):
             raise InputError(
                 f"probe rotation: determinant {np.linalg.det(self.rotation):.3g}, expected "
                 "orthonormal columns with determinant 1"
             )
-        if not _proper(self.axes):
-            raise InputError(
-                f"probe beam {self.beam.tolist()} and azimuth {self.azimuth.tolist()}, expected "
-                "perpendicular unit vectors"
-            )
-
-    @property
-    def axes(self) -> FloatArray:
-        """``(3, 3)``, columns azimuth, elevation and beam in the world."""
-        return np.stack([self.azimuth, np.cross(self.beam, self.azimuth), self.beam], axis=1)
+        if not np.isfinite(self.translation).all():
+            raise InputError(f"probe translation: {self.translation}, expected finite coordinates")
 
     def to_world(self, points: FloatArray) -> FloatArray:
-        """World positions ``(..., 3)`` mm of positions in the valve's axes."""
-        return np.asarray(points @ self.rotation.T + self.translation)
-
-    def to_probe(self, points: FloatArray) -> FloatArray:
         """Positions ``(..., 3)`` mm along azimuth, elevation and beam of points in valve axes."""
-        return np.asarray((self.to_world(points) - self.apex) @ self.axes)
+        return np.asarray(points @ self.rotation.T + self.translation)
 
     @property
     def apex_in_valve(self) -> FloatArray:
-        """``(3,)`` mm, the apex in the valve's axes."""
-        return np.asarray((self.apex - self.translation) @ self.rotation)
+        """``(3,)`` mm, the apex of the pyramid in the valve's axes."""
+        return np.asarray(-self.translation @ self.rotation)
 
 
-def _proper(matrix: FloatArray) -> bool:
-    return bool(np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0)
+RADIUS_MM = 20.0
+"""mm, of the ball around the valve that lies in the pyramid."""
 
 
 def draw_probe(
@@ -96,9 +64,8 @@ def draw_probe(
     *,
     distance_mm: tuple[float, float] = (35.0, 75.0),
     tilt_deg: tuple[float, float] = (0.0, 55.0),
-    radius_mm: float = 20.0,
 ) -> Probe:
-    """A probe behind the atrium, the world's axes being azimuth, elevation and beam.
+    """A probe behind the atrium.
 
     Distance and tilt are uniform within their ranges, the roll and the direction of the tilt over
     the full circle; the valve's direction is uniform over those in which a ball around the valve
@@ -113,25 +80,23 @@ def draw_probe(
         From the apex to the valve's origin.
     tilt_deg : (float, float)
         Between the valve's axis and the line of sight to the probe.
-    radius_mm : float
-        Of the ball.
 
     Raises
     ------
     InputError
-        If a range is not one, or a distance is less than the ball's radius.
+        If a range is not one, or a distance is less than `RADIUS_MM`.
     """
     acquisition = acquisition or Acquisition()
     for name, (low, high) in (("distance_mm", distance_mm), ("tilt_deg", tilt_deg)):
         if not 0 <= low <= high < math.inf:
             raise InputError(f"probe {name}: {low:g} to {high:g}, expected 0 <= low <= high")
-    if tilt_deg[1] > 90 or distance_mm[0] <= radius_mm:
+    if tilt_deg[1] > 90 or distance_mm[0] <= RADIUS_MM:
         raise InputError(
             f"probe: tilt to {tilt_deg[1]:g} degrees and distance from {distance_mm[0]:g} mm, "
-            f"expected 90 at most, and more than {radius_mm:g}"
+            f"expected 90 at most, and more than {RADIUS_MM:g}"
         )
     distance = rng.uniform(*distance_mm)
-    ball = math.degrees(math.asin(radius_mm / distance))
+    ball = math.degrees(math.asin(RADIUS_MM / distance))
     free = [
         math.radians(max(0.5 * span - ball, 0.0))
         for span in (acquisition.azimuth_deg, acquisition.elevation_span_deg)

@@ -6,7 +6,7 @@ A scatterer keeps its material coordinates in all frames, so that speckle moves 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numba as nb
 import numpy as np
@@ -33,30 +33,6 @@ class Material:
     echo_db: float
     specular: bool = True
     fineness: float = 1.0
-
-
-class TissuePart(Protocol):
-    """A piece of tissue that scatterers can be sown into."""
-
-    @property
-    def material(self) -> Material:
-        """Its properties."""
-
-    @property
-    def volume(self) -> float:
-        """mm^3 in the first frame."""
-
-    def sow(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Material coordinates ``(count, 3)`` of scatterers, uniform over the volume."""
-
-    def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
-        """Positions ``(n, 3)`` mm in valve axes, and ``(n,)`` how squarely sound hits (0 to 1)."""
-
-    def strength(self, seeds: FloatArray) -> FloatArray:
-        """Amplitude ``(n,)`` relative to the material's."""
-
-    def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
-        """``(n,)`` from 0 to 1, the share of dense tissue."""
 
 
 def _differences(points: FloatArray, axis: int, closed: bool) -> FloatArray:
@@ -209,6 +185,10 @@ class Cord:
         """``(n,)`` from 0 to 1, the share of dense tissue."""
         values = self._ends(self.dense)
         return np.asarray(np.interp(seeds[:, 0], np.arange(len(values)), values))
+
+
+TissuePart: TypeAlias = TissueSheet | Cord
+"""A piece of tissue that scatterers can be sown into."""
 
 
 @nb.njit(cache=True)

@@ -8,7 +8,9 @@ Positions are mm in the valve's own axes. Each part states what it does to sound
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -353,45 +355,23 @@ class Echoes:
     loss: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Parts with their scatterers.
+class Sown(NamedTuple):
+    """A part with its scatterers.
 
     Attributes
     ----------
-    parts : tuple of TissuePart
-    seeds : tuple of (n, 3)
-        Material coordinates in each part.
-    strengths : tuple of (n,)
+    part : TissuePart
+    seeds : (n, 3)
+        Material coordinates.
+    strength : (n,)
         Amplitude of each scatterer, but for the angle.
-    losses : tuple of (n,)
-    acquisition : Acquisition
-    probe : Probe
+    loss : (n,)
     """
 
-    parts: tuple[TissuePart, ...]
-    seeds: tuple[FloatArray, ...]
-    strengths: tuple[FloatArray, ...]
-    losses: tuple[FloatArray, ...]
-    acquisition: Acquisition
-    probe: Probe
-
-    def echoes(self, frame: int) -> Echoes:
-        """The scatterers where they are in one frame."""
-        apex = self.probe.apex_in_valve
-        floor = 10 ** (self.acquisition.angle_floor_db / 20)
-        points, amplitudes = [], []
-        for part, seeds, strength in zip(self.parts, self.seeds, self.strengths, strict=True):
-            place, facing = part.place(frame, seeds, apex)
-            points.append(self.probe.to_probe(place))
-            if part.material.specular:
-                seen = floor + (1 - floor) * facing**self.acquisition.angle_exponent
-                amplitudes.append(strength * seen)
-            else:
-                amplitudes.append(strength)
-        return Echoes(
-            np.concatenate(points), np.concatenate(amplitudes), np.concatenate(self.losses)
-        )
+    part: TissuePart
+    seeds: FloatArray
+    strength: FloatArray
+    loss: FloatArray
 
 
 def cell_volume(acquisition: Acquisition, distance_mm: float) -> float:
@@ -402,27 +382,39 @@ def cell_volume(acquisition: Acquisition, distance_mm: float) -> float:
 
 def make_scene(
     valve: MovingValve, acquisition: Acquisition, probe: Probe, rng: np.random.Generator
-) -> Scene:
+) -> list[Sown]:
     """The heart around a valve with scatterers.
 
     Their number gives each resolution cell at the valve as many as the acquisition says; the number
     in thin tissue is a multiple, and all are at least 8 per part.
     """
+    a = acquisition
     heart = make_heart(valve, probe.apex_in_valve, rng)
-    parts = make_parts(valve, heart, acquisition, rng)
     distance = float(np.linalg.norm(probe.apex_in_valve))
-    density = acquisition.scatterers_per_cell / cell_volume(acquisition, distance)
-    seeds, strengths, losses = [], [], []
-    for part in parts:
+    density = a.scatterers_per_cell / cell_volume(a, distance)
+    more = max(a.attenuation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz, 0.0)
+    scene = []
+    for part in make_parts(valve, heart, a, rng):
         count = max(8, round(density * part.material.fineness * part.volume))
-        own = part.sow(rng, count)
+        seeds = part.sow(rng, count)
         share = part.volume / count
-        loss = acquisition.frequency_mhz * max(
-            acquisition.attenuation_db_per_cm_mhz - acquisition.blood_attenuation_db_per_cm_mhz,
-            0.0,
-        ) + acquisition.shadow_db_per_cm * part.density_of_shadow(own)
-        seeds.append(own)
+        loss = a.frequency_mhz * more + a.shadow_db_per_cm * part.density_of_shadow(seeds)
         level = 10 ** (part.material.echo_db / 20) * np.sqrt(share)
-        strengths.append(level * part.strength(own))
-        losses.append(share * loss)
-    return Scene(tuple(parts), tuple(seeds), tuple(strengths), tuple(losses), acquisition, probe)
+        scene.append(Sown(part, seeds, level * part.strength(seeds), share * loss))
+    return scene
+
+
+def scene_echoes(
+    scene: Sequence[Sown], frame: int, acquisition: Acquisition, probe: Probe
+) -> Echoes:
+    """The scatterers where they are in one frame."""
+    apex, floor = probe.apex_in_valve, 10 ** (acquisition.angle_floor_db / 20)
+    points, amplitudes = [], []
+    for part, seeds, strength, _ in scene:
+        place, facing = part.place(frame, seeds, apex)
+        points.append(probe.to_world(place))
+        if part.material.specular:
+            strength = strength * (floor + (1 - floor) * facing**acquisition.angle_exponent)
+        amplitudes.append(strength)
+    losses = np.concatenate([sown.loss for sown in scene])
+    return Echoes(np.concatenate(points), np.concatenate(amplitudes), losses)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numba as nb
 import numpy as np
@@ -18,7 +19,7 @@ from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
 from mvest.imaging.simulator.probe import Probe
-from mvest.imaging.simulator.scene import Echoes, make_scene
+from mvest.imaging.simulator.scene import make_scene, scene_echoes
 from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
@@ -35,22 +36,14 @@ def compress(envelope: Float32Array, acquisition: Acquisition) -> Float32Array:
     return np.clip(level, 0, 255, out=level)
 
 
-def volume_frame(
-    acquisition: Acquisition, probe: Probe
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Spacing (3,), direction (3, 3) and origin (3,) of the volume.
+def volume_origin(acquisition: Acquisition) -> FloatArray:
+    """``(3,)`` mm: the volume is centred across the beam and begins at the nearest middle sample.
 
-    Its axes are azimuth, elevation and beam; it is centred across the beam and begins where the
-    nearest sample of the middle beam lies.
+    Its axes are those of the world: azimuth, elevation and beam.
     """
-    spacing = np.full(3, acquisition.voxel_mm)
     i, j, _ = acquisition.shape
-    corner = [
-        -0.5 * (i - 1) * acquisition.voxel_mm,
-        -0.5 * (j - 1) * acquisition.voxel_mm,
-        acquisition.depth_mm[0],
-    ]
-    return spacing, probe.axes, probe.apex + probe.axes @ np.array(corner)
+    across = (-0.5 * (i - 1) * acquisition.voxel_mm, -0.5 * (j - 1) * acquisition.voxel_mm)
+    return np.array([*across, acquisition.depth_mm[0]])
 
 
 def scan_convert(levels: Float32Array, grid: BeamGrid) -> NDArray[np.uint8]:
@@ -138,7 +131,7 @@ def simulate_volume(
     chosen = _chosen(valve, frames)
     if seed < 0:
         raise InputError(f"simulated volume, seed = {seed}, expected >= 0")
-    depth = probe.to_probe(np.zeros(3))[2]
+    depth = probe.to_world(np.zeros(3))[2]
     if depth <= acquisition.depth_mm[0]:
         raise InputError(
             f"simulated volume, probe: the valve lies {depth:.1f} mm along the beam, "
@@ -153,19 +146,18 @@ def simulate_volume(
     envelope = np.empty(grid.shape, dtype=np.float32)
     for k, frame in enumerate(chosen):
         noise = np.random.default_rng([seed, 1, frame])
-        echoes = scene.echoes(frame)
+        echoes = scene_echoes(scene, frame, acquisition, probe)
         losses = Losses.of(grid, echoes, contact)
         for window, (turn, about, shift) in zip(grid.windows(), beats, strict=True):
             points = (echoes.points - about) @ turn.T + (about + shift)
-            moved = Echoes(points, echoes.amplitude, echoes.loss)
+            moved = replace(echoes, points=points)
             envelope[window[0] : window[1]] = render_window(grid, moved, losses, window, noise)
         out[k] = scan_convert(compress(envelope, acquisition), grid)
-    spacing, direction, origin = volume_frame(acquisition, probe)
     return VolumeSequence(
         out,
-        spacing,
-        direction,
-        origin,
+        np.full(3, acquisition.voxel_mm),
+        np.eye(3),
+        volume_origin(acquisition),
         np.asarray(valve.times[chosen]),
         Modality.ULTRASOUND,
         f"simulated: {valve.name}, seed {seed}",
@@ -208,7 +200,7 @@ def _displacements(
 
     The mean shift is zero: the truth is the mean of the beats.
     """
-    about = probe.to_probe(np.zeros(3))
+    about = probe.to_world(np.zeros(3))
     turn = Rotation.from_rotvec(
         np.deg2rad(acquisition.beat_turn_deg) * rng.standard_normal((acquisition.beats, 3))
     ).as_matrix()
