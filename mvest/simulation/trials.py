@@ -19,10 +19,10 @@ from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.evaluation import frame_errors, surface_distances
-from mvest.imaging.learning.training import Setting, render_frame
+from mvest.imaging.learning.accuracy import frame_errors, surface_distances
+from mvest.imaging.learning.training import render_frame
 from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.simulator.acquisition import Acquisition, draw_acquisition
+from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve
@@ -114,8 +114,7 @@ def try_volume(
     if not has_valve:
         nothing = dict.fromkeys(WITHOUT_VALVE[trial.kind], ABSENT_DB)
         base = replace(base, **nothing, shadow_db_per_cm=0.0)  # type: ignore[arg-type]
-    seen = render_frame(valve, frame, base, trial.spread, render)
-    volume = seen.volume
+    volume, seen = render_frame(valve, frame, base, trial.spread, render)
     if trial.kind == "white noise":
         grey = np.random.default_rng(render).integers(0, 256, volume.frames.shape, dtype=np.uint8)
         volume = replace(volume, frames=grey, source="white noise", sha256="")
@@ -129,18 +128,9 @@ def try_volume(
         "confidence": float(found.confidence),
     }
     if has_valve:
-        true, layout = TrueValve.of(seen.vertices, seen.tips, model.shape), model.shape.layout
-        errors = frame_errors(found, found.vertices, found.tips, true, layout)
-        row |= {
-            "surface": errors.surface,
-            "points": errors.points,
-            "tips": errors.tips,
-            "position": errors.position,
-            "pose": errors.turn,
-            "landmarks": errors.stages["landmarks"],
-            "hinge": errors.annulus,
-            **_differences(found.vertices, found.tips, seen.vertices, seen.tips, layout),
-        }
+        true, layout = TrueValve.of(seen.vertices[0], seen.tips[0], model.shape), seen.layout
+        row |= frame_errors(found, true, layout)
+        row |= _differences(found.vertices, found.tips, true.vertices, true.tips, layout)
     return {"row": json.dumps(row)}
 
 

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mvest.imaging.learning.evaluation import surface_distances
 
 from mvest.errors import InputError
 from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import default_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.evaluation import surface_distances
 from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence

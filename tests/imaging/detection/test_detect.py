@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mvest.imaging.detection.boundary import leaflet_axes
+from mvest.imaging.detection.landmark_detector import landmark_points
 
 from mvest.errors import InputError
-from mvest.imaging.detection.boundary import leaflet_axes
 from mvest.imaging.detection.detect import fit_frame, search_frame
-from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (

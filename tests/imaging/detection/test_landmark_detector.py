@@ -5,14 +5,14 @@ Where votes agree.
 
 import numpy as np
 import pytest
-
-from mvest.imaging.detection import landmark_detector
 from mvest.imaging.detection.landmark_detector import (
     LandmarkDetector,
     consensus,
     landmark_points,
     landmark_samples,
 )
+
+from mvest.imaging.detection import landmark_detector
 from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (
     LAYOUT,

@@ -1,10 +1,10 @@
 """Shape and tips read off at a pose."""
 
 import numpy as np
+from mvest.imaging.detection.shape_start import MODES, ShapeStart, shape_start_samples
 
 from mvest.imaging.detection import shape_start
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.shape_start import MODES, ShapeStart, shape_start_samples
 from tests.imaging.detection.made_up import (
     NumberedFrame,
     geometry,

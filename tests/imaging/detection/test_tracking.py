@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mvest.imaging.detection.landmark_detector import landmark_points
 
 from mvest.imaging.detection import pose_search, tracking
 from mvest.imaging.detection.detect import NoValveError, fit_frame, search_frame
-from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import PoseSearch, PositionDetector
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve, smooth_in_time
