@@ -22,8 +22,7 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import frame_errors, surface_distances
 from mvest.imaging.learning.training import render_frame
 from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.typing import FloatArray

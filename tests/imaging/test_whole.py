@@ -11,8 +11,7 @@ from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import default_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, landmarks
 from tests.made_up_sequence import descending_valve

@@ -39,8 +39,7 @@ from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
 from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence

@@ -6,7 +6,7 @@ A scatterer keeps its material coordinates in all frames, so that speckle moves 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numba as nb
 import numpy as np
@@ -33,6 +33,24 @@ class Material:
     echo_db: float
     specular: bool = True
     fineness: float = 1.0
+
+
+class Seeds(NamedTuple):
+    """Scatterers in a part, uniform over its volume.
+
+    Attributes
+    ----------
+    places : (n, 3)
+        Material coordinates.
+    strength : (n,)
+        Amplitude relative to the material's.
+    dense : (n,)
+        Share of dense tissue, 0 to 1.
+    """
+
+    places: FloatArray
+    strength: FloatArray
+    dense: FloatArray
 
 
 def _differences(points: FloatArray, axis: int, closed: bool) -> FloatArray:
@@ -91,8 +109,8 @@ class TissueSheet:
         """mm^3 in the first frame."""
         return float(self._cells.sum())
 
-    def sow(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Rows, columns and places along the normal ``(count, 3)``."""
+    def sow(self, rng: np.random.Generator, count: int) -> Seeds:
+        """Scatterers at rows, columns and places along the normal; none is of dense tissue."""
         cells = self._cells
         each = rng.multinomial(count, cells.ravel() / cells.sum())
         seeds = rng.random((count, 3))
@@ -100,22 +118,13 @@ class TissueSheet:
         seeds[:, 0] += cell // cells.shape[1]
         seeds[:, 1] += cell % cells.shape[1]
         seeds[:, 2] = self.span[0] + (self.span[1] - self.span[0]) * seeds[:, 2]
-        return seeds
+        strength = _bilinear(self.relative, seeds) * np.exp(-self.fade * np.abs(seeds[:, 2]))
+        return Seeds(seeds, strength, np.zeros(count))
 
     def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
         """Positions ``(n, 3)`` and ``|normal . line of sight|`` ``(n,)``."""
         p = self.points[frame]
         return _on_sheet(p, normals(p), self.thickness, seeds, apex)
-
-    def strength(self, seeds: FloatArray) -> FloatArray:
-        """Amplitude ``(n,)`` relative to the material's."""
-        return np.asarray(
-            _bilinear(self.relative, seeds) * np.exp(-self.fade * np.abs(seeds[:, 2]))
-        )
-
-    def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
-        """``(n,)`` zeros: sheets hold no dense tissue."""
-        return np.zeros(len(seeds))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,15 +164,17 @@ class Cord:
         """mm^3 in the first frame."""
         return float(self._cells.sum())
 
-    def sow(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Places along the line, and across it in the unit disk ``(count, 3)``."""
+    def sow(self, rng: np.random.Generator, count: int) -> Seeds:
+        """Scatterers at places along the line, and across it in the unit disk."""
         cells = self._cells
         each = rng.multinomial(count, cells / cells.sum())
         seeds = rng.random((count, 3))
         radius, angle = np.sqrt(seeds[:, 1]), 2 * np.pi * seeds[:, 2]
         seeds[:, 0] += np.repeat(np.arange(len(cells)), each)
         seeds[:, 1], seeds[:, 2] = radius * np.cos(angle), radius * np.sin(angle)
-        return seeds
+        values = self._ends(self.dense)
+        dense = np.interp(seeds[:, 0], np.arange(len(values)), values)
+        return Seeds(seeds, np.ones(count), dense)
 
     def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
         """Positions ``(n, 3)`` and the sine between cord and line of sight ``(n,)``."""
@@ -176,15 +187,6 @@ class Cord:
         v = np.cross(tangent, u)
         p, tangent, u, v = (self._ends(x) for x in (p, tangent, u, v))
         return _on_cord(p, tangent, u, v, self._ends(self.radius), seeds, apex)
-
-    def strength(self, seeds: FloatArray) -> FloatArray:
-        """Amplitude ``(n,)`` relative to the material's: 1."""
-        return np.ones(len(seeds))
-
-    def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
-        """``(n,)`` from 0 to 1, the share of dense tissue."""
-        values = self._ends(self.dense)
-        return np.asarray(np.interp(seeds[:, 0], np.arange(len(values)), values))
 
 
 TissuePart: TypeAlias = TissueSheet | Cord

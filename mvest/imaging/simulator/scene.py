@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import Probe
+from mvest.imaging.simulator.acquisition import Acquisition, Probe
 from mvest.imaging.simulator.scatterers import Cord, Material, TissuePart, TissueSheet, normals
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.typing import FloatArray
@@ -398,9 +397,9 @@ def make_scene(
         count = max(8, round(density * part.material.fineness * part.volume))
         seeds = part.sow(rng, count)
         share = part.volume / count
-        loss = a.frequency_mhz * more + a.shadow_db_per_cm * part.density_of_shadow(seeds)
+        loss = a.frequency_mhz * more + a.shadow_db_per_cm * seeds.dense
         level = 10 ** (part.material.echo_db / 20) * np.sqrt(share)
-        scene.append(Sown(part, seeds, level * part.strength(seeds), share * loss))
+        scene.append(Sown(part, seeds.places, level * seeds.strength, share * loss))
     return scene
 
 

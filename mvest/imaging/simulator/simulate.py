@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
-from mvest.imaging.simulator.probe import Probe
+from mvest.imaging.simulator.acquisition import Acquisition, Probe
+from mvest.imaging.simulator.beams import BeamGrid, losses_of, render_window
 from mvest.imaging.simulator.scene import make_scene, scene_echoes
 from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
@@ -131,24 +130,24 @@ def simulate_volume(
     chosen = _chosen(valve, frames)
     if seed < 0:
         raise InputError(f"simulated volume, seed = {seed}, expected >= 0")
-    depth = probe.to_world(np.zeros(3))[2]
-    if depth <= acquisition.depth_mm[0]:
+    about = probe.to_world(np.zeros(3))
+    if about[2] <= acquisition.depth_mm[0]:
         raise InputError(
-            f"simulated volume, probe: the valve lies {depth:.1f} mm along the beam, "
+            f"simulated volume, probe: the valve lies {about[2]:.1f} mm along the beam, "
             f"expected more than the nearest depth {acquisition.depth_mm[0]:g} mm"
         )
     rng = np.random.default_rng([seed, 0])
     scene = make_scene(valve, acquisition, probe, rng)
     grid = BeamGrid.of(acquisition)
-    beats = _displacements(acquisition, probe, rng)
-    contact = _contact(acquisition, rng)
+    beats = _displacements(acquisition, rng)
+    contact = acquisition.contact_db * rng.standard_normal((7, 7))
     out = np.empty((len(chosen), *acquisition.shape), dtype=np.uint8)
     envelope = np.empty(grid.shape, dtype=np.float32)
     for k, frame in enumerate(chosen):
         noise = np.random.default_rng([seed, 1, frame])
         echoes = scene_echoes(scene, frame, acquisition, probe)
-        losses = Losses.of(grid, echoes, contact)
-        for window, (turn, about, shift) in zip(grid.windows(), beats, strict=True):
+        losses = losses_of(grid, echoes, contact)
+        for window, turn, shift in zip(grid.windows(), *beats, strict=True):
             points = (echoes.points - about) @ turn.T + (about + shift)
             moved = replace(echoes, points=points)
             envelope[window[0] : window[1]] = render_window(grid, moved, losses, window, noise)
@@ -194,23 +193,14 @@ def _chosen(valve: MovingValve, frames: Sequence[int] | None) -> list[int]:
 
 
 def _displacements(
-    acquisition: Acquisition, probe: Probe, rng: np.random.Generator
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Turn (3, 3), centre (3,) and shift (3,) of the scene in each beat, in the probe's axes.
+    acquisition: Acquisition, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Turns ``(B, 3, 3)`` about the valve and shifts ``(B, 3)`` of the scene in each beat.
 
     The mean shift is zero: the truth is the mean of the beats.
     """
-    about = probe.to_world(np.zeros(3))
     turn = Rotation.from_rotvec(
         np.deg2rad(acquisition.beat_turn_deg) * rng.standard_normal((acquisition.beats, 3))
     ).as_matrix()
     shift = acquisition.beat_shift_mm * rng.standard_normal((acquisition.beats, 3))
-    shift -= shift.mean(axis=0)
-    if acquisition.beats == 1:
-        turn = np.eye(3)[None]
-    return [(turn[b], about, shift[b]) for b in range(acquisition.beats)]
-
-
-def _contact(acquisition: Acquisition, rng: np.random.Generator) -> FloatArray:
-    """Gain ``(7, 7)`` dB over the pyramid."""
-    return np.asarray(acquisition.contact_db * rng.standard_normal((7, 7)))
+    return turn if acquisition.beats > 1 else np.eye(3)[None], shift - shift.mean(axis=0)

@@ -7,7 +7,6 @@ import pytest
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import (
     SHIFTED,
-    SMALL,
     TRAINING,
     WIDE,
     Acquisition,
@@ -15,6 +14,7 @@ from mvest.imaging.simulator.acquisition import (
     Range,
     draw_acquisition,
 )
+from tests.imaging.simulator.made_up_valve import SMALL
 
 # Echo strengths and compensation may be those of training in both.
 BOTH = {"wall_db", "chord_db", "papillary_db", "vessel_db", "compensation_db_per_cm_mhz"}

@@ -4,9 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.imaging.simulator.acquisition import SMALL, Acquisition
+from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
 from mvest.imaging.simulator.scene import Echoes, cell_volume
+from tests.imaging.simulator.made_up_valve import SMALL
 
 QUIET = replace(
     Acquisition(),

@@ -3,8 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import Probe, draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, Probe, draw_probe
 
 
 def test_drawn_probes_look_at_the_valve_from_the_atrium():

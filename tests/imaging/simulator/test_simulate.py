@@ -9,9 +9,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
-from mvest.imaging.simulator.acquisition import SMALL
+from mvest.imaging.simulator.acquisition import Probe, draw_probe
 from mvest.imaging.simulator.beams import BeamGrid
-from mvest.imaging.simulator.probe import Probe, draw_probe
 from mvest.imaging.simulator.scene import make_heart, make_parts, make_scene
 from mvest.imaging.simulator.simulate import (
     _displacements,
@@ -22,7 +21,7 @@ from mvest.imaging.simulator.simulate import (
     volume_frame,
 )
 from mvest.imaging.volume import VolumeSequence
-from tests.imaging.simulator.made_up_valve import made_up_valve
+from tests.imaging.simulator.made_up_valve import SMALL, made_up_valve
 
 VALVE = made_up_valve()
 # Half way tilted, and world axes that are none of the probe's or the valve's.
