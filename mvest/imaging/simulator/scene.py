@@ -395,11 +395,11 @@ def make_scene(
     scene = []
     for part in make_parts(valve, heart, a, rng):
         count = max(8, round(density * part.material.fineness * part.volume))
-        seeds = part.sow(rng, count)
+        seeds, strength, dense = part.sow(rng, count)
         share = part.volume / count
-        loss = a.frequency_mhz * more + a.shadow_db_per_cm * seeds.dense
+        loss = a.frequency_mhz * more + a.shadow_db_per_cm * dense
         level = 10 ** (part.material.echo_db / 20) * np.sqrt(share)
-        scene.append(Sown(part, seeds.places, level * seeds.strength, share * loss))
+        scene.append(Sown(part, seeds, level * strength, share * loss))
     return scene
 
 
