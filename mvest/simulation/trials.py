@@ -16,12 +16,12 @@ from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import pose_of
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import frame_errors, surface_distances
 from mvest.imaging.learning.training import render_frame
-from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve

@@ -9,12 +9,10 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.imaging.detection.frame import StandardFrame
-from mvest.imaging.detection.leaflets import RIMS, find_boundary, find_landmarks, find_rim
+from mvest.imaging.detection.leaflets import find_boundary, find_landmarks, find_rim
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     MODES,
-    PLACES,
-    likely_places,
     refined,
     search_poses,
     starting_shape,
@@ -122,14 +120,6 @@ class FrameValve:
     landmarks: FloatArray
 
 
-def search_frame(
-    frame: StandardFrame, model: DetectionModel, count: int
-) -> tuple[Poses, FloatArray]:
-    """The best ``count`` poses in a frame and their ratings (0 to 1), best first."""
-    places, _ = likely_places(frame, model.boosters, PLACES)
-    return search_poses(frame, model.boosters, places, count)
-
-
 def find_frame(
     frame: StandardFrame, model: DetectionModel, settings: FitSettings | None = None
 ) -> FrameValve:
@@ -140,7 +130,7 @@ def find_frame(
     NoValveError
         If there is no place to look at.
     """
-    poses, rating = search_frame(frame, model, CANDIDATES)
+    poses, rating = search_poses(frame, model.boosters, CANDIDATES)
     if not len(poses):
         raise NoValveError("no place to look for a valve at: no field of view")
     if rating[0] < SURE:
@@ -187,7 +177,7 @@ def _confidence(
     In volumes with walls and no valve, leaflets may be seen (on a wall) where no pose is believed
     in, or the other way round, and mostly in a shape that no valve has.
     """
-    rating = float(np.clip(refined(frame, model.boosters, pose, 1)[1][0], 0.0, 1.0))
+    rating = float(np.clip(refined(frame, model.boosters, pose)[1][0], 0.0, 1.0))
     strange = max(0.0, float(((b / model.shape.std[: len(b)]) ** 2).mean()) - 1.0)
     return max(0.0, min(1.0, RATING_SHARE * rating + float(seen.mean())) - STRANGE_SHARE * strange)
 
@@ -245,46 +235,45 @@ def fit_frame(
     )
     pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], points[: len(at)], std))
     manual = np.array([k for k in fixed if k < len(at)], dtype=np.int64)
+    by_hand = at[manual], points[manual], np.full(len(manual), HAND_STD_MM[0])
     for modes, reach in zip(chosen.modes, chosen.reach_mm, strict=True):
         b = np.concatenate([b, np.zeros(modes - len(b))]) if modes > len(b) else b[:modes]
-        vertices = pose.world(shape.shape(b[None]))[0]
-        pulls, confidence = _seen(
-            frame, model, vertices, float(pose.log_scale[0]), reach, chosen.alike
-        )
-        hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[0])
-        pulls = Pulls.joined([pulls, hand])
+        _, pulls, confidence = _seen(frame, model, pose, b, reach, chosen.alike, by_hand)
         pose, b = fit_shape(shape, pose, b, pulls)
-    vertices = pose.world(shape.shape(b[None]))[0]
-    pulls, confidence = _seen(
-        frame, model, vertices, float(pose.log_scale[0]), chosen.reach_mm[-1], chosen.alike
+    by_hand = at[manual], points[manual], np.full(len(manual), HAND_STD_MM[1])
+    vertices, pulls, confidence = _seen(
+        frame, model, pose, b, chosen.reach_mm[-1], chosen.alike, by_hand
     )
-    hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
-    vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), chosen.stiffness, chosen.hold)
+    vertices = relax(vertices, layout, pulls, chosen.stiffness, chosen.hold)
     sure = _confidence(frame, model, pose, b, confidence)
     return FrameValve(begin, pose, b, vertices, tips, sure, confidence, points)
-
-
-def _by_hand(at: IntArray, vertices: FloatArray, points: FloatArray, std: float) -> Pulls:
-    return Pulls.to_points(at, vertices[at], points, np.full(len(at), std))
 
 
 def _seen(
     frame: StandardFrame,
     model: DetectionModel,
-    vertices: FloatArray,
-    log_scale: float,
+    pose: Poses,
+    b: FloatArray,
     reach: float,
     alike: float,
-) -> tuple[Pulls, FloatArray]:
-    """Pulls of leaflets and rims on a shape ``(n, 3)`` mm, and each vertex' confidence ``(n,)``."""
-    layout = model.shape.layout
-    normals, offset, std, confidence = find_boundary(frame, model.boosters, vertices, layout, reach)
-    root = np.sqrt(alike)
-    parts = [Pulls(np.arange(layout.size), normals, offset, root * std)]
-    for rim in RIMS:
-        axes, off, spread = find_rim(frame, model.boosters, rim, vertices, layout, log_scale)
-        at = layout.annulus if rim == "annulus" else layout.free_edge
+    by_hand: tuple[IntArray, FloatArray, FloatArray],
+) -> tuple[FloatArray, Pulls, FloatArray]:
+    """A shape ``(n, 3)`` mm, what pulls on it, and each vertex' confidence ``(n,)``.
+
+    Leaflets and rims pull, and vertices placed by hand: their numbers, where they were placed, and
+    the standard deviations of that.
+    """
+    layout, boosters = model.shape.layout, model.boosters
+    vertices = pose.world(model.shape.shape(b[None]))[0]
+    normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
+    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(alike) * std)]
+    for rim, at in (("annulus", layout.annulus), ("free_edge", layout.free_edge)):
+        axes, off, spread = find_rim(
+            frame, boosters, rim, vertices, layout, float(pose.log_scale[0])
+        )
         # Columns are alike too, over about as many as rows are.
         wide = np.sqrt(np.sqrt(alike)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
-    return Pulls.joined(parts), confidence
+    at, points, wide = by_hand
+    parts.append(Pulls.to_points(at, vertices[at], points, wide))
+    return vertices, Pulls.joined(parts), confidence

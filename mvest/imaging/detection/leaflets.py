@@ -11,13 +11,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.frame import SamplePattern, StandardFrame, features
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.shape_model import ShapeModel
+from mvest.imaging.detection.shape_model import (
+    Misses,
+    ShapeModel,
+    TrueValve,
+    missed_poses,
+    missed_shapes,
+)
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Trees
-from mvest.imaging.learning.sampling import SamplePattern, features
-from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses, missed_shapes
 from mvest.imaging.valve_sequence import landmark_vertices
 from mvest.typing import FloatArray, IntArray
 

@@ -15,12 +15,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.frame import SamplePattern, StandardFrame, directions, features
 from mvest.imaging.detection.pose import Poses, rotation_grid
-from mvest.imaging.detection.shape_model import ShapeModel
+from mvest.imaging.detection.shape_model import Misses, ShapeModel, TrueValve, missed_poses
 from mvest.imaging.learning.boosting import Trees
-from mvest.imaging.learning.sampling import SamplePattern, directions, features
-from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray
 
 PLACES = 24
@@ -84,10 +82,8 @@ def _places(frame: StandardFrame) -> FloatArray:
     return frame.centres(GRID_LEVEL)[(every & (level > 0)).ravel()]
 
 
-def likely_places(
-    frame: StandardFrame, boosters: Trees, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """The best places ``(count, 3)`` mm that are apart from one another, and their ratings.
+def likely_places(frame: StandardFrame, boosters: Trees, count: int) -> FloatArray:
+    """The best places ``(count, 3)`` mm that are apart from one another.
 
     Parameters
     ----------
@@ -96,17 +92,16 @@ def likely_places(
     """
     places = _places(frame)
     if not len(places):
-        return np.zeros((0, 3)), np.zeros(0)
-    rating = boosters["position"](_shell_features(frame, places))[:, 0]
+        return np.zeros((0, 3))
+    left = boosters["position"](_shell_features(frame, places))[:, 0]
     kept: list[int] = []
-    left = rating.copy()
     for _ in range(count):
         k = int(np.argmax(left))
         if not np.isfinite(left[k]):
             break
         kept.append(k)
         left[np.linalg.norm(places - places[k], axis=1) < 0.8 * NEAR_MM] = -np.inf
-    return places[kept], rating[kept]
+    return places[kept]
 
 
 ORIENTATIONS = 700
@@ -223,10 +218,8 @@ def refinement_samples(
     return features(frame, FINE, poses.centre, poses.axes), poses.towards(right)
 
 
-def search_poses(
-    frame: StandardFrame, boosters: Trees, places: FloatArray, count: int
-) -> tuple[Poses, FloatArray]:
-    """The best ``count`` poses at some places ``(P, 3)`` mm and their ratings, best first.
+def search_poses(frame: StandardFrame, boosters: Trees, count: int) -> tuple[Poses, FloatArray]:
+    """The best ``count`` poses in a frame and their ratings (0 to 1), best first.
 
     Parameters
     ----------
@@ -234,7 +227,7 @@ def search_poses(
         One output for ``pose_coarse`` and ``pose_fine``: the rating. Seven for each step of
         ``pose_refine``: what takes the error back.
     """
-    grid = rotation_grid(ORIENTATIONS)
+    places, grid = likely_places(frame, boosters, PLACES), rotation_grid(ORIENTATIONS)
     every = Poses(
         np.repeat(places, len(grid), 0),
         np.tile(grid, (len(places), 1, 1)),
@@ -242,27 +235,21 @@ def search_poses(
     )
     rating = boosters["pose_coarse"](features(frame, COARSE, every.centre, every.axes))[:, 0]
     best = np.argsort(-rating, kind="stable")[:REFINED]
-    poses, rating = refined(frame, boosters, every[best], REFINED)
+    poses, rating = _sorted(*refined(frame, boosters, every[best]))
     # Front and back are distinguished last, so the best ones are tried the other way round too.
     back = poses[:TURNED].moved(np.tile(HALF_TURN, (len(poses[:TURNED]), 1)))
-    back, rated = refined(frame, boosters, back, TURNED)
-    poses, rating = Poses.joined([poses, back]), np.concatenate([rating, rated])
-    best = np.argsort(-rating, kind="stable")[:count]
+    back, rated = _sorted(*refined(frame, boosters, back))
+    poses, rating = _sorted(Poses.joined([poses, back]), np.concatenate([rating, rated]))
+    return poses[:count], rating[:count]
+
+
+def _sorted(poses: Poses, rating: FloatArray) -> tuple[Poses, FloatArray]:
+    """Best first."""
+    best = np.argsort(-rating, kind="stable")
     return poses[best], rating[best]
 
 
-def refined(
-    frame: StandardFrame, boosters: Trees, poses: Poses, count: int
-) -> tuple[Poses, FloatArray]:
-    """Refine some poses; the best ``count`` of them and their ratings."""
-    poses, rating = refined_in_order(frame, boosters, poses)
-    best = np.argsort(-rating, kind="stable")[:count]
-    return poses[best], rating[best]
-
-
-def refined_in_order(
-    frame: StandardFrame, boosters: Trees, poses: Poses
-) -> tuple[Poses, FloatArray]:
+def refined(frame: StandardFrame, boosters: Trees, poses: Poses) -> tuple[Poses, FloatArray]:
     """Refine some poses; all of them in their order, and their ratings."""
     for k in range(len(REFINEMENTS)):
         values = features(frame, FINE, poses.centre, poses.axes)

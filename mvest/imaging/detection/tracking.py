@@ -25,11 +25,10 @@ from mvest.imaging.detection.detect import (
     NoValveError,
     fit_frame,
     merits,
-    search_frame,
 )
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import refined, refined_in_order
+from mvest.imaging.detection.pose_search import refined, search_poses
 from mvest.imaging.detection.shape_model import Pulls, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.valve_sequence import LANDMARKS, MIN_CONFIDENCE, ValveSequence, landmark_vertices
@@ -319,7 +318,7 @@ def _trajectory(
     for k, frame in enumerate(frames):
         placed = _pose_by_hand(by_hand.get(k, {}), model)
         if placed is None:
-            poses, rating = search_frame(frame, model, CANDIDATES)
+            poses, rating = search_poses(frame, model.boosters, CANDIDATES)
             few = poses.apart(rating, chosen.hypotheses)
             own.append((poses[few], rating[few]))
         else:
@@ -339,7 +338,7 @@ def _trajectory(
         if _pose_by_hand(by_hand.get(k, {}), model) is not None:
             candidates.append(own[k])
             continue
-        again, rated = refined(frame, model.boosters, best, len(best))
+        again, rated = refined(frame, model.boosters, best)
         candidates.append((Poses.joined([own[k][0], again]), np.concatenate([own[k][1], rated])))
     path = _best_path(candidates, times, model, chosen)
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
@@ -351,7 +350,7 @@ def _likeliest_in_all(
     """At which of some poses the valve is seen best in a few frames."""
     seen = np.zeros(len(tried))
     for k in sorted({0, len(frames) // 2, len(frames) - 1}):
-        poses, _ = refined_in_order(frames[k], model.boosters, tried)
+        poses, _ = refined(frames[k], model.boosters, tried)
         seen += merits(frames[k], model, poses, fit)
     return int(np.argmax(seen))
 

@@ -13,9 +13,9 @@ from scipy.spatial.distance import cdist
 from mvest.errors import InputError
 from mvest.imaging.detection.detect import FrameValve
 from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from mvest.typing import FloatArray
 
 BIN_MM = 1.0

@@ -24,21 +24,18 @@ from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_sa
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     MODES,
-    PLACES,
     REFINED,
     REFINEMENTS,
     coarse_samples,
     fine_samples,
-    likely_places,
     position_samples,
     refinement_samples,
     search_poses,
     shape_start_samples,
 )
-from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
+from mvest.imaging.detection.shape_model import ShapeModel, TrueValve, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
-from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
@@ -106,8 +103,7 @@ def taken_for_valves(
 
     Half of ``count`` poses are those rated best, the others some of the rest.
     """
-    places, _ = likely_places(frame, draft, PLACES)
-    poses, _ = search_poses(frame, draft, places, REFINED)
+    poses, _ = search_poses(frame, draft, REFINED)
     best = count // 2
     others = best + rng.choice(len(poses) - best, count - best, replace=False)
     return poses[np.concatenate([np.arange(best), others])]

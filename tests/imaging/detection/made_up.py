@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.valve_sequence import MovingValve, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.template import Template

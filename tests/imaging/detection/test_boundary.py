@@ -5,8 +5,8 @@ import pytest
 from mvest.imaging.detection.boundary import BoundaryDetector, boundary_samples, leaflet_axes
 
 from mvest.imaging.detection import boundary
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from tests.imaging.detection.made_up import (
     LAYOUT,
     TIPS,

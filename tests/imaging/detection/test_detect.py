@@ -9,7 +9,7 @@ from mvest.imaging.detection.landmark_detector import landmark_points
 
 from mvest.errors import InputError
 from mvest.imaging.detection.detect import fit_frame, search_frame
-from mvest.imaging.learning.truth import TrueValve
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (
     FIT,

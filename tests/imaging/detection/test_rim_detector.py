@@ -5,8 +5,8 @@ import pytest
 from mvest.imaging.detection.rim_detector import RimDetector, rim_axes, rim_samples
 
 from mvest.imaging.detection import rim_detector
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from tests.imaging.detection.made_up import (
     LAYOUT,
     TIPS,

@@ -7,8 +7,8 @@ from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.learning.evaluation import best_threshold, frame_errors, surface_distances
 
 from mvest.imaging.detection.detect import FrameValve
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from mvest.valve.anatomy.template import Template
 from tests.imaging.detection.made_up import TIPS, poses
 

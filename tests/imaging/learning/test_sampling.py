@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.detection.frame import StandardFrame
-from mvest.imaging.learning.sampling import SamplePattern, directions, features
+from mvest.imaging.detection.frame import SamplePattern, StandardFrame, directions, features
 from tests.exchange.volumes.volumes import MIRRORED, ROTATION
 from tests.imaging.detection.made_up import poses
 
