@@ -20,7 +20,7 @@ from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.accuracy import frame_errors, surface_distances
+from mvest.imaging.learning.accuracy import frame_errors, surface_distance
 from mvest.imaging.learning.training import render_frame
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
@@ -160,10 +160,9 @@ def try_sequence(
     frames = []
     for k in range(len(true.times)):
         x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
-        there, back = surface_distances(x, right, layout)
         frames.append(
             {
-                "surface": float(0.5 * (there.mean() + back.mean())),
+                "surface": surface_distance(x, right, layout),
                 "points": float(np.linalg.norm(x - right, axis=1).mean()),
                 "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
                 **_differences(x, tips, right, true.tips[k], layout),

@@ -232,7 +232,7 @@ def _bending(layout: ValveLayout) -> sparse.csr_array:
     return sparse.csr_array(laplacian.T @ laplacian)
 
 
-# -- valves that detectors learn from, and guesses that miss them -----------------------------------
+# -- valves that detectors learn from, and guesses that miss them ---------------------------------
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueValve:
     """One valve in world coordinates.

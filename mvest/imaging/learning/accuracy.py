@@ -126,18 +126,9 @@ def measure_accuracy(
     Raises
     ------
     InputError
-        If there are fewer than two sequences, shapes do not fit, or an error is not finite.
+        If there are no errors at some vertex, or one is not finite.
     """
     count, frames, n = samples.shape[:3]
-    if count < 2:
-        raise InputError(f"accuracy of detectors: {count} sequences, expected two or more")
-    if samples.shape != (count, frames, len(rest), 3) or tip_samples.shape != (count, frames, 2, 3):
-        raise InputError(
-            f"accuracy of detectors: errors {samples.shape} and {tip_samples.shape} of {len(rest)} "
-            "vertices, expected (S, F, n, 3) and (S, F, 2, 3)"
-        )
-    if not (np.isfinite(samples).all() and np.isfinite(tip_samples).all()):
-        raise InputError("accuracy of detectors: errors that are not finite")
     about = samples - samples.mean(axis=0)
     std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 1) * frames * 3))
     correlations = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
@@ -169,18 +160,9 @@ def widened(
         Errors of further sequences, of other valves and over wider acquisitions.
     wide_confidence : (W,)
 
-    Raises
-    ------
-    InputError
-        If confidences are not one for each, or there is no further sequence.
     """
     samples, std = accuracy.samples, accuracy.std_mm
     count, frames = samples.shape[:2]
-    if len(confidence) != count or len(wide) != len(wide_confidence) or not len(wide):
-        raise InputError(
-            f"errors by confidence: {count} sequences with {len(confidence)} confidences, and "
-            f"{len(wide)} with {len(wide_confidence)}, expected one for each, and some of both"
-        )
     mean = samples.mean(axis=0)
     compared = samples if count > 2 else samples[:0]  # one other has no spread
     off = []
@@ -236,9 +218,8 @@ def frame_errors(found: FrameValve, true: TrueValve, layout: ValveLayout) -> dic
         (degrees).
     """
     by = found.start.towards(true.pose)[0]
-    there, back = surface_distances(found.vertices, true.vertices, layout)
     return {
-        "surface": float(0.5 * (there.mean() + back.mean())),
+        "surface": surface_distance(found.vertices, true.vertices, layout),
         "points": _mean_distance(found.vertices, true.vertices),
         "tips": _mean_distance(found.tips, true.tips),
         "position": float(np.linalg.norm(by[:3])),
@@ -252,14 +233,13 @@ def _mean_distance(points: FloatArray, true: FloatArray) -> float:
     return float(np.linalg.norm(points - true, axis=1).mean())
 
 
-def surface_distances(
-    detected: FloatArray, true: FloatArray, layout: ValveLayout
-) -> tuple[FloatArray, FloatArray]:
-    """Distances ``(n,)`` mm of the vertices of each surface from the other.
+def surface_distance(detected: FloatArray, true: FloatArray, layout: ValveLayout) -> float:
+    """Mean symmetric distance (mm) of two surfaces: of the vertices of each from the other.
 
     A surface is stood for by its tangent planes at four times as many points in each direction.
     """
-    return _to_surface(detected, true, layout), _to_surface(true, detected, layout)
+    there, back = _to_surface(detected, true, layout), _to_surface(true, detected, layout)
+    return float(0.5 * (there.mean() + back.mean()))
 
 
 def _to_surface(points: FloatArray, surface: FloatArray, layout: ValveLayout) -> FloatArray:

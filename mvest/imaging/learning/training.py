@@ -18,12 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mvest.errors import InputError
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_samples, rim_samples
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
-    MODES,
     REFINED,
     REFINEMENTS,
     coarse_samples,
@@ -270,12 +268,8 @@ def train_model(
     Raises
     ------
     InputError
-        If there is no valve, fewer shapes than modes, or fewer modes than are read off at a pose.
+        If there are fewer shapes than modes.
     """
-    if not valves:
-        raise InputError("training: no valves")
-    if settings.modes < MODES:
-        raise InputError(f"training: {settings.modes} modes, expected at least {MODES}")
     shape = fit_shape_model(valves, settings.modes)
     first = min(settings.draft_volumes, settings.volumes)
     samples = drafted = list(sampled(range(first), shape, None))

@@ -22,15 +22,14 @@ from mvest.typing import FloatArray
 ROWS = 33
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Heart:
-    """Moving grids ``(T, R, C, 3)`` mm of inner surfaces, and lines of muscles.
+class Heart(NamedTuple):
+    """What lies around a valve, in motion: walls of the chambers and papillary muscles.
 
     Attributes
     ----------
-    ventricle, atrium, aorta : (T, R, C, 3)
-        Rows lead away from the valve, columns run around.
-    ventricle_thickness, atrium_thickness, aorta_thickness : (R, C)
+    ventricle, atrium, aorta : (T, R, C, 3) mm and (R, C) mm
+        Inner surface, whose rows lead away from the valve and whose columns run around, and
+        thickness of the wall.
     muscles : tuple of (T, m, 3)
         From each papillary tip to the ventricle's wall.
     muscle_radius : (m,)
@@ -38,12 +37,9 @@ class Heart:
         Share of the outflow tract in the ventricle's base, 0 (at the back) to 1.
     """
 
-    ventricle: FloatArray
-    atrium: FloatArray
-    aorta: FloatArray
-    ventricle_thickness: FloatArray
-    atrium_thickness: FloatArray
-    aorta_thickness: FloatArray
+    ventricle: tuple[FloatArray, FloatArray]
+    atrium: tuple[FloatArray, FloatArray]
+    aorta: tuple[FloatArray, FloatArray]
     muscles: tuple[FloatArray, ...]
     muscle_radius: FloatArray
     outflow: FloatArray
@@ -145,13 +141,11 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     wall *= 1 - 0.35 * _step((u - 0.75) / 0.25)
 
     muscles, fat = _muscles(valve, ventricle, rng)
+    atrium = _atrium(annulus, angle, apex, rng)
     return Heart(
-        ventricle,
-        _atrium(annulus, angle, apex, rng),
-        aorta,
-        np.maximum(wall, 2.0),
-        np.full((ROWS, len(angle)), rng.uniform(2.0, 3.2)),
-        np.full((len(along), len(around)), rng.uniform(1.6, 2.2)),
+        (ventricle, np.maximum(wall, 2.0)),
+        (atrium, np.full((ROWS, len(angle)), rng.uniform(2.0, 3.2))),
+        (aorta, np.full((len(along), len(around)), rng.uniform(1.6, 2.2))),
         muscles,
         fat,
         outflow[:, 0],
@@ -264,10 +258,10 @@ def _wall_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[
     wall, vessel = Material("wall", a.wall_db), Material("vessel", a.vessel_db)
     muscle = Material("papillary", a.papillary_db, specular=False)
     parts: list[TissuePart] = []
-    for material, points, thickness, span in (
-        (wall, heart.ventricle, heart.ventricle_thickness, (0.0, 1.0)),
-        (vessel, heart.atrium, heart.atrium_thickness, (-1.0, 0.0)),
-        (vessel, heart.aorta, heart.aorta_thickness, (-0.5, 0.5)),
+    for material, (points, thickness), span in (
+        (wall, heart.ventricle, (0.0, 1.0)),
+        (vessel, heart.atrium, (-1.0, 0.0)),
+        (vessel, heart.aorta, (-0.5, 0.5)),
     ):
         parts.append(
             TissueSheet(material, points, thickness, span, _mottled(thickness.shape, 2.0, rng))
@@ -282,14 +276,15 @@ def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list
     free = 1 - heart.outflow
     pericardium = Material("pericardium", a.vessel_db + 2.0)
     around = Material("surroundings", a.wall_db - 2.0, specular=False, fineness=0.5)
-    outside = heart.ventricle + heart.ventricle_thickness[..., None] * normals(heart.ventricle)
-    shape = heart.ventricle_thickness.shape
+    points, thickness = heart.ventricle
+    outside, shape = points + thickness[..., None] * normals(points), thickness.shape
     parts: list[TissuePart] = [
         TissueSheet(
             pericardium, outside, np.full(shape, 1.2), (0.0, 1.0), np.tile(free, (shape[0], 1))
         )
     ]
-    atrium = heart.atrium - heart.atrium_thickness[..., None] * normals(heart.atrium)
+    points, thickness = heart.atrium
+    atrium = points - thickness[..., None] * normals(points)
     # Close to the annulus the atrium's wall turns outward, and its normal into the ventricle.
     for points, side in ((outside, 1.0), (atrium[:, 4:], -1.0)):
         thickness = np.tile(0.02 + SURROUNDINGS_MM * free, (points.shape[1], 1))
