@@ -278,10 +278,7 @@ def test_volumes_and_what_writes_them_count_where_they_are_used():
     }  # fmt: skip
     assert reached(*SAMPLED_BY) >= volumes
     tried = reached(try_sequence)
-    assert tried >= volumes | {
-        "mvest.imaging.detection.tracking",
-        "mvest.imaging.detection.shape_model",
-    }
+    assert tried >= volumes | {"mvest.imaging.detection.tracking", "mvest.imaging.detection.frame"}
     for found in (imaged, tried):
         assert not [name for name in found if name.startswith("experiments.common.cases")]
 

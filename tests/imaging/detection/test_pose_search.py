@@ -203,13 +203,13 @@ def test_the_best_place_is_first_and_others_are_apart(shape, monkeypatch):
 def test_fewer_places_than_asked_for_are_all_there_are(monkeypatch):
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.array([[0.0, 0, 0], [1.0, 0, 0]]))
     monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    flat = {"position": Oracle(1, lambda x: x[:, :1])}
+    flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
     np.testing.assert_array_equal(likely_places(NumberedFrame(), flat, 5), [[1.0, 0, 0]])
 
 
 def test_nowhere_to_look_gives_no_places(monkeypatch):
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
-    flat = {"position": Oracle(1, lambda x: x[:, :1])}
+    flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
     assert likely_places(NumberedFrame(), flat, 5).shape == (0, 3)
 
 
