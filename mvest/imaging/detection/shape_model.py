@@ -228,7 +228,7 @@ def _bending(layout: ValveLayout) -> sparse.csr_array:
     first = np.concatenate([number.ravel(), number[:-1].ravel()])
     second = np.concatenate([np.roll(number, -1, 1).ravel(), number[1:].ravel()])
     neighbours = sparse.coo_array((np.ones(len(first)), (first, second)), (layout.size,) * 2)
-    laplacian = csgraph.laplacian(neighbours + neighbours.T)
+    laplacian = sparse.csr_array(csgraph.laplacian(neighbours + neighbours.T))
     return sparse.csr_array(laplacian.T @ laplacian)
 
 
