@@ -28,7 +28,7 @@ def _check(valve: Any, what: str, shapes: dict[str, tuple[int, ...]]) -> None:
             raise InputError(f"{what}, {name}: shape {given}, expected {shape}")
     times = valve.times
     if not (len(times) and np.isfinite(times).all() and np.all(np.diff(times) > 0)):
-        raise InputError(f"{what}, times {times} s: expected increasing ones")
+        raise InputError(f"{what}: times {times} s, expected increasing ones")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

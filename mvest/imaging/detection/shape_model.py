@@ -18,7 +18,6 @@ from functools import lru_cache
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
 from mvest.errors import InputError
@@ -228,7 +227,8 @@ def _bending(layout: ValveLayout) -> sparse.csr_array:
     first = np.concatenate([number.ravel(), number[:-1].ravel()])
     second = np.concatenate([np.roll(number, -1, 1).ravel(), number[1:].ravel()])
     neighbours = sparse.coo_array((np.ones(len(first)), (first, second)), (layout.size,) * 2)
-    laplacian = sparse.csr_array(csgraph.laplacian(neighbours + neighbours.T))
+    adjacency = neighbours + neighbours.T
+    laplacian = sparse.diags_array(adjacency.sum(axis=1)) - adjacency
     return sparse.csr_array(laplacian.T @ laplacian)
 
 

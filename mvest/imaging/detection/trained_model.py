@@ -203,6 +203,12 @@ def default_model() -> DetectionModel:
     InputError
         If the package holds none, or it cannot be read.
     """
+    if not MODEL_FILE.is_file():
+        raise InputError(
+            f"{MODEL_FILE}: no trained detectors come with this installation; expected what "
+            "python -m experiments.run experiment=imaging imaging.model=null "
+            "imaging.publish_model=true makes"
+        )
     return load_model(MODEL_FILE)
 
 
