@@ -38,7 +38,7 @@ $(INSTALLED): requirements.lock pyproject.toml
 $(DEVELOP): $(INSTALLED)
 	@echo "installing what tests, documentation and 3D pictures need ..."
 	@$(UV) --require-hashes --constraint requirements.lock -r pyproject.toml \
-		--extra dev --extra docs --extra viz --extra cluster --extra febio
+		--extra dev --extra docs --extra viz --extra cluster
 	@touch $@
 
 install: $(DEVELOP) ## create .venv with all locked packages (every other target installs what it needs)
@@ -98,7 +98,7 @@ slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tes
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'
 
 lock: $(DEVELOP) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
-	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra docs --extra viz --extra cluster --extra febio \
+	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra docs --extra viz --extra cluster \
 		--generate-hashes --no-annotate --custom-compile-command "make lock" $(UPGRADE) \
 		--quiet --output-file requirements.lock
 

@@ -11,8 +11,7 @@ import numpy as np
 
 import mvest
 from mvest.exchange.segmentations import write_sequence_nrrd
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.simulation.motion import MotionSettings, close_in_motion
 from mvest.valve.anatomy.dimensions import AnnulusDimensions

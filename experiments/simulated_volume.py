@@ -28,8 +28,7 @@ from mvest.cases.from_images.files import write_landmarks, write_surfaces
 from mvest.errors import ConfigurationError, MvestError
 from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
 from mvest.files import write_atomically
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.simulation.motion import MotionSettings, close_in_motion

@@ -20,9 +20,9 @@ from .estimation.information.identifiability import identifiability as identifia
 from .estimation.prediction import Prediction as Prediction
 from .estimation.transform import Identity as Identity
 from .estimation.transform import Log as Log
+from .exchange.volumes import read_volume as read_volume
 from .imaging.detection.tracking import detect_valve as detect_valve
 from .imaging.detection.trained_model import default_model as default_model
-from .exchange.volumes import read_volume as read_volume
 from .imaging.volume import Modality as Modality
 from .mechanics.body import simulate_body as simulate_body
 from .mechanics.law.moduli import TransverselyIsotropic as TransverselyIsotropic

@@ -15,8 +15,7 @@ import pytest
 import mvest
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume
 from tests.made_up_closure import made_up_case, use
 from tests.made_up_sequence import descending_valve

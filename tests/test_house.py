@@ -162,10 +162,10 @@ IMPORT_NAME = {
     "simpleitk": ("SimpleITK",),
     "vtk": ("vtkmodules",),
 }
-OPTIONAL = ("viz", "cluster", "febio", "postgres", "second-model")
+OPTIONAL = ("viz", "cluster", "postgres", "second-model")
 """Extras that mvest and experiments may use, within functions."""
 
-LOCKED = ("dev", "docs", "viz", "cluster", "febio")
+LOCKED = ("dev", "docs", "viz", "cluster")
 """Extras that `make lock` pins."""
 
 

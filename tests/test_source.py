@@ -192,7 +192,7 @@ def test_what_is_kept_knows_what_makes_it():
     imaged = reached(imaged_patient._simulate, imaged_patient._write)
     assert imaged >= FORWARD | {"mvest.exchange.segmentations", "mvest.imaging.simulator.beams"}
     tried = reached(try_sequence)
-    assert tried >= {"mvest.imaging.detection.tracking", "mvest.imaging.learning.truth"}
+    assert tried >= {"mvest.imaging.detection.tracking", "mvest.imaging.detection.frame"}
     assert reached(*SAMPLED_BY) >= {"mvest.imaging.volume", "mvest.imaging.simulator.beams"}
 
 

@@ -30,8 +30,7 @@ from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.segmentations import write_sequence_nrrd
-from mvest.imaging.simulator.acquisition import draw_acquisition
-from mvest.imaging.simulator.probe import Probe, draw_probe
+from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence

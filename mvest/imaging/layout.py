@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,13 +29,12 @@ class ValveLayout:
         and the middles of both are columns.
     rows : int
         Vertices from annulus to free edge, at least 3.
-    region_names : tuple of str
-        Of the leaflet over phi in (0, 180), and of the other one.
     """
 
     columns: int = 64
     rows: int = 15
-    region_names: tuple[str, str] = ("anterior", "posterior")
+    region_names: ClassVar[tuple[str, str]] = ("anterior", "posterior")
+    """Of the leaflet over phi in (0, 180), and of the other one."""
 
     def __post_init__(self) -> None:
         if self.columns < 8 or self.columns % 4 or self.rows < 3:

@@ -11,13 +11,24 @@ frame are commissures, annulus, middles of the free edges and tips.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray, IntArray
+
+
+def _check(valve: Any, what: str, shapes: dict[str, tuple[int, ...]]) -> None:
+    """Refuse arrays that do not belong together, and times that do not increase."""
+    for name, shape in shapes.items():
+        given = np.shape(getattr(valve, name))
+        if given != shape:
+            raise InputError(f"{what}, {name}: shape {given}, expected {shape}")
+    times = valve.times
+    if not (len(times) and np.isfinite(times).all() and np.all(np.diff(times) > 0)):
+        raise InputError(f"{what}: times {times} s, expected increasing ones")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,18 +65,8 @@ class MovingValve:
 
     def __post_init__(self) -> None:
         t, n, c = len(self.times), self.layout.size, len(self.chord_phi)
-        for name, shape in (
-            ("vertices", (t, n, 3)),
-            ("tips", (t, 2, 3)),
-            ("thickness", (n,)),
-            ("chord_s", (c,)),
-            ("chord_tip", (c,)),
-        ):
-            given = np.shape(getattr(self, name))
-            if given != shape:
-                raise InputError(f"moving valve {self.name}, {name}: shape {given}, not {shape}")
-        if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
-            raise InputError(f"moving valve {self.name}: times {self.times} s do not increase")
+        shapes = {"vertices": (t, n, 3), "tips": (t, 2, 3), "thickness": (n,)}
+        _check(self, f"moving valve {self.name}", shapes | {"chord_s": (c,), "chord_tip": (c,)})
 
 
 MIN_CONFIDENCE = 0.7
@@ -112,18 +113,9 @@ class ValveSequence:
 
     def __post_init__(self) -> None:
         t, n = len(self.times), self.layout.size
-        for name, shape in (
-            ("vertices", (t, n, 3)),
-            ("tips", (t, 2, 3)),
-            ("frame_confidence", (t,)),
-            ("vertex_confidence", (t, n)),
-            ("std_mm", (n,)),
-        ):
-            given = np.shape(getattr(self, name))
-            if given != shape:
-                raise InputError(f"valve sequence {name}: shape {given}, expected {shape}")
-        if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
-            raise InputError(f"valve sequence times {self.times} s, expected increasing ones")
+        shapes = {"vertices": (t, n, 3), "tips": (t, 2, 3), "std_mm": (n,)}
+        confidence = {"frame_confidence": (t,), "vertex_confidence": (t, n)}
+        _check(self, "valve sequence", shapes | confidence)
 
     @property
     def confidence(self) -> float:

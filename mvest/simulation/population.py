@@ -248,11 +248,6 @@ def save_population(path: Path, population: Population) -> None:
     if len(layouts) != 1:
         raise InputError(f"{path}: valves of {len(layouts)} layouts, expected one layout")
     layout = valves[0].layout
-    if layout != ValveLayout(layout.columns, layout.rows):
-        raise InputError(
-            f"{path}: valves of the regions {', '.join(layout.region_names)}, expected "
-            f"{', '.join(ValveLayout().region_names)}"
-        )
 
     def joined(name: str, kind: type = np.float32) -> Any:
         return np.concatenate([np.asarray(getattr(v, name), dtype=kind) for v in valves])

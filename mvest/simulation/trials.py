@@ -16,14 +16,13 @@ from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import pose_of
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.evaluation import frame_errors, surface_distances
-from mvest.imaging.learning.training import Setting, render_frame
-from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.simulator.acquisition import Acquisition, draw_acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.learning.accuracy import frame_errors, surface_distance
+from mvest.imaging.learning.training import render_frame
+from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.typing import FloatArray
@@ -114,8 +113,7 @@ def try_volume(
     if not has_valve:
         nothing = dict.fromkeys(WITHOUT_VALVE[trial.kind], ABSENT_DB)
         base = replace(base, **nothing, shadow_db_per_cm=0.0)  # type: ignore[arg-type]
-    seen = render_frame(valve, frame, base, trial.spread, render)
-    volume = seen.volume
+    volume, seen = render_frame(valve, frame, base, trial.spread, render)
     if trial.kind == "white noise":
         grey = np.random.default_rng(render).integers(0, 256, volume.frames.shape, dtype=np.uint8)
         volume = replace(volume, frames=grey, source="white noise", sha256="")
@@ -129,18 +127,9 @@ def try_volume(
         "confidence": float(found.confidence),
     }
     if has_valve:
-        true, layout = TrueValve.of(seen.vertices, seen.tips, model.shape), model.shape.layout
-        errors = frame_errors(found, found.vertices, found.tips, true, layout)
-        row |= {
-            "surface": errors.surface,
-            "points": errors.points,
-            "tips": errors.tips,
-            "position": errors.position,
-            "pose": errors.turn,
-            "landmarks": errors.stages["landmarks"],
-            "hinge": errors.annulus,
-            **_differences(found.vertices, found.tips, seen.vertices, seen.tips, layout),
-        }
+        true, layout = TrueValve.of(seen.vertices[0], seen.tips[0], model.shape), seen.layout
+        row |= frame_errors(found, true, layout)
+        row |= _differences(found.vertices, found.tips, true.vertices, true.tips, layout)
     return {"row": json.dumps(row)}
 
 
@@ -171,10 +160,9 @@ def try_sequence(
     frames = []
     for k in range(len(true.times)):
         x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
-        there, back = surface_distances(x, right, layout)
         frames.append(
             {
-                "surface": float(0.5 * (there.mean() + back.mean())),
+                "surface": surface_distance(x, right, layout),
                 "points": float(np.linalg.norm(x - right, axis=1).mean()),
                 "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
                 **_differences(x, tips, right, true.tips[k], layout),

@@ -442,9 +442,6 @@ def test_valves_of_one_file_have_one_layout(drawn, tmp_path):
     for valves, message in (((*drawn.valves, other), "2 layouts"), ((), "0 layouts")):
         with pytest.raises(InputError, match=message):
             save_population(tmp_path / "p.npz", replace(drawn, valves=valves))
-    named = still(layout=ValveLayout(16, 3, ("left", "right")))
-    with pytest.raises(InputError, match="regions left, right, expected anterior, posterior"):
-        save_population(tmp_path / "p.npz", replace(drawn, valves=(named,)))
 
 
 def test_a_file_that_cannot_be_written_is_said(drawn, tmp_path):

@@ -22,8 +22,8 @@ from experiments.common.schema import NOT_HASHED, Values
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
+from mvest.imaging.learning.boosting import Trees
 from mvest.imaging.learning.training import (
-    Draft,
     Samples,
     TrainingSettings,
     draft_of,
@@ -199,7 +199,7 @@ class ImagingStore:
         folder, settings = self.samples_folder(), self.settings.training
 
         def sampled(
-            numbers: Sequence[int], shape: ShapeModel, make_draft: Callable[[], Draft] | None
+            numbers: Sequence[int], shape: ShapeModel, make_draft: Callable[[], Trees] | None
         ) -> list[StoredSamples]:
             def make(missing: list[int]) -> Iterator[Samples]:
                 draft = make_draft() if make_draft else None
@@ -220,7 +220,7 @@ class ImagingStore:
                     self.seed,
                     processes=self.settings.processes,
                     trained_on=trained_on,
-                    progress=lambda *_: bar.step(),
+                    progress=bar.step,
                     sampled=sampled,
                 )
 

@@ -17,7 +17,7 @@ from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore,
 from mvest.cases.from_images.expected_error import coverage
 from mvest.errors import ConfigurationError, InputError
 from mvest.files import sha256_of, write_atomically
-from mvest.imaging.detection.shape_start import MODES
+from mvest.imaging.detection.pose_search import MODES
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
     DetectionModel,
@@ -27,11 +27,11 @@ from mvest.imaging.detection.trained_model import (
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import (
     Correlogram,
+    best_threshold,
     measure_accuracy,
     unlike_share,
     widened,
 )
-from mvest.imaging.learning.evaluation import best_threshold
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import landmark_vertices
 from mvest.provenance import provenance

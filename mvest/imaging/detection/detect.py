@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.leaflets import find_boundary, find_landmarks, find_rim
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import PLACES
+from mvest.imaging.detection.pose_search import (
+    MODES,
+    refined,
+    search_poses,
+    starting_shape,
+)
 from mvest.imaging.detection.shape_model import Pulls, fit_shape, relax
-from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence, landmark_vertices
@@ -101,8 +106,8 @@ class FrameValve:
     confidence : float
         0 (no valve) to 1.
     vertex_confidence : (n,)
-    stages : mapping
-        Name of a stage -> what it found, for tests of each.
+    landmarks : (L, 3)
+        As they were found before shapes were fitted.
     """
 
     start: Poses
@@ -112,15 +117,7 @@ class FrameValve:
     tips: FloatArray
     confidence: float
     vertex_confidence: FloatArray
-    stages: Mapping[str, FloatArray] = field(default_factory=dict)
-
-
-def search_frame(
-    frame: StandardFrame, model: DetectionModel, count: int = 5
-) -> tuple[Poses, FloatArray]:
-    """The best ``count`` poses in a frame and their ratings (0 to 1), best first."""
-    places, _ = model.position(frame, PLACES)
-    return model.poses(frame, places, count)
+    landmarks: FloatArray
 
 
 def find_frame(
@@ -133,7 +130,7 @@ def find_frame(
     NoValveError
         If there is no place to look at.
     """
-    poses, rating = search_frame(frame, model, CANDIDATES)
+    poses, rating = search_poses(frame, model.boosters, CANDIDATES)
     if not len(poses):
         raise NoValveError("no place to look for a valve at: no field of view")
     if rating[0] < SURE:
@@ -159,15 +156,15 @@ def _merit(
 ) -> float:
     shape, layout = model.shape, model.shape.layout
     some = np.arange(layout.size).reshape(layout.rows, -1)[::2, ::2]
-    coarse = ValveLayout(some.shape[1], some.shape[0], layout.region_names)
-    start, _ = model.start(frame, pose, shape)
+    coarse = ValveLayout(some.shape[1], some.shape[0])
+    start, _ = starting_shape(frame, model.boosters, pose, shape)
     b = np.zeros(settings.modes[0])
     b[:MODES] = start[0]
     seen = np.zeros(0)
     wide = np.sqrt(max(1.0, settings.alike * coarse.size / layout.size))
     for reach in (settings.reach_mm[0], settings.reach_mm[-1]):
         vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
-        normals, offset, std, seen = model.boundary(frame, vertices, coarse, reach)
+        normals, offset, std, seen = find_boundary(frame, model.boosters, vertices, coarse, reach)
         pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
     return _confidence(frame, model, pose, b, seen)
 
@@ -180,7 +177,7 @@ def _confidence(
     In volumes with walls and no valve, leaflets may be seen (on a wall) where no pose is believed
     in, or the other way round, and mostly in a shape that no valve has.
     """
-    rating = float(np.clip(model.poses.refined(frame, pose, 1)[1][0], 0.0, 1.0))
+    rating = float(np.clip(refined(frame, model.boosters, pose)[1][0], 0.0, 1.0))
     strange = max(0.0, float(((b / model.shape.std[: len(b)]) ** 2).mean()) - 1.0)
     return max(0.0, min(1.0, RATING_SHARE * rating + float(seen.mean())) - STRANGE_SHARE * strange)
 
@@ -217,20 +214,18 @@ def fit_frame(
         raise InputError(
             f"fit of {max(chosen.modes)} modes, expected at most the model's {len(shape.std)}"
         )
-    stages: dict[str, FloatArray] = {"pose": pose.world(shape.mean)[0]}
-    start, found_tips = model.start(frame, pose, shape)
+    start, found_tips = starting_shape(frame, model.boosters, pose, shape)
     b = np.zeros(chosen.modes[0])
     b[:MODES] = start[0] if coefficients is None else coefficients[:MODES]
     tips = found_tips[0] if tips is None else tips
     vertices = pose.world(shape.shape(b[None]))[0]
-    stages["shape start"] = vertices
     # Landmarks; those placed by hand are believed.
     at = np.array(list(landmark_vertices(layout).values()))
     guesses = np.concatenate([vertices[at], tips])
     fixed = fixed or {}
     free = np.array([k for k in range(len(guesses)) if k not in fixed], dtype=np.int64)
     points, spread = np.array(guesses), np.full(len(guesses), 0.0)
-    points[free], spread[free] = model.landmarks(frame, pose, guesses[free], free)
+    points[free], spread[free] = find_landmarks(frame, model.boosters, pose, guesses[free], free)
     for k, point in fixed.items():
         points[k] = point
     tips = points[len(at) :]
@@ -238,51 +233,47 @@ def fit_frame(
         np.where(np.isin(np.arange(len(at)), free), LANDMARK_STD_MM, HAND_STD_MM[0]),
         spread[: len(at)],
     )
-    stages["landmarks"] = points
     pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], points[: len(at)], std))
     manual = np.array([k for k in fixed if k < len(at)], dtype=np.int64)
-    pulls, confidence = None, np.zeros(layout.size)
+    by_hand = at[manual], points[manual], np.full(len(manual), HAND_STD_MM[0])
     for modes, reach in zip(chosen.modes, chosen.reach_mm, strict=True):
         b = np.concatenate([b, np.zeros(modes - len(b))]) if modes > len(b) else b[:modes]
-        vertices = pose.world(shape.shape(b[None]))[0]
-        pulls, confidence = _seen(
-            frame, model, vertices, float(pose.log_scale[0]), reach, chosen.alike
-        )
-        hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[0])
-        pulls = Pulls.joined([pulls, hand])
+        _, pulls, confidence = _seen(frame, model, pose, b, reach, chosen.alike, by_hand)
         pose, b = fit_shape(shape, pose, b, pulls)
-        stages[f"shape fit {modes}"] = pose.world(shape.shape(b[None]))[0]
-    vertices = pose.world(shape.shape(b[None]))[0]
-    pulls, confidence = _seen(
-        frame, model, vertices, float(pose.log_scale[0]), chosen.reach_mm[-1], chosen.alike
+    by_hand = at[manual], points[manual], np.full(len(manual), HAND_STD_MM[1])
+    vertices, pulls, confidence = _seen(
+        frame, model, pose, b, chosen.reach_mm[-1], chosen.alike, by_hand
     )
-    hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
-    vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), chosen.stiffness, chosen.hold)
+    vertices = relax(vertices, layout, pulls, chosen.stiffness, chosen.hold)
     sure = _confidence(frame, model, pose, b, confidence)
-    return FrameValve(begin, pose, b, vertices, tips, sure, confidence, stages)
-
-
-def _by_hand(at: IntArray, vertices: FloatArray, points: FloatArray, std: float) -> Pulls:
-    return Pulls.to_points(at, vertices[at], points, np.full(len(at), std))
+    return FrameValve(begin, pose, b, vertices, tips, sure, confidence, points)
 
 
 def _seen(
     frame: StandardFrame,
     model: DetectionModel,
-    vertices: FloatArray,
-    log_scale: float,
+    pose: Poses,
+    b: FloatArray,
     reach: float,
     alike: float,
-) -> tuple[Pulls, FloatArray]:
-    """Pulls of leaflets and rims on a shape ``(n, 3)`` mm, and each vertex' confidence ``(n,)``."""
-    layout = model.shape.layout
-    normals, offset, std, confidence = model.boundary(frame, vertices, layout, reach)
-    root = np.sqrt(alike)
-    parts = [Pulls(np.arange(layout.size), normals, offset, root * std)]
-    for rim in (model.annulus, model.free_edge):
-        axes, off, spread = rim(frame, vertices, layout, log_scale)
-        at = layout.annulus if rim.row == 0 else layout.free_edge
+    by_hand: tuple[IntArray, FloatArray, FloatArray],
+) -> tuple[FloatArray, Pulls, FloatArray]:
+    """A shape ``(n, 3)`` mm, what pulls on it, and each vertex' confidence ``(n,)``.
+
+    Leaflets and rims pull, and vertices placed by hand: their numbers, where they were placed, and
+    the standard deviations of that.
+    """
+    layout, boosters = model.shape.layout, model.boosters
+    vertices = pose.world(model.shape.shape(b[None]))[0]
+    normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
+    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(alike) * std)]
+    for rim, at in (("annulus", layout.annulus), ("free_edge", layout.free_edge)):
+        axes, off, spread = find_rim(
+            frame, boosters, rim, vertices, layout, float(pose.log_scale[0])
+        )
         # Columns are alike too, over about as many as rows are.
         wide = np.sqrt(np.sqrt(alike)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
-    return Pulls.joined(parts), confidence
+    at, points, wide = by_hand
+    parts.append(Pulls.to_points(at, vertices[at], points, wide))
+    return vertices, Pulls.joined(parts), confidence

@@ -3,6 +3,8 @@
 First every place is rated, whatever the orientation. Then orientations are rated at every place
 that is left, and the best ones refined step by step.
 
+At a pose, leading modes of the shape and the papillary tips are read off: the shape to begin with.
+
 Search in position first and in position, orientation and size then is the marginal space learning
 of Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008); the refinement is a cascade of regressions
 from what is seen at a hypothesis to its error.
@@ -10,17 +12,13 @@ from what is seen at a hypothesis to its error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.frame import SamplePattern, StandardFrame, directions, features
 from mvest.imaging.detection.pose import Poses, rotation_grid
-from mvest.imaging.detection.shape_model import ShapeModel
-from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import SamplePattern, directions, features
-from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
+from mvest.imaging.detection.shape_model import Misses, ShapeModel, TrueValve, missed_poses
+from mvest.imaging.learning.boosting import Trees
 from mvest.typing import FloatArray
 
 PLACES = 24
@@ -84,33 +82,26 @@ def _places(frame: StandardFrame) -> FloatArray:
     return frame.centres(GRID_LEVEL)[(every & (level > 0)).ravel()]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PositionDetector:
-    """Rates places.
+def likely_places(frame: StandardFrame, boosters: Trees, count: int) -> FloatArray:
+    """The best places ``(count, 3)`` mm that are apart from one another.
 
-    Attributes
+    Parameters
     ----------
-    boosters : Boosters
+    boosters : mapping
         One output: the rating, 1 at a valve's centre.
     """
-
-    boosters: Boosters
-
-    def __call__(self, frame: StandardFrame, count: int) -> tuple[FloatArray, FloatArray]:
-        """The best places ``(count, 3)`` mm that are apart from one another, and their ratings."""
-        places = _places(frame)
-        if not len(places):
-            return np.zeros((0, 3)), np.zeros(0)
-        rating = self.boosters(_shell_features(frame, places))[:, 0]
-        kept: list[int] = []
-        left = rating.copy()
-        for _ in range(count):
-            k = int(np.argmax(left))
-            if not np.isfinite(left[k]):
-                break
-            kept.append(k)
-            left[np.linalg.norm(places - places[k], axis=1) < 0.8 * NEAR_MM] = -np.inf
-        return places[kept], rating[kept]
+    places = _places(frame)
+    if not len(places):
+        return np.zeros((0, 3))
+    left = boosters["position"](_shell_features(frame, places))[:, 0]
+    kept: list[int] = []
+    for _ in range(count):
+        k = int(np.argmax(left))
+        if not np.isfinite(left[k]):
+            break
+        kept.append(k)
+        left[np.linalg.norm(places - places[k], axis=1) < 0.8 * NEAR_MM] = -np.inf
+    return places[kept]
 
 
 ORIENTATIONS = 700
@@ -227,51 +218,88 @@ def refinement_samples(
     return features(frame, FINE, poses.centre, poses.axes), poses.towards(right)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseSearch:
-    """Rates and refines poses.
+def search_poses(frame: StandardFrame, boosters: Trees, count: int) -> tuple[Poses, FloatArray]:
+    """The best ``count`` poses in a frame and their ratings (0 to 1), best first.
 
-    Attributes
+    Parameters
     ----------
-    coarse, fine : Boosters
-        One output: the rating.
-    refine : tuple of Boosters
-        Seven outputs each: what takes the error back.
+    boosters : mapping
+        One output for ``pose_coarse`` and ``pose_fine``: the rating. Seven for each step of
+        ``pose_refine``: what takes the error back.
     """
+    places, grid = likely_places(frame, boosters, PLACES), rotation_grid(ORIENTATIONS)
+    every = Poses(
+        np.repeat(places, len(grid), 0),
+        np.tile(grid, (len(places), 1, 1)),
+        np.zeros(len(places) * len(grid)),
+    )
+    rating = boosters["pose_coarse"](features(frame, COARSE, every.centre, every.axes))[:, 0]
+    best = np.argsort(-rating, kind="stable")[:REFINED]
+    poses, rating = _sorted(*refined(frame, boosters, every[best]))
+    # Front and back are distinguished last, so the best ones are tried the other way round too.
+    back = poses[:TURNED].moved(np.tile(HALF_TURN, (len(poses[:TURNED]), 1)))
+    back, rated = _sorted(*refined(frame, boosters, back))
+    poses, rating = _sorted(Poses.joined([poses, back]), np.concatenate([rating, rated]))
+    return poses[:count], rating[:count]
 
-    coarse: Boosters
-    fine: Boosters
-    refine: tuple[Boosters, ...]
 
-    def __call__(
-        self, frame: StandardFrame, places: FloatArray, count: int
-    ) -> tuple[Poses, FloatArray]:
-        """The best ``count`` poses at some places ``(P, 3)`` mm and their ratings, best first."""
-        grid = rotation_grid(ORIENTATIONS)
-        every = Poses(
-            np.repeat(places, len(grid), 0),
-            np.tile(grid, (len(places), 1, 1)),
-            np.zeros(len(places) * len(grid)),
-        )
-        rating = self.coarse(features(frame, COARSE, every.centre, every.axes))[:, 0]
-        best = np.argsort(-rating, kind="stable")[:REFINED]
-        poses, rating = self.refined(frame, every[best], REFINED)
-        # Front and back are distinguished last, so the best ones are tried the other way round too.
-        back = poses[:TURNED].moved(np.tile(HALF_TURN, (len(poses[:TURNED]), 1)))
-        back, rated = self.refined(frame, back, TURNED)
-        poses, rating = Poses.joined([poses, back]), np.concatenate([rating, rated])
-        best = np.argsort(-rating, kind="stable")[:count]
-        return poses[best], rating[best]
+def _sorted(poses: Poses, rating: FloatArray) -> tuple[Poses, FloatArray]:
+    """Best first."""
+    best = np.argsort(-rating, kind="stable")
+    return poses[best], rating[best]
 
-    def refined(self, frame: StandardFrame, poses: Poses, count: int) -> tuple[Poses, FloatArray]:
-        """Refine some poses; the best ``count`` of them and their ratings."""
-        poses, rating = self.refined_in_order(frame, poses)
-        best = np.argsort(-rating, kind="stable")[:count]
-        return poses[best], rating[best]
 
-    def refined_in_order(self, frame: StandardFrame, poses: Poses) -> tuple[Poses, FloatArray]:
-        """Refine some poses; all of them in their order, and their ratings."""
-        for step in self.refine:
-            poses = poses.moved(step(features(frame, FINE, poses.centre, poses.axes)))
-        rating = self.fine(features(frame, WIDE, poses.centre, poses.axes))[:, 0]
-        return poses, rating
+def refined(frame: StandardFrame, boosters: Trees, poses: Poses) -> tuple[Poses, FloatArray]:
+    """Refine some poses; all of them in their order, and their ratings."""
+    for k in range(len(REFINEMENTS)):
+        values = features(frame, FINE, poses.centre, poses.axes)
+        poses = poses.moved(boosters[f"pose_refine_{k}"](values))
+    rating = boosters["pose_fine"](features(frame, WIDE, poses.centre, poses.axes))[:, 0]
+    return poses, rating
+
+
+MODES = 8
+"""Leading modes that are read off; among them how far the valve is open."""
+
+START_MISSES = Misses(1.5, 5.0, 0.04)
+
+
+def _start_pattern() -> SamplePattern:
+    rng = np.random.default_rng(3)
+    offsets = rng.standard_normal((260, 3)) * np.array([10.0, 9.0, 9.0]) + [0, 0, -8.0]
+    offsets[200:] = rng.standard_normal((60, 3)) * 6.0 + [0, 0, -22.0]
+    offsets[200:, 0] += np.repeat([15.0, -15.0], 30)  # about where papillary tips are
+    return SamplePattern.paired(offsets, np.where(rng.random(260) < 0.5, 1, 2), 120, 3)
+
+
+START = _start_pattern()
+
+
+def shape_start_samples(
+    frame: StandardFrame, true: TrueValve, model: ShapeModel, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """Missed poses, with the coefficients and tips ``(P, MODES + 6)`` seen from them."""
+    poses = missed_poses(true.pose, START_MISSES, count, rng)
+    local = poses.local(np.broadcast_to(true.vertices, (count, *true.vertices.shape)))
+    tips = poses.local(np.broadcast_to(true.tips, (count, 2, 3)))
+    # Over their deviation, so that all outputs are of one size.
+    y = model.coefficients(local)[:, :MODES] / model.std[:MODES]
+    return (
+        features(frame, START, poses.centre, poses.axes),
+        np.concatenate([y, (tips - model.tips).reshape(count, 6)], axis=1),
+    )
+
+
+def starting_shape(
+    frame: StandardFrame, boosters: Trees, poses: Poses, model: ShapeModel
+) -> tuple[FloatArray, FloatArray]:
+    """Coefficients ``(P, MODES)`` and tips ``(P, 2, 3)`` in world mm, read off at some poses.
+
+    Parameters
+    ----------
+    boosters : mapping
+        Coefficients over their deviation, then both tips (mm at the size of the mean valve).
+    """
+    answers = boosters["shape"](features(frame, START, poses.centre, poses.axes))
+    tips = model.tips + answers[:, MODES:].reshape(-1, 2, 3)
+    return answers[:, :MODES] * model.std[:MODES], poses.world(tips)

@@ -25,10 +25,10 @@ from mvest.imaging.detection.detect import (
     NoValveError,
     fit_frame,
     merits,
-    search_frame,
 )
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.pose_search import refined, search_poses
 from mvest.imaging.detection.shape_model import Pulls, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.valve_sequence import LANDMARKS, MIN_CONFIDENCE, ValveSequence, landmark_vertices
@@ -38,49 +38,25 @@ from mvest.typing import BoolArray, FloatArray
 
 
 def smooth_in_time(
-    times: FloatArray,
-    vertices: FloatArray,
-    tips: FloatArray,
-    vertex_weight: FloatArray,
-    frame_weight: FloatArray,
-    s: FloatArray,
-    smoothing_s: tuple[float, float, float],
-) -> tuple[FloatArray, FloatArray]:
-    """Positions with little acceleration where they were not sure.
+    times: FloatArray, points: FloatArray, weight: FloatArray, length_s: FloatArray
+) -> FloatArray:
+    """Positions ``(T, m, 3)`` mm with little acceleration where they were not sure.
+
+    Minimises sum w (z - y)^2 dt + length^4 int z''^2 dt on second divided differences (Whittaker,
+    Proc. Edinburgh Math. Soc. 41:63, 1923), so what varies over much less than ``length`` goes.
 
     Parameters
     ----------
     times : (T,) s
-    vertices, tips : (T, n, 3), (T, 2, 3) mm
-    vertex_weight, frame_weight : (T, n), (T,)
-        How much each counts, relative to the others.
-    s : (n,)
-        0 at the annulus, 1 at the free edge.
-    smoothing_s : (float, float, float)
-        Times for annulus, free edge (in between: linear in s) and tips.
-
-    Returns
-    -------
-    vertices, tips
-    """
-    annulus, edge, tip = (max(float(t), 0.0) for t in smoothing_s)
-    length = (1 - s) * annulus + s * edge
-    smooth = _whittaker(times, vertices, vertex_weight, length)
-    weight = np.repeat(frame_weight[:, None], tips.shape[1], 1)
-    return smooth, _whittaker(times, tips, weight, np.full(tips.shape[1], tip))
-
-
-def _whittaker(
-    times: FloatArray, values: FloatArray, weight: FloatArray, length: FloatArray
-) -> FloatArray:
-    """Penalised least squares on second divided differences, for each column ``(T, m, 3)``.
-
-    Minimises sum w (z - y)^2 dt + length^4 int z''^2 dt (Whittaker, Proc. Edinburgh Math. Soc.
-    41:63, 1923), so that what varies over much less than ``length`` (s) goes.
+    points : (T, m, 3) mm
+    weight : (T, m)
+        How much each counts, relative to the same point in other frames.
+    length_s : (m,)
+        Over which each is smoothed; where all are 0, nothing is.
     """
     count = len(times)
-    if count < 3 or not np.any(length > 0):
-        return values
+    if count < 3 or not np.any(length_s > 0):
+        return points
     step = np.diff(times)
     second = np.zeros((count - 2, count))
     for k in range(count - 2):
@@ -89,8 +65,8 @@ def _whittaker(
     share = 0.5 * (np.concatenate([step, step[-1:]]) + np.concatenate([step[:1], step]))
     bend = second.T @ (0.5 * (step[1:] + step[:-1])[:, None] * second)
     weight = np.maximum(weight, 1e-3) / np.maximum(weight.mean(axis=0), 1e-3) * share[:, None]
-    matrix = length[:, None, None] ** 4 * bend + np.einsum("tm,tu->mtu", weight, np.eye(count))
-    right = np.swapaxes(weight[..., None] * values, 0, 1)
+    matrix = length_s[:, None, None] ** 4 * bend + np.einsum("tm,tu->mtu", weight, np.eye(count))
+    right = np.swapaxes(weight[..., None] * points, 0, 1)
     return np.asarray(np.swapaxes(np.linalg.solve(matrix, right), 0, 1))
 
 
@@ -178,18 +154,18 @@ def detect_valve(
     valves = _found_again(frames, valves, model, chosen, by_hand)
     confidence = np.array([valve.confidence for valve in valves])
     sure = np.stack([valve.vertex_confidence for valve in valves])
-    vertices, tips = smooth_in_time(
+    at_annulus, at_edge, at_tips = chosen.smoothing_s
+    layout, s = model.shape.layout, model.shape.layout.s
+    smooth = smooth_in_time(
         np.asarray(volume.times),
-        np.stack([valve.vertices for valve in valves]),
-        np.stack([valve.tips for valve in valves]),
-        sure * confidence[:, None],
-        confidence,
-        model.shape.layout.s,
-        chosen.smoothing_s,
+        np.stack([np.concatenate([valve.vertices, valve.tips]) for valve in valves]),
+        np.concatenate([sure, np.ones((len(valves), 2))], axis=1) * confidence[:, None],
+        np.append((1 - s) * at_annulus + s * at_edge, [at_tips] * 2),
     )
+    vertices, tips = smooth[:, :-2], smooth[:, -2:]
     for k, points in by_hand.items():
         vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, chosen.fit)
-    accuracy, layout = model.accuracy, model.shape.layout
+    accuracy = model.accuracy
     if accuracy is not None:
         accuracy = accuracy.at(float(np.median(confidence)))
     valve = ValveSequence(
@@ -318,7 +294,7 @@ def _trajectory(
     for k, frame in enumerate(frames):
         placed = _pose_by_hand(by_hand.get(k, {}), model)
         if placed is None:
-            poses, rating = search_frame(frame, model, CANDIDATES)
+            poses, rating = search_poses(frame, model.boosters, CANDIDATES)
             few = poses.apart(rating, chosen.hypotheses)
             own.append((poses[few], rating[few]))
         else:
@@ -338,7 +314,7 @@ def _trajectory(
         if _pose_by_hand(by_hand.get(k, {}), model) is not None:
             candidates.append(own[k])
             continue
-        again, rated = model.poses.refined(frame, best, len(best))
+        again, rated = refined(frame, model.boosters, best)
         candidates.append((Poses.joined([own[k][0], again]), np.concatenate([own[k][1], rated])))
     path = _best_path(candidates, times, model, chosen)
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
@@ -350,7 +326,7 @@ def _likeliest_in_all(
     """At which of some poses the valve is seen best in a few frames."""
     seen = np.zeros(len(tried))
     for k in sorted({0, len(frames) // 2, len(frames) - 1}):
-        poses, _ = model.poses.refined_in_order(frames[k], tried)
+        poses, _ = refined(frames[k], model.boosters, tried)
         seen += merits(frames[k], model, poses, fit)
     return int(np.argmax(seen))
 

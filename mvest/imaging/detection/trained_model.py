@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,18 +15,14 @@ from numpy.typing import NDArray
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.detection.boundary import BoundaryDetector
-from mvest.imaging.detection.landmark_detector import LandmarkDetector
-from mvest.imaging.detection.pose_search import REFINEMENTS, PoseSearch, PositionDetector
-from mvest.imaging.detection.rim_detector import RimDetector
+from mvest.imaging.detection.pose_search import MODES, REFINEMENTS
 from mvest.imaging.detection.shape_model import ShapeModel
-from mvest.imaging.detection.shape_start import MODES, ShapeStart
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.boosting import Boosters
+from mvest.imaging.learning.boosting import Boosters, Trees
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import LANDMARKS
 from mvest.reading.documents import parse_json
-from mvest.reading.npz import read_npz
+from mvest.reading.npz import check_array, read_npz
 from mvest.reading.text import one_line, read_bytes
 from mvest.typing import FloatArray
 
@@ -82,7 +78,7 @@ class DetectionAccuracy:
         expected there.
     shapes : (S, F, n, 3) mm or None
         Where the valves of these sequences were found, each frame in its own axes (`pose_of`).
-        None: a model of before this was kept.
+        None: this was not kept.
     tip_shapes : (S, F, 2, 3) mm or None
     """
 
@@ -113,10 +109,14 @@ class DetectionAccuracy:
         return float(start * np.exp(slope * (1.0 - confidence)))
 
 
+ACCURACY: Final = tuple(field.name for field in fields(DetectionAccuracy))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DetectionModel:
     """Everything that was learned.
 
-    Parameters
+    Attributes
     ----------
     shape : ShapeModel
     boosters : mapping
@@ -129,37 +129,11 @@ class DetectionModel:
         Of the file it was read from.
     """
 
-    def __init__(
-        self,
-        shape: ShapeModel,
-        boosters: Mapping[str, Boosters],
-        trained_on: Mapping[str, Any],
-        accuracy: DetectionAccuracy | None = None,
-        sha256: str = "",
-    ) -> None:
-        missing = [name for name in STAGES if name not in boosters]
-        if missing:
-            raise InputError(f"detection model: no trees for {', '.join(missing)}")
-        for name, count in OUTPUTS.items():
-            if boosters[name].outputs != count:
-                raise InputError(
-                    f"detection model: {boosters[name].outputs} outputs of {name}, expected {count}"
-                )
-        self.shape, self.boosters = shape, dict(boosters)
-        self.trained_on, self.accuracy, self.sha256 = dict(trained_on), accuracy, sha256
-        self.position = PositionDetector(boosters["position"])
-        self.poses = PoseSearch(
-            boosters["pose_coarse"],
-            boosters["pose_fine"],
-            tuple(boosters[f"pose_refine_{k}"] for k in range(len(REFINEMENTS))),
-        )
-        self.start = ShapeStart(boosters["shape"])
-        self.landmarks = LandmarkDetector(
-            tuple(boosters[f"landmark_{k}"] for k in range(len(LANDMARKS)))
-        )
-        self.annulus = RimDetector(0, boosters["annulus"])
-        self.free_edge = RimDetector(-1, boosters["free_edge"])
-        self.boundary = BoundaryDetector(boosters["boundary"])
+    shape: ShapeModel
+    boosters: Trees
+    trained_on: Mapping[str, Any]
+    accuracy: DetectionAccuracy | None = None
+    sha256: str = ""
 
 
 def save_model(path: Path | str, model: DetectionModel) -> None:
@@ -191,17 +165,10 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
     for name in STAGES:
         for k, text in enumerate(model.boosters[name].texts):
             arrays[f"trees.{name}.{k}"] = _bytes(text)
-    if model.accuracy is not None:
-        accuracy = model.accuracy
-        arrays["accuracy.std_mm"] = accuracy.std_mm
-        arrays["accuracy.correlation_length_mm"] = np.array(accuracy.correlation_length_mm)
-        arrays["accuracy.samples"] = accuracy.samples.astype(np.float32)
-        arrays["accuracy.tip_samples"] = accuracy.tip_samples.astype(np.float32)
-        arrays["accuracy.widening"] = np.array(accuracy.widening)
-        arrays["accuracy.like_from"] = np.array(accuracy.like_from)
-        if accuracy.shapes is not None and accuracy.tip_shapes is not None:
-            arrays["accuracy.shapes"] = accuracy.shapes.astype(np.float32)
-            arrays["accuracy.tip_shapes"] = accuracy.tip_shapes.astype(np.float32)
+    for name in ACCURACY if model.accuracy is not None else ():
+        if (value := getattr(model.accuracy, name)) is not None:
+            kind = np.float32 if np.ndim(value) > 1 else np.float64
+            arrays[f"accuracy.{name}"] = np.asarray(value, dtype=kind)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
@@ -254,58 +221,44 @@ def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> Det
             f"{source}: format {about.get('format')!r}, version {about.get('version')!r}; expected "
             f"{FORMAT!r}, version {VERSION}"
         )
-    kinds = {"columns": int, "rows": int, "region_names": list, "trees": dict, "trained_on": dict}
-    for key, kind in kinds.items():
+    for key, kind in (("columns", int), ("rows", int), ("trained_on", dict)):
         if not isinstance(about[key], kind):
             raise ValueError(f"{key} is no {kind.__name__}")
-    names = about["region_names"]
-    if len(names) != 2 or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"region_names are {len(names)} values, not two names")
-    layout = ValveLayout(about["columns"], about["rows"], (names[0], names[1]))
-    n, k = layout.size, len(np.atleast_1d(stored["shape.std"]))
+    layout = ValveLayout(about["columns"], about["rows"])
+    n = layout.size
+
+    def numbers(name: str, *shape: int | None) -> FloatArray:
+        return check_array(stored[name], name, "f", shape)
+
+    std = numbers("shape.std", None)
     shape = ShapeModel(
         layout,
-        float(_numbers(stored, "shape.size_mm", ())),
-        _numbers(stored, "shape.mean", (n, 3)),
-        _numbers(stored, "shape.modes", (k, n, 3)),
-        _numbers(stored, "shape.std", (k,)),
-        _numbers(stored, "shape.tips", (2, 3)),
+        float(numbers("shape.size_mm")),
+        numbers("shape.mean", n, 3),
+        numbers("shape.modes", len(std), n, 3),
+        std,
+        numbers("shape.tips", 2, 3),
     )
     boosters = {}
-    for name, outputs in about["trees"].items():
-        if not isinstance(outputs, int):
-            raise ValueError(f"trees of {name}: {outputs!r} outputs")
-        texts = tuple(_text(stored[f"trees.{name}.{i}"]) for i in range(outputs))
+    for name, outputs in OUTPUTS.items():
+        texts = tuple(_text(stored[f"trees.{name}.{k}"]) for k in range(outputs))
         boosters[name] = Boosters(texts, f"{source}, {name}")
     accuracy = None
     if "accuracy.std_mm" in stored:
         count = np.shape(stored["accuracy.samples"])[:2]
-        # A file of before these were measured: errors are of one size, and no volume is unlike.
-        known = {"widening": np.array([1.0, 0.0]), "like_from": np.array(0.0)}
-        known |= {key: stored[name] for key in known if (name := f"accuracy.{key}") in stored}
-        start, slope = _numbers(known, "widening", (2,))
-        shapes = tip_shapes = None
-        if "accuracy.shapes" in stored:
-            shapes = _numbers(stored, "accuracy.shapes", (*count, n, 3))
-            tip_shapes = _numbers(stored, "accuracy.tip_shapes", (*count, 2, 3))
+        start, slope = numbers("accuracy.widening", 2).tolist()
+        has_shapes = "accuracy.shapes" in stored
         accuracy = DetectionAccuracy(
-            _numbers(stored, "accuracy.std_mm", (n,)),
-            float(_numbers(stored, "accuracy.correlation_length_mm", ())),
-            _numbers(stored, "accuracy.samples", (*count, n, 3)),
-            _numbers(stored, "accuracy.tip_samples", (*count, 2, 3)),
-            (float(start), float(slope)),
-            float(_numbers(known, "like_from", ())),
-            shapes,
-            tip_shapes,
+            numbers("accuracy.std_mm", n),
+            float(numbers("accuracy.correlation_length_mm")),
+            numbers("accuracy.samples", *count, n, 3),
+            numbers("accuracy.tip_samples", *count, 2, 3),
+            (start, slope),
+            float(numbers("accuracy.like_from")),
+            numbers("accuracy.shapes", *count, n, 3) if has_shapes else None,
+            numbers("accuracy.tip_shapes", *count, 2, 3) if has_shapes else None,
         )
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
-
-
-def _numbers(stored: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> FloatArray:
-    values = np.asarray(stored[name])
-    if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
-        raise ValueError(f"{name} has shape {values.shape}, or is not finite; expected {shape}")
-    return np.asarray(values, dtype=np.float64)
 
 
 def _bytes(text: str) -> NDArray[np.uint8]:

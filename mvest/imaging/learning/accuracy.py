@@ -1,15 +1,21 @@
-"""How far detectors are off on held-out sequences, and over what distance alike."""
+"""How far detectors are off in held-out volumes, and over what distance alike."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
+from mvest.imaging.detection.detect import FrameValve
+from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
+from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
 BIN_MM = 1.0
@@ -25,8 +31,7 @@ NORMAL_95 = 1.959963984540054
 """Standard deviations on either side that hold 95 % of a normal distribution."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Correlogram:
+class Correlogram(NamedTuple):
     """Correlation of errors against distance.
 
     Attributes
@@ -34,12 +39,10 @@ class Correlogram:
     distance : (B,) mm
         Mean distance of each bin's pairs.
     correlation : (B,)
-    pairs : (B,)
     """
 
     distance: FloatArray
     correlation: FloatArray
-    pairs: FloatArray
 
 
 def matern(distance: FloatArray, length: float) -> FloatArray:
@@ -83,7 +86,7 @@ def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
         total = np.bincount(number[near], weights=values[near])
         return np.asarray(total[some] / pairs[some])
 
-    return Correlogram(mean(distance), mean(product[first, second]), pairs[some])
+    return Correlogram(mean(distance), mean(product[first, second]))
 
 
 def fitted_length(correlations: Correlogram) -> float:
@@ -123,18 +126,9 @@ def measure_accuracy(
     Raises
     ------
     InputError
-        If there are fewer than two sequences, shapes do not fit, or an error is not finite.
+        If there are no errors at some vertex, or one is not finite.
     """
     count, frames, n = samples.shape[:3]
-    if count < 2:
-        raise InputError(f"accuracy of detectors: {count} sequences, expected two or more")
-    if samples.shape != (count, frames, len(rest), 3) or tip_samples.shape != (count, frames, 2, 3):
-        raise InputError(
-            f"accuracy of detectors: errors {samples.shape} and {tip_samples.shape} of {len(rest)} "
-            "vertices, expected (S, F, n, 3) and (S, F, 2, 3)"
-        )
-    if not (np.isfinite(samples).all() and np.isfinite(tip_samples).all()):
-        raise InputError("accuracy of detectors: errors that are not finite")
     about = samples - samples.mean(axis=0)
     std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 1) * frames * 3))
     correlations = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
@@ -166,18 +160,9 @@ def widened(
         Errors of further sequences, of other valves and over wider acquisitions.
     wide_confidence : (W,)
 
-    Raises
-    ------
-    InputError
-        If confidences are not one for each, or there is no further sequence.
     """
     samples, std = accuracy.samples, accuracy.std_mm
     count, frames = samples.shape[:2]
-    if len(confidence) != count or len(wide) != len(wide_confidence) or not len(wide):
-        raise InputError(
-            f"errors by confidence: {count} sequences with {len(confidence)} confidences, and "
-            f"{len(wide)} with {len(wide_confidence)}, expected one for each, and some of both"
-        )
     mean = samples.mean(axis=0)
     compared = samples if count > 2 else samples[:0]  # one other has no spread
     off = []
@@ -206,15 +191,93 @@ def unlike_share(count: int) -> float:
     return max(1, int(UNLIKE_SHARE * (count + 1))) / (count + 1)
 
 
-def share_within(errors: FloatArray, std_mm: FloatArray, mean: FloatArray | None = None) -> float:
+def share_within(errors: FloatArray, std_mm: FloatArray) -> float:
     """Share of coordinates of held-out errors that lie within 1.96 standard deviations.
 
     Parameters
     ----------
     errors : (S, F, n, 3) mm
     std_mm : (n,)
-    mean : (F, n, 3) mm, optional
-        Taken off first.
     """
-    off = errors if mean is None else errors - mean
-    return float((np.abs(off) <= NORMAL_95 * std_mm[:, None]).mean())
+    return float((np.abs(errors) <= NORMAL_95 * std_mm[:, None]).mean())
+
+
+FINER = 4
+"""Times as many points as vertices in each direction stand for a surface."""
+
+
+def frame_errors(found: FrameValve, true: TrueValve, layout: ValveLayout) -> dict[str, float]:
+    """Errors of one frame.
+
+    Returns
+    -------
+    dict
+        In mm ``surface`` (mean symmetric distance of the leaflets' surfaces), ``points`` (mean
+        distance of corresponding vertices), ``tips``, ``landmarks`` and ``hinge`` (of the annulus
+        across its course); of the pose that the fit began with, ``position`` (mm) and ``pose``
+        (degrees).
+    """
+    by = found.start.towards(true.pose)[0]
+    return {
+        "surface": surface_distance(found.vertices, true.vertices, layout),
+        "points": _mean_distance(found.vertices, true.vertices),
+        "tips": _mean_distance(found.tips, true.tips),
+        "position": float(np.linalg.norm(by[:3])),
+        "pose": float(np.rad2deg(np.linalg.norm(by[3:6]))),
+        "landmarks": _mean_distance(found.landmarks, landmark_points(true, layout)),
+        "hinge": _across(found.vertices[layout.annulus], true.vertices[layout.annulus]),
+    }
+
+
+def _mean_distance(points: FloatArray, true: FloatArray) -> float:
+    return float(np.linalg.norm(points - true, axis=1).mean())
+
+
+def surface_distance(detected: FloatArray, true: FloatArray, layout: ValveLayout) -> float:
+    """Mean symmetric distance (mm) of two surfaces: of the vertices of each from the other.
+
+    A surface is stood for by its tangent planes at four times as many points in each direction.
+    """
+    there, back = _to_surface(detected, true, layout), _to_surface(true, detected, layout)
+    return float(0.5 * (there.mean() + back.mean()))
+
+
+def _to_surface(points: FloatArray, surface: FloatArray, layout: ValveLayout) -> FloatArray:
+    fine = ValveLayout(FINER * layout.columns, FINER * (layout.rows - 1) + 1)
+    grid = surface.reshape(layout.rows, layout.columns, 3)
+    u = np.arange(fine.columns) / FINER
+    left, share = u.astype(np.int64), (u % 1.0)[:, None]
+    around = grid[:, left] * (1 - share) + grid[:, (left + 1) % layout.columns] * share
+    v = np.arange(fine.rows) / FINER
+    upper = np.minimum(v.astype(np.int64), layout.rows - 2)
+    share = (v - upper)[:, None, None]
+    flat = (around[upper] * (1 - share) + around[upper + 1] * share).reshape(-1, 3)
+    gap, near = cKDTree(flat).query(points)
+    normal = leaflet_axes(flat, fine)[near, :, 2]
+    off = np.abs(((points - flat[near]) * normal).sum(axis=1))
+    # Beyond a rim the nearest point is on the rim itself.
+    row = near // fine.columns
+    inside = (row > 0) & (row < fine.rows - 1)
+    return np.where(inside, off, gap)
+
+
+def _across(points: FloatArray, true: FloatArray) -> float:
+    """Mean distance (mm) of a closed curve's points from another one, seen as segments."""
+    a, b = true, np.roll(true, -1, 0)
+    along = b - a
+    t = ((points[:, None] - a) * along).sum(axis=2) / (along**2).sum(axis=1)
+    foot = a + np.clip(t, 0, 1)[..., None] * along
+    return float(np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1).mean())
+
+
+def best_threshold(right: FloatArray, wrong: FloatArray) -> float:
+    """The confidence that separates right detections from wrong ones best.
+
+    It maximises the share of ``right`` at or above it plus the share of ``wrong`` below it; of
+    equally good thresholds the middle one is taken.
+    """
+    edges = np.unique(np.concatenate([right, wrong]))
+    tried = np.concatenate([edges[:1] - 1e-3, 0.5 * (edges[1:] + edges[:-1]), edges[-1:] + 1e-3])
+    score = [(right >= t).mean() + (wrong < t).mean() for t in tried]
+    best = tried[np.isclose(score, max(score))]
+    return float(best[len(best) // 2])

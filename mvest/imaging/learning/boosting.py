@@ -1,24 +1,26 @@
 """Gradient-boosted trees (LightGBM), several outputs side by side, kept as plain text.
 
-The text is checked before LightGBM reads it, because LightGBM trusts it: a child or a feature that
-does not exist is read from memory that is not the trees' own, and a number that is none ends the
-process. The format is that of ``Booster.model_to_string`` (LightGBM 4, "version=v4").
+LightGBM grows trees and writes them (``Booster.model_to_string``, "version=v4"). It does not read
+them again, because it trusts the text: a child or a feature that does not exist is read from memory
+that is not the trees' own, and a number that is none ends the process. Trees are plain arrays here,
+checked once, and their answers are the same to the last bit.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, TypeAlias
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from mvest.errors import InputError
 from mvest.quantities import Count, Processes, Share
-from mvest.typing import FloatArray
+from mvest.reading.text import one_line
+from mvest.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,37 @@ class BoostSettings:
         }
 
 
+END: Final = "end of trees\n"
+WRITTEN: Final = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1"}
+"""What the head of every text says."""
+
+IS_PROBABILITY: Final = {"regression": False, "cross_entropy": True}
+"""Whether answers are the logistic function of the sums of trees, by the objective."""
+
+
+class _Trees(NamedTuple):
+    """Trees of one output.
+
+    Attributes
+    ----------
+    roots : (T,)
+        Node at which each tree begins.
+    feature, threshold : (N,)
+        Of each node.
+    children : (N, 2)
+        Where it goes on if the feature is at most the threshold, and where otherwise: to a node, or
+        to leaf k if the number is -1 - k.
+    values : (L,)
+        Of all leaves.
+    """
+
+    roots: IntArray
+    feature: IntArray
+    threshold: FloatArray
+    children: IntArray
+    values: FloatArray
+
+
 class Boosters:
     """Trees for each of several outputs of the same features.
 
@@ -81,24 +114,18 @@ class Boosters:
     """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
-        checked = [checked_trees(text, source) for text in texts]
-        counts = {features for _, features in checked}
+        # Up to the last tree: what follows tells of the training.
+        self.texts, self._source = tuple(text.partition(END)[0] + END for text in texts), source
+        try:
+            read = [_read(text) for text in texts]
+        except (ValueError, LookupError, OverflowError) as fault:
+            reason = one_line(fault, 80)
+            raise InputError(f"{source}: no trees that LightGBM wrote ({reason})") from fault
+        counts = {features for features, _, _ in read}
         if len(counts) != 1:
             raise InputError(f"{source}: trees of {sorted(counts)} features, expected one number")
-        self._begin(tuple(text for text, _ in checked), counts.pop(), source)
-
-    def _begin(self, texts: tuple[str, ...], features: int, source: str) -> None:
-        import lightgbm  # here, as it takes a second that studies without images need not wait
-
-        self.texts, self.features, self._source = texts, features, source
-        try:
-            self._boosters = [lightgbm.Booster(model_str=text) for text in self.texts]
-        except lightgbm.basic.LightGBMError as fault:
-            raise InputError(f"{source}: no trees that LightGBM reads ({fault})") from fault
-
-    def __reduce__(self) -> tuple[Callable[..., Boosters], tuple[tuple[str, ...], int, str]]:
-        # Between processes of one program: what was checked once is not checked again.
-        return _as_checked, (self.texts, self.features, self._source)
+        self.features = counts.pop()
+        self._trees = [(trees, is_probability) for _, is_probability, trees in read]
 
     @property
     def outputs(self) -> int:
@@ -112,18 +139,86 @@ class Boosters:
                 f"{self._source}: trees look at {self.features} features, found {x.shape[1]}; the "
                 "model is of another version"
             )
-        if not len(x):
-            return np.zeros((0, self.outputs))
-        answers = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
-        return np.stack(answers, axis=1)
+        answers = np.empty((len(x), self.outputs))
+        for k, (trees, is_probability) in enumerate(self._trees):
+            total = _sums(x, *trees)
+            answers[:, k] = expit(total) if is_probability else total
+        return answers
 
 
-@lru_cache(maxsize=64)
-def _as_checked(texts: tuple[str, ...], features: int, source: str) -> Boosters:
-    """Trees that another process sent: those of one call after another are read once."""
-    made = Boosters.__new__(Boosters)
-    made._begin(texts, features, source)
-    return made
+Trees: TypeAlias = Mapping[str, Boosters]
+"""Those of each stage by its name."""
+
+
+@nb.njit(cache=True)
+def _sums(
+    x: NDArray[np.float32],
+    roots: IntArray,
+    feature: IntArray,
+    threshold: FloatArray,
+    children: IntArray,
+    values: FloatArray,
+) -> FloatArray:  # pragma: no cover (compiled)
+    """Sum over the trees ``(P,)``, in their order."""
+    total = np.zeros(len(x))
+    for p in range(len(x)):
+        for root in roots:
+            at = root
+            while at >= 0:
+                at = children[at, 0 if x[p, feature[at]] <= threshold[at] else 1]
+            total[p] += values[-1 - at]
+    return total
+
+
+def _read(text: str) -> tuple[int, bool, _Trees]:
+    """Number of features, whether outputs are probabilities, and the trees in a text."""
+    body, end, _ = text.partition(END)
+    head, *blocks = body.split("\nTree=")
+    about = dict(line.split("=", 1) for line in head.split("\n")[1:] if line)
+    if not end or {key: about[key] for key in WRITTEN} != WRITTEN:
+        raise ValueError("cut off, or of another version")
+    if not blocks or len(about["tree_sizes"].split()) != len(blocks):
+        raise ValueError(f"{len(blocks)} trees, which are not all")
+    features = len(about["feature_names"].split())
+    trees, nodes, leaves = [], 0, 0
+    for number, block in enumerate(blocks):
+        tree = _tree(block, number, features)
+        inner = tree.children >= 0
+        children = np.where(inner, tree.children + nodes, tree.children - leaves)
+        root = tree.roots + (nodes if len(children) else -leaves)
+        trees.append(tree._replace(roots=root, children=children))
+        nodes, leaves = nodes + len(children), leaves + len(tree.values)
+    joined = (np.concatenate(parts) for parts in zip(*trees, strict=True))
+    return features, IS_PROBABILITY[about["objective"]], _Trees(*joined)
+
+
+def _tree(block: str, number: int, features: int) -> _Trees:
+    """One tree by itself, whose nodes lead to later ones and to leaves only."""
+    fields = dict(line.split("=", 1) for line in block.split("\n")[1:] if line)
+    feature, left, right, kind = (
+        np.array(fields[key].split(), dtype=np.int64)
+        for key in ("split_feature", "left_child", "right_child", "decision_type")
+    )
+    threshold, values = (
+        np.array(fields[key].split(), dtype=np.float64) for key in ("threshold", "leaf_value")
+    )
+    count = len(threshold)
+    sound = (
+        {len(feature), len(left), len(right), len(kind), len(values) - 1} == {count}
+        and fields["num_leaves"] == str(len(values))
+        and fields["num_cat"] == fields["is_linear"] == "0"
+        and np.isin(kind, (0, 2)).all()  # a comparison, where no feature is missing
+        and np.isin(feature, np.arange(features)).all()
+        and np.isfinite(threshold).all()
+        and np.isfinite(values).all()
+    )
+    if not sound:
+        raise ValueError(f"tree {number}: refers to what is not there")
+    children = np.stack([left, right], axis=1)
+    later = (children > np.arange(count)[:, None]) & (children < count)
+    if not (later | ((children < 0) & (children >= -len(values)))).all():
+        raise ValueError(f"tree {number}: refers to what is not there")
+    return _Trees(np.array([0 if count else -1]), feature, threshold, children, values)
 
 
 def train_boosters(
@@ -132,7 +227,6 @@ def train_boosters(
     settings: BoostSettings,
     seed: int,
     objective: str = "regression",
-    weight: FloatArray | None = None,
 ) -> Boosters:
     """Grow trees for every column of ``y (P, outputs)``.
 
@@ -141,12 +235,11 @@ def train_boosters(
     objective : str
         ``regression`` (least squares), or ``cross_entropy`` (probability; labels from 0 to 1).
     """
-    import lightgbm
+    import lightgbm  # here, as it takes a second that what only uses trees need not wait
 
     data = lightgbm.Dataset(
         x,
         label=np.ascontiguousarray(y[:, 0]),
-        weight=weight,
         free_raw_data=False,
         params={"max_bin": 63, "verbosity": -1},
     )
@@ -158,126 +251,3 @@ def train_boosters(
         )
         texts.append(booster.model_to_string())
     return Boosters(tuple(texts))
-
-
-END: Final = "end of trees\n"
-OBJECTIVES: Final = ("regression", "binary sigmoid:1", "cross_entropy")
-FIXED: Final = {
-    "version": "v4",
-    "num_class": "1",
-    "num_tree_per_iteration": "1",
-    "label_index": "0",
-}
-HEAD: Final = {
-    *FIXED, "max_feature_idx", "objective", "feature_names", "feature_infos", "tree_sizes",
-}  # fmt: skip
-INNER: Final = (
-    "split_feature", "split_gain", "threshold", "decision_type", "left_child", "right_child",
-    "internal_value", "internal_weight", "internal_count",
-)  # fmt: skip
-LEAF: Final = ("leaf_value", "leaf_weight", "leaf_count")
-TREE: Final = {"Tree", "num_leaves", "num_cat", "is_linear", "shrinkage", *INNER, *LEAF}
-
-_NUMBER = r"-?[0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?"
-_NUMBERS = re.compile(rf"(?:{_NUMBER}(?: {_NUMBER})*)?")
-_WHOLE = re.compile(r"-?[0-9]{1,9}")
-_RANGE = re.compile(rf"none|\[{_NUMBER}:{_NUMBER}\]")
-
-
-def checked_trees(text: str, source: str) -> tuple[str, int]:
-    """The text up to its last tree, and how many features the trees look at.
-
-    Parameters
-    ----------
-    text : str
-        As ``Booster.model_to_string`` gives it, or what this function returned.
-    source : str
-        Named in errors.
-
-    Raises
-    ------
-    InputError
-        If it is no such text, is cut off, or a tree refers to what is not there.
-    """
-    body, end, _ = text.partition(END)
-    starts = [match.start() for match in re.finditer(r"^Tree=", body, flags=re.MULTILINE)]
-    try:
-        if not end or not starts:
-            raise ValueError("cut off or empty")
-        blocks = [body[a:b] for a, b in zip(starts, [*starts[1:], len(body)], strict=True)]
-        features = _head(body[: starts[0]], [len(block) for block in blocks])
-        for number, block in enumerate(blocks):
-            _tree(block, number, features)
-    except (ValueError, KeyError) as fault:
-        raise InputError(f"{source}: no trees that LightGBM wrote ({fault})") from fault
-    return body + END, features
-
-
-def _fields(lines: list[str], expected: set[str]) -> dict[str, str]:
-    pairs = [line.partition("=") for line in lines if line]
-    fields = {key: value for key, _, value in pairs}
-    if set(fields) != expected or len(fields) != len(pairs):
-        odd = ", ".join(sorted(set(fields) ^ expected)) or "one more than once"
-        raise ValueError(f"fields missing or unknown: {odd[:80]}")
-    return fields
-
-
-def _head(text: str, sizes: list[int]) -> int:
-    first, *lines = text.split("\n")
-    fields = _fields(lines, set(HEAD))
-    count = _whole(fields["max_feature_idx"]) + 1
-    right = (
-        text.isascii()
-        and first == "tree"
-        and all(fields[key] == value for key, value in FIXED.items())
-        and fields["objective"] in OBJECTIVES
-        and count > 0
-        and len(fields["feature_names"].split(" ")) == count
-        and len(infos := fields["feature_infos"].split(" ")) == count
-        and all(_RANGE.fullmatch(info) for info in infos)
-        and fields["tree_sizes"] == " ".join(map(str, sizes))
-    )
-    if not right:
-        raise ValueError("header")
-    return count
-
-
-def _tree(text: str, number: int, features: int) -> None:
-    fields = _fields(text.split("\n"), TREE)
-    leaves = _whole(fields["num_leaves"])
-    split = [_whole(v) for v in fields["split_feature"].split()]
-    kind = [_whole(v) for v in fields["decision_type"].split()]
-    left = [_whole(v) for v in fields["left_child"].split()]
-    right = [_whole(v) for v in fields["right_child"].split()]
-    for key in (*INNER, *LEAF, "shrinkage"):
-        if not _NUMBERS.fullmatch(fields[key]):
-            raise ValueError(f"tree {number}, {key}: not numbers")
-    single = leaves == 1
-    for key in INNER:
-        if len(fields[key].split()) != leaves - 1:
-            raise ValueError(f"tree {number}, {key}: not {leaves - 1} values")
-    for key in LEAF:
-        # A tree of a single leaf comes without its weight.
-        if len(fields[key].split()) not in ((0, 1) if single else (leaves,)):
-            raise ValueError(f"tree {number}, {key}: not {leaves} values")
-    # Every inner node but the first and every leaf is some earlier node's child, once.
-    children = sorted(left + right)
-    every = list(range(-leaves, 0)) + list(range(1, leaves - 1))
-    sound = (
-        fields["Tree"] == str(number)
-        and leaves >= 1
-        and fields["leaf_value"] != ""
-        and fields["num_cat"] == fields["is_linear"] == "0"
-        and all(0 <= feature < features for feature in split)
-        and all(0 <= value <= 10 and value % 2 == 0 for value in kind)
-        and (single or children == every)
-        and all(child < 0 or child > k for side in (left, right) for k, child in enumerate(side))
-    )
-    if not sound:
-        raise ValueError(f"tree {number}: refers to what is not there")
-
-
-def _whole(text: str) -> int:
-    if not _WHOLE.fullmatch(text):
-        raise ValueError(f"{text[:20]!r} is no whole number")
-    return int(text)

@@ -12,38 +12,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mvest.errors import InputError
-from mvest.imaging.detection.boundary import boundary_samples
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
-from mvest.imaging.detection.landmark_detector import landmark_samples
+from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_samples, rim_samples
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
-    PLACES,
     REFINED,
     REFINEMENTS,
-    PoseSearch,
-    PositionDetector,
     coarse_samples,
     fine_samples,
     position_samples,
     refinement_samples,
+    search_poses,
+    shape_start_samples,
 )
-from mvest.imaging.detection.rim_detector import rim_samples
-from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
-from mvest.imaging.detection.shape_start import MODES, shape_start_samples
+from mvest.imaging.detection.shape_model import ShapeModel, TrueValve, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
-from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
-from mvest.imaging.learning.truth import TrueValve
-from mvest.imaging.simulator.acquisition import Acquisition, draw_acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
+from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.valve_sequence import LANDMARKS, MovingValve
+from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.processes import side_by_side
 from mvest.quantities import Count
@@ -51,9 +44,6 @@ from mvest.typing import FloatArray
 
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
-
-Setting: TypeAlias = Literal["training", "wide", "shifted"]
-"""Within the ranges that detectors are trained in, in part or wholly outside of them."""
 
 Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
@@ -104,39 +94,32 @@ class TrainingSettings:
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Draft:
-    """A first search for poses, whose mistakes the final rating learns from."""
+def taken_for_valves(
+    frame: StandardFrame, draft: Trees, count: int, rng: np.random.Generator
+) -> Poses:
+    """What a first search takes for valves: the final rating learns from its mistakes.
 
-    position: PositionDetector
-    poses: PoseSearch
-
-    def taken_for_valves(self, frame: StandardFrame, count: int, rng: np.random.Generator) -> Poses:
-        """Half of ``count`` poses are those rated best, the others some of the rest."""
-        places, _ = self.position(frame, PLACES)
-        poses, _ = self.poses(frame, places, REFINED)
-        best = count // 2
-        others = best + rng.choice(len(poses) - best, count - best, replace=False)
-        return poses[np.concatenate([np.arange(best), others])]
+    Half of ``count`` poses are those rated best, the others some of the rest.
+    """
+    poses, _ = search_poses(frame, draft, REFINED)
+    best = count // 2
+    others = best + rng.choice(len(poses) - best, count - best, replace=False)
+    return poses[np.concatenate([np.arange(best), others])]
 
 
 Sampled: TypeAlias = Callable[
-    [Sequence[int], ShapeModel, Callable[[], Draft] | None], Sequence[Samples]
+    [Sequence[int], ShapeModel, Callable[[], Trees] | None], Sequence[Samples]
 ]
 """(numbers of volumes, shapes, what makes the draft; none for the first volumes) -> samples."""
 
 
-def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Draft:
+def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Trees:
     """The search that is learned from the first volumes alone."""
-
-    def grown(name: str) -> Boosters:
-        return train_stage(name, *samples_of(name, samples), settings, seed)
-
-    refine = tuple(grown(f"pose_refine_{k}") for k in range(len(REFINEMENTS)))
-    return Draft(
-        PositionDetector(grown("position")),
-        PoseSearch(grown("pose_coarse"), grown("pose_fine"), refine),
-    )
+    refine = [f"pose_refine_{k}" for k in range(len(REFINEMENTS))]
+    return {
+        name: train_stage(name, *samples_of(name, samples), settings, seed)
+        for name in ("position", "pose_coarse", "pose_fine", *refine)
+    }
 
 
 def draw_samples(
@@ -145,18 +128,17 @@ def draw_samples(
     model: ShapeModel,
     counts: SampleCounts,
     rng: np.random.Generator,
-    draft: Draft | None = None,
+    draft: Trees | None = None,
 ) -> Samples:
     """Samples of all stages from one frame; a draft's mistakes are among them."""
     layout = model.layout
-    mistaken = None if draft is None else draft.taken_for_valves(frame, counts.mistaken, rng)
+    mistaken = None if draft is None else taken_for_valves(frame, draft, counts.mistaken, rng)
     samples: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
         "position": position_samples(frame, true, counts.position, rng),
         "pose_coarse": coarse_samples(frame, true, model, counts.pose_rating, rng),
         "pose_fine": fine_samples(frame, true, model, counts.pose_rating, rng, mistaken),
         "shape": shape_start_samples(frame, true, model, counts.shape, rng),
-        "annulus": rim_samples(frame, true, model, 0, counts.rim, rng),
-        "free_edge": rim_samples(frame, true, model, -1, counts.rim, rng),
+        **{rim: rim_samples(frame, true, model, rim, counts.rim, rng) for rim in RIMS},
         "boundary": boundary_samples(frame, true, model, counts.boundary, rng),
     }
     for k in range(len(REFINEMENTS)):
@@ -168,28 +150,6 @@ def draw_samples(
     return {name: (x, y.astype(np.float32)) for name, (x, y) in samples.items()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RenderedFrame:
-    """One simulated volume of one frame, and the valve in it.
-
-    Attributes
-    ----------
-    frame : StandardFrame
-    vertices : (n, 3) mm
-        In world coordinates, as are the tips.
-    tips : (2, 3) mm
-    acquisition : Acquisition
-    volume : VolumeSequence
-        Of this frame alone.
-    """
-
-    frame: StandardFrame
-    vertices: FloatArray
-    tips: FloatArray
-    acquisition: Acquisition
-    volume: VolumeSequence
-
-
 def render_frame(
     valve: MovingValve,
     which: int,
@@ -198,21 +158,17 @@ def render_frame(
     seed: np.random.SeedSequence,
     *,
     degraded: bool = False,
-) -> RenderedFrame:
-    """Simulate the volume of one frame of a valve, probe and rendering drawn at random.
+) -> tuple[VolumeSequence, ValveSequence]:
+    """A simulated volume of one frame of a valve, and the valve in it.
 
-    With ``degraded`` it is made worse besides, see :mod:`mvest.imaging.learning.training`.
+    Probe and rendering are drawn at random. With ``degraded`` the volume is made worse besides, see
+    :mod:`mvest.imaging.learning.training`.
     """
     rng = np.random.default_rng(seed)
     acquisition = draw_acquisition(rng, base, spread)
     probe = draw_probe(rng, acquisition)
     volume = simulate_volume(valve, acquisition, probe, int(rng.integers(2**31)), frames=[which])
-    if degraded:
-        volume = degrade(volume, rng)
-    true = true_sequence(valve, probe, [which])
-    return RenderedFrame(
-        standard_frame(volume, 0), true.vertices[0], true.tips[0], acquisition, volume
-    )
+    return degrade(volume, rng) if degraded else volume, true_sequence(valve, probe, [which])
 
 
 def volume_samples(
@@ -221,7 +177,7 @@ def volume_samples(
     shape: ShapeModel,
     settings: TrainingSettings,
     seed: int,
-    draft: Draft | None = None,
+    draft: Trees | None = None,
 ) -> Samples:
     """Simulate one training volume and sample it for all stages.
 
@@ -235,15 +191,17 @@ def volume_samples(
     settings : TrainingSettings
     seed : int
         Of the training.
-    draft : Draft, optional
+    draft : mapping, optional
         For all but the first volumes.
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
-    seen = render_frame(valve, which, settings.acquisition, "training", render, degraded=True)
-    true = TrueValve.of(seen.vertices, seen.tips, shape)
+    volume, seen = render_frame(
+        valve, which, settings.acquisition, "training", render, degraded=True
+    )
+    true = TrueValve.of(seen.vertices[0], seen.tips[0], shape)
     rng = np.random.default_rng(sample.spawn(1)[0])
-    return draw_samples(seen.frame, true, shape, settings.samples, rng, draft)
+    return draw_samples(standard_frame(volume, 0), true, shape, settings.samples, rng, draft)
 
 
 def samples_of(
@@ -285,12 +243,12 @@ def train_model(
     settings: TrainingSettings,
     seed: int,
     *,
+    sampled: Sampled,
     processes: int = 1,
     trained_on: Mapping[str, Any] | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
-    sampled: Sampled | None = None,
+    progress: Callable[[], None] | None = None,
 ) -> DetectionModel:
-    """Simulate volumes and learn all stages.
+    """Learn all stages from samples of simulated volumes.
 
     Parameters
     ----------
@@ -299,39 +257,19 @@ def train_model(
     settings : TrainingSettings
     seed : int
         The result depends on it and not on the number of processes.
+    sampled : callable
+        Makes the samples by `volume_samples`, or has them from a cache.
     processes : int
     trained_on : mapping, optional
         Plain values that are kept with the model.
     progress : callable, optional
-        Called with what is being done, how much is done and how much there is.
-    sampled : callable, optional
-        Makes the samples instead, from a cache for example; as `volume_samples` would.
+        Called when a stage is done.
 
     Raises
     ------
     InputError
-        If there is no valve, fewer shapes than modes, or fewer modes than are read off at a pose.
+        If there are fewer shapes than modes.
     """
-    if not valves:
-        raise InputError("training: no valves")
-    if settings.modes < MODES:
-        raise InputError(f"training: {settings.modes} modes, expected at least {MODES}")
-    tell = progress or (lambda what, done, all_: None)
-
-    def simulated(
-        numbers: Sequence[int], shape: ShapeModel, make_draft: Callable[[], Draft] | None
-    ) -> list[Samples]:
-        draft = make_draft() if make_draft else None
-        volumes = ((valves[k % len(valves)], k, shape, settings, seed, draft) for k in numbers)
-        made: list[Samples] = []
-        for k, sample in zip(
-            numbers, side_by_side(volume_samples, volumes, processes), strict=True
-        ):
-            made.append(sample)
-            tell("volumes", k + 1, settings.volumes)
-        return made
-
-    sampled = sampled or simulated
     shape = fit_shape_model(valves, settings.modes)
     first = min(settings.draft_volumes, settings.volumes)
     samples = drafted = list(sampled(range(first), shape, None))
@@ -341,9 +279,10 @@ def train_model(
     stages = ((name, *samples_of(name, samples), settings, seed) for name in STAGES)
     boosters = {}
     grown = side_by_side(train_stage, stages, processes)
-    for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):
+    for name, found_boosters in zip(STAGES, grown, strict=True):
         boosters[name] = found_boosters
-        tell("stages", k + 1, len(STAGES))
+        if progress is not None:
+            progress()
     return DetectionModel(shape, boosters, dict(trained_on or {}))
 
 

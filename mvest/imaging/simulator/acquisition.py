@@ -1,4 +1,4 @@
-"""How a simulated echo volume is acquired: every setting of the rendering, with its unit and range.
+"""How a simulated echo volume is acquired: every setting with its unit and range, and the probe.
 
 Levels in dB are of amplitude, relative to the root mean square of fully developed speckle of an
 echo strength of 0 dB, seen face on and without attenuation.
@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.quantities import (
     Angle,
     AxisCount,
@@ -27,9 +27,13 @@ from mvest.quantities import (
     Share,
     Weight,
 )
+from mvest.typing import FloatArray
 
 SPEED_OF_SOUND = 1540.0
 """m/s, mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
+
+LARGEST = 1000.0
+"""Size of any setting, in its unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,46 +132,32 @@ class Acquisition:
     shape: tuple[AxisCount, AxisCount, AxisCount] = (160, 128, 160)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if not math.isfinite(number):
-                    self._refuse(field.name, "a finite number")
-        for name in (
-            "frequency_mhz", "axial_mm", "dynamic_range_db", "scatterers_per_cell", "voxel_mm",
-            "haze_mm",
-        ):  # fmt: skip
-            if not getattr(self, name) > 0:
-                self._refuse(name, "> 0")
-        for name in (
-            "attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
-            "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
-            "beat_turn_deg",
-        ):  # fmt: skip
-            if not getattr(self, name) >= 0:
-                self._refuse(name, ">= 0")
-        for name in ("side_lobe_db", "angle_floor_db", "dropout_db"):
-            if not getattr(self, name) <= 0:
-                self._refuse(name, "<= 0 dB")
-        for name in ("azimuth_deg", "elevation_span_deg"):
-            if not 10 <= getattr(self, name) <= 120:
-                self._refuse(name, "10 to 120 degrees")
-        for name, span in (
-            ("lateral_deg", self.azimuth_deg),
-            ("elevation_deg", self.elevation_span_deg),
-        ):
-            if not 0.2 <= getattr(self, name) <= span / 4:
-                self._refuse(name, "0.2 degrees to a quarter of the opening")
-        if not 0 <= self.dropout <= 0.6:
-            self._refuse("dropout", "0 to 0.6")
-        if len(self.depth_mm) != 2 or not 0 < self.depth_mm[0] < self.depth_mm[1]:
+        require_numbers(
+            self, "acquisition", "frequency_mhz", "axial_mm", "dynamic_range_db",
+            "scatterers_per_cell", "voxel_mm", "haze_mm",
+        )  # fmt: skip
+        if len(self.depth_mm) != 2 or not 0 < self.depth_mm[0] < self.depth_mm[1] < math.inf:
             self._refuse("depth_mm", "two increasing distances > 0")
-        if self.axial_mm > (self.depth_mm[1] - self.depth_mm[0]) / 4:
-            self._refuse("axial_mm", "a quarter of the depth range at most")
-        if not 1 <= self.beats <= 12:
-            self._refuse("beats", "1 to 12")
         if len(self.shape) != 3 or min(self.shape) < 8:
             self._refuse("shape", "three numbers of voxels >= 8")
+        bounds = {
+            **dict.fromkeys(
+                ("attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
+                 "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
+                 "beat_turn_deg"), (0.0, LARGEST),
+            ),
+            **dict.fromkeys(("side_lobe_db", "angle_floor_db", "dropout_db"), (-LARGEST, 0.0)),
+            **dict.fromkeys(("azimuth_deg", "elevation_span_deg"), (10.0, 120.0)),
+            "lateral_deg": (0.2, self.azimuth_deg / 4),
+            "elevation_deg": (0.2, self.elevation_span_deg / 4),
+            "axial_mm": (0.0, (self.depth_mm[1] - self.depth_mm[0]) / 4),
+            "dropout": (0.0, 0.6),
+            "beats": (1.0, 12.0),
+        }  # fmt: skip
+        for name in (f.name for f in fields(self) if f.name not in ("depth_mm", "shape")):
+            low, high = bounds.get(name, (-LARGEST, LARGEST))
+            if not low <= getattr(self, name) <= high:
+                self._refuse(name, f"{low:g} to {high:g}")
 
     def _refuse(self, name: str, expected: str) -> None:
         raise InputError(f"acquisition {name} = {getattr(self, name)}, expected {expected}")
@@ -178,153 +168,61 @@ class Acquisition:
         return 2e3 * math.pi * self.frequency_mhz / SPEED_OF_SOUND
 
 
-SMALL = Acquisition(
-    axial_mm=2.2,
-    lateral_deg=4.0,
-    elevation_deg=5.0,
-    depth_mm=(4.0, 100.0),
-    voxel_mm=2.0,
-    shape=(48, 40, 48),
-)
-"""Coarse and fast, for tests."""
-
+Setting: TypeAlias = Literal["training", "wide", "shifted"]
+"""From which ranges an acquisition is drawn."""
 
 Interval: TypeAlias = tuple[float, float]
 
+RANGES: dict[str, tuple[Literal["times", "plus"], Interval, tuple[Interval, ...]]] = {
+    "frequency_mhz": ("times", (0.8, 1.2), ((0.65, 0.75), (1.25, 1.4))),
+    "axial_mm": ("times", (0.75, 1.3), ((1.35, 1.6),)),
+    "lateral_deg": ("times", (0.75, 1.3), ((1.35, 1.6),)),
+    "elevation_deg": ("times", (0.75, 1.3), ((1.35, 1.6),)),
+    "side_lobe_db": ("plus", (-5.0, 4.0), ((4.5, 7.0),)),
+    "dynamic_range_db": ("plus", (-6.0, 8.0), ((-10.0, -7.0), (9.0, 13.0))),
+    "gain_db": ("plus", (-5.0, 5.0), ((-7.0, -5.5), (5.5, 7.0))),
+    "attenuation_db_per_cm_mhz": ("times", (0.7, 1.3), ((1.35, 1.6),)),
+    "compensation_db_per_cm_mhz": ("plus", (-0.05, 0.05), ((-0.05, 0.05),)),
+    "shadow_db_per_cm": ("times", (0.0, 1.5), ((1.6, 2.2),)),
+    "angle_exponent": ("times", (0.6, 1.4), ((0.4, 0.55), (1.45, 1.7))),
+    "angle_floor_db": ("plus", (-5.0, 4.0), ((-7.0, -5.5), (4.5, 7.0))),
+    "dropout": ("plus", (-0.08, 0.08), ((0.09, 0.16),)),
+    "blood_db": ("plus", (-5.0, 5.0), ((5.5, 8.0),)),
+    "electronics_db": ("plus", (-5.0, 5.0), ((5.5, 9.0),)),
+    "haze_db": ("plus", (-10.0, 5.0), ((5.5, 8.0),)),
+    "contact_db": ("times", (0.3, 1.5), ((1.6, 1.9),)),
+    "wall_db": ("plus", (-4.0, 4.0), ((-6.0, 6.0),)),
+    "leaflet_db": ("plus", (-4.0, 3.0), ((-6.0, -4.2),)),
+    "annulus_db": ("plus", (-4.0, 3.0), ((-6.0, -4.2),)),
+    "chord_db": ("plus", (-5.0, 5.0), ((-5.0, 5.0),)),
+    "papillary_db": ("plus", (-4.0, 4.0), ((-4.0, 4.0),)),
+    "vessel_db": ("plus", (-4.0, 4.0), ((-4.0, 4.0),)),
+    "beat_shift_mm": ("times", (0.0, 1.5), ((1.6, 2.5),)),
+    "beat_turn_deg": ("times", (0.0, 1.5), ((1.6, 2.5),)),
+}
+"""How each setting varies about that of the base: whether what is drawn multiplies it or is added
+to it, within which interval in training, and within which shifted ones.
 
-@dataclass(frozen=True, slots=True)
-class Range:
-    """How one setting varies about that of the base.
-
-    Attributes
-    ----------
-    setting : str
-        Name of a number in :class:`Acquisition`.
-    how : "times" or "plus"
-        Whether what is drawn multiplies the setting or is added to it.
-    intervals : tuple of (float, float)
-        One is chosen with equal chances, then a value in it.
-    """
-
-    setting: str
-    how: Literal["times", "plus"]
-    intervals: tuple[Interval, ...]
-
-    def __post_init__(self) -> None:
-        numbers = {f.name for f in fields(Acquisition) if f.name not in ("depth_mm", "shape")}
-        if self.setting not in numbers or self.setting == "beats":
-            raise InputError(f"range of {self.setting!r}, expected a number of an acquisition")
-        if self.how not in ("times", "plus"):
-            raise InputError(f"range of {self.setting}: {self.how!r}, expected times or plus")
-        if not self.intervals or any(not low <= high for low, high in self.intervals):
-            raise InputError(
-                f"range of {self.setting}: {self.intervals}, expected intervals (low, high)"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class AcquisitionRanges:
-    """Ranges of settings, drawn independently of each other."""
-
-    name: str
-    ranges: tuple[Range, ...]
-
-
-def _range(setting: str, how: Literal["times", "plus"], *intervals: Interval) -> Range:
-    return Range(setting, how, intervals)
-
-
-TRAINING = AcquisitionRanges(
-    "training",
-    (
-        _range("frequency_mhz", "times", (0.8, 1.2)),
-        _range("axial_mm", "times", (0.75, 1.3)),
-        _range("lateral_deg", "times", (0.75, 1.3)),
-        _range("elevation_deg", "times", (0.75, 1.3)),
-        _range("side_lobe_db", "plus", (-5.0, 4.0)),
-        _range("dynamic_range_db", "plus", (-6.0, 8.0)),
-        _range("gain_db", "plus", (-5.0, 5.0)),
-        _range("attenuation_db_per_cm_mhz", "times", (0.7, 1.3)),
-        _range("compensation_db_per_cm_mhz", "plus", (-0.05, 0.05)),
-        _range("shadow_db_per_cm", "times", (0.0, 1.5)),
-        _range("angle_exponent", "times", (0.6, 1.4)),
-        _range("angle_floor_db", "plus", (-5.0, 4.0)),
-        _range("dropout", "plus", (-0.08, 0.08)),
-        _range("blood_db", "plus", (-5.0, 5.0)),
-        _range("electronics_db", "plus", (-5.0, 5.0)),
-        _range("haze_db", "plus", (-10.0, 5.0)),
-        _range("contact_db", "times", (0.3, 1.5)),
-        _range("wall_db", "plus", (-4.0, 4.0)),
-        _range("leaflet_db", "plus", (-4.0, 3.0)),
-        _range("annulus_db", "plus", (-4.0, 3.0)),
-        _range("chord_db", "plus", (-5.0, 5.0)),
-        _range("papillary_db", "plus", (-4.0, 4.0)),
-        _range("vessel_db", "plus", (-4.0, 4.0)),
-        _range("beat_shift_mm", "times", (0.0, 1.5)),
-        _range("beat_turn_deg", "times", (0.0, 1.5)),
-    ),
-)
-"""What detectors are trained on; widths of ranges are a choice."""
-
-SHIFTED = AcquisitionRanges(
-    "shifted",
-    (
-        _range("frequency_mhz", "times", (0.65, 0.75), (1.25, 1.4)),
-        _range("axial_mm", "times", (1.35, 1.6)),
-        _range("lateral_deg", "times", (1.35, 1.6)),
-        _range("elevation_deg", "times", (1.35, 1.6)),
-        _range("side_lobe_db", "plus", (4.5, 7.0)),
-        _range("dynamic_range_db", "plus", (-10.0, -7.0), (9.0, 13.0)),
-        _range("gain_db", "plus", (-7.0, -5.5), (5.5, 7.0)),
-        _range("attenuation_db_per_cm_mhz", "times", (1.35, 1.6)),
-        _range("compensation_db_per_cm_mhz", "plus", (-0.05, 0.05)),
-        _range("shadow_db_per_cm", "times", (1.6, 2.2)),
-        _range("angle_exponent", "times", (0.4, 0.55), (1.45, 1.7)),
-        _range("angle_floor_db", "plus", (-7.0, -5.5), (4.5, 7.0)),
-        _range("dropout", "plus", (0.09, 0.16)),
-        _range("blood_db", "plus", (5.5, 8.0)),
-        _range("electronics_db", "plus", (5.5, 9.0)),
-        _range("haze_db", "plus", (5.5, 8.0)),
-        _range("contact_db", "times", (1.6, 1.9)),
-        _range("wall_db", "plus", (-6.0, 6.0)),
-        _range("leaflet_db", "plus", (-6.0, -4.2)),
-        _range("annulus_db", "plus", (-6.0, -4.2)),
-        _range("chord_db", "plus", (-5.0, 5.0)),
-        _range("papillary_db", "plus", (-4.0, 4.0)),
-        _range("vessel_db", "plus", (-4.0, 4.0)),
-        _range("beat_shift_mm", "times", (1.6, 2.5)),
-        _range("beat_turn_deg", "times", (1.6, 2.5)),
-    ),
-)
-"""What detectors never saw: apart from echo strengths and compensation, every range is disjoint
-from that of training, and mostly on the worse side."""
-
-
-WIDE = AcquisitionRanges(
-    "wide",
-    tuple(
-        Range(own.setting, own.how, tuple(dict.fromkeys((*own.intervals, *beyond.intervals))))
-        for own, beyond in zip(TRAINING.ranges, SHIFTED.ranges, strict=True)
-    ),
-)
-"""Each setting by itself inside the ranges of training or outside: half and half, or with chances
-of one to two where both sides lie outside."""
+Shifted acquisitions are what detectors never saw: apart from echo strengths and compensation, every
+range is disjoint from that of training, and mostly on the worse side. The widths are a choice.
+"""
 
 
 def draw_acquisition(
     rng: np.random.Generator,
     base: Acquisition | None = None,
-    spread: AcquisitionRanges | str = "training",
+    spread: str = "training",
 ) -> Acquisition:
-    """An acquisition drawn about a base; the result records every value.
+    """An acquisition drawn about a base, each setting by itself; the result records every value.
 
     Parameters
     ----------
     rng : numpy Generator
     base : Acquisition, optional
         The default one if none is given.
-    spread : AcquisitionRanges or its name, "training", "wide" or "shifted"
-        What is drawn, and from where.
+    spread : "training", "wide" or "shifted"
+        In `RANGES`: within the ranges of training, outside of them, or wide: each setting inside or
+        outside, half and half, or with chances of one to two where both sides lie outside.
 
     Raises
     ------
@@ -332,14 +230,107 @@ def draw_acquisition(
         If no spread has that name, or a value drawn makes no sense as an acquisition's.
     """
     base = base or Acquisition()
-    if isinstance(spread, str):
-        known = {s.name: s for s in (TRAINING, WIDE, SHIFTED)}
-        if spread not in known:
-            raise InputError(f"spread {spread!r}, expected one of {', '.join(known)}")
-        spread = known[spread]
+    if spread not in (known := get_args(Setting)):
+        raise InputError(f"spread {spread!r}, expected one of {', '.join(known)}")
     drawn: dict[str, float] = {}
-    for entry in spread.ranges:
-        low, high = entry.intervals[int(rng.integers(len(entry.intervals)))]
-        value, before = float(rng.uniform(low, high)), float(getattr(base, entry.setting))
-        drawn[entry.setting] = before * value if entry.how == "times" else before + value
+    for name, (how, within, outside) in RANGES.items():
+        wide = tuple(dict.fromkeys((within, *outside)))
+        intervals = {"training": (within,), "wide": wide, "shifted": outside}[spread]
+        low, high = intervals[int(rng.integers(len(intervals)))]
+        value, before = float(rng.uniform(low, high)), float(getattr(base, name))
+        drawn[name] = before * value if how == "times" else before + value
     return replace(base, **drawn)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Probe:
+    """Pose of the valve as seen from the probe, which scans from the world's origin along z.
+
+    The axes of the world (LPS, mm) are azimuth, in which beats are stitched, elevation and beam.
+
+    Attributes
+    ----------
+    rotation : (3, 3)
+        Its columns are the x, y and z axes of the valve in the world; a proper rotation.
+    translation : (3,) mm
+        World position of the valve's origin.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+
+    def to_world(self, points: FloatArray) -> FloatArray:
+        """Positions ``(..., 3)`` mm along azimuth, elevation and beam of points in valve axes."""
+        return np.asarray(points @ self.rotation.T + self.translation)
+
+    @property
+    def apex_in_valve(self) -> FloatArray:
+        """``(3,)`` mm, the apex of the pyramid in the valve's axes."""
+        return np.asarray(-self.translation @ self.rotation)
+
+
+RADIUS_MM = 20.0
+"""mm, of the ball around the valve that lies in the pyramid."""
+
+
+def draw_probe(
+    rng: np.random.Generator,
+    acquisition: Acquisition | None = None,
+    *,
+    distance_mm: tuple[float, float] = (35.0, 75.0),
+    tilt_deg: tuple[float, float] = (0.0, 55.0),
+) -> Probe:
+    """A probe behind the atrium.
+
+    Distance and tilt are uniform within their ranges, the roll and the direction of the tilt over
+    the full circle; the valve's direction is uniform over those in which a ball around the valve
+    lies in the pyramid (straight ahead, if it fits nowhere). The ranges are a choice.
+
+    Parameters
+    ----------
+    rng : numpy Generator
+    acquisition : Acquisition, optional
+        Whose pyramid holds the valve; the default one if none is given.
+    distance_mm : (float, float)
+        From the apex to the valve's origin.
+    tilt_deg : (float, float)
+        Between the valve's axis and the line of sight to the probe.
+
+    Raises
+    ------
+    InputError
+        If a range is not one, or a distance is less than `RADIUS_MM`.
+    """
+    acquisition = acquisition or Acquisition()
+    for name, (low, high) in (("distance_mm", distance_mm), ("tilt_deg", tilt_deg)):
+        if not 0 <= low <= high < math.inf:
+            raise InputError(f"probe {name}: {low:g} to {high:g}, expected 0 <= low <= high")
+    if tilt_deg[1] > 90 or distance_mm[0] <= RADIUS_MM:
+        raise InputError(
+            f"probe: tilt to {tilt_deg[1]:g} degrees and distance from {distance_mm[0]:g} mm, "
+            f"expected 90 at most, and more than {RADIUS_MM:g}"
+        )
+    distance = rng.uniform(*distance_mm)
+    ball = math.degrees(math.asin(RADIUS_MM / distance))
+    free = [
+        math.radians(max(0.5 * span - ball, 0.0))
+        for span in (acquisition.azimuth_deg, acquisition.elevation_span_deg)
+    ]
+    a, e = (rng.uniform(-f, f) for f in free)
+    sight = np.array([math.tan(a), math.tan(e), 1.0])
+    sight /= np.linalg.norm(sight)
+    tilt, towards, roll = (
+        math.radians(rng.uniform(*tilt_deg)),
+        rng.uniform(0, 2 * math.pi),
+        rng.uniform(0, 2 * math.pi),
+    )
+    # An orthonormal triad with the line of sight, and the valve's axis tilted away from it.
+    u = np.cross(sight, [0.0, 1.0, 0.0])
+    u /= np.linalg.norm(u)
+    v = np.cross(sight, u)
+    z = -math.cos(tilt) * sight + math.sin(tilt) * (math.cos(towards) * u + math.sin(towards) * v)
+    x = np.cross(u if abs(u @ z) < 0.9 else v, z)
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    x, y = math.cos(roll) * x + math.sin(roll) * y, math.cos(roll) * y - math.sin(roll) * x
+    return Probe(np.stack([x, y, z], axis=1), distance * sight)

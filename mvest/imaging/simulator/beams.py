@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -24,10 +25,29 @@ Float32Array = NDArray[np.float32]
 DECIBEL = np.log(10.0) / 20.0
 
 
+class Losses(NamedTuple):
+    """What is lost on the way to a sample and back, on a coarse grid over the whole pyramid.
+
+    Attributes
+    ----------
+    decibel : (A, E, D) float32
+        Two-way, beyond that of blood.
+    start, step : (3,)
+        Of azimuth and elevation (rad) and distance (mm).
+    """
+
+    decibel: Float32Array
+    start: FloatArray
+    step: FloatArray
+
+
 @nb.njit(cache=True)
-def _jacobian(x: float, y: float) -> float:
-    """Solid angle over the product of both angles, at their tangents."""
-    return (1 + x * x) * (1 + y * y) / (1 + x * x + y * y) ** 1.5
+def _beam(x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Azimuth, elevation, distance, and the solid angle there over the product of both angles."""
+    x, y = x / z, y / z
+    square = 1 + x * x + y * y
+    jacobian = (1 + x * x) * (1 + y * y) / square**1.5
+    return np.arctan(x), np.arctan(y), z * np.sqrt(square), jacobian
 
 
 @nb.njit(cache=True)
@@ -38,18 +58,16 @@ def add_losses(
     n0, n1, n2 = loss.shape
     size = step[0] * step[1] * step[2]
     for i in range(len(points)):
-        z = points[i, 2]
-        if z <= 0 or amount[i] == 0:
+        if points[i, 2] <= 0 or amount[i] == 0:
             continue
-        x, y = points[i, 0] / z, points[i, 1] / z
-        r = z * np.sqrt(1 + x * x + y * y)
-        a, e = (np.arctan(x) - start[0]) / step[0], (np.arctan(y) - start[1]) / step[1]
+        azimuth, elevation, r, jacobian = _beam(points[i, 0], points[i, 1], points[i, 2])
+        a, e = (azimuth - start[0]) / step[0], (elevation - start[1]) / step[1]
         d = (r - start[2]) / step[2]
         if a < 0 or a >= n0 - 1 or e < 0 or e >= n1 - 1 or d < 0 or d >= n2 - 1:
             continue
         ia, ie, k = int(a), int(e), int(d)
         fa, fe, fd = a - ia, e - ie, d - k
-        w = amount[i] / (size * r * r * _jacobian(x, y))
+        w = amount[i] / (size * r * r * jacobian)
         for p in range(2):
             wa = w * (fa if p else 1 - fa)
             for q in range(2):
@@ -59,14 +77,13 @@ def add_losses(
 
 
 @nb.njit(cache=True)
-def _at(values: Float32Array, a: float, e: float, d: float) -> float:
-    """Linear interpolation, constant outside."""
+def _lost(losses: Losses, azimuth: float, elevation: float, distance: float) -> float:
+    """Loss (dB) by linear interpolation, constant outside."""
+    values, start, step = losses
     n0, n1, n2 = values.shape
-    a, e, d = (
-        min(max(a, 0.0), n0 - 1.001),
-        min(max(e, 0.0), n1 - 1.001),
-        min(max(d, 0.0), n2 - 1.001),
-    )
+    a = min(max((azimuth - start[0]) / step[0], 0.0), n0 - 1.001)
+    e = min(max((elevation - start[1]) / step[1], 0.0), n1 - 1.001)
+    d = min(max((distance - start[2]) / step[2], 0.0), n2 - 1.001)
     i, j, k = int(a), int(e), int(d)
     x, y, z = a - i, e - j, d - k
     low = (1 - y) * ((1 - z) * values[i, j, k] + z * values[i, j, k + 1])
@@ -78,22 +95,16 @@ def _at(values: Float32Array, a: float, e: float, d: float) -> float:
 
 @nb.njit(cache=True)
 def add_noise(
-    signal: Float32Array,
-    level: FloatArray,
-    start: FloatArray,
-    step: FloatArray,
-    loss: Float32Array,
-    loss_start: FloatArray,
-    loss_step: FloatArray,
+    signal: Float32Array, level: FloatArray, start: FloatArray, step: FloatArray, losses: Losses
 ) -> None:
     """Scale noise to a level over distance, less what is lost on the way."""
     for a in range(signal.shape[0]):
-        ca = (start[0] + a * step[0] - loss_start[0]) / loss_step[0]
         for e in range(signal.shape[1]):
-            ce = (start[1] + e * step[1] - loss_start[1]) / loss_step[1]
             for d in range(signal.shape[3]):
-                cd = (start[2] + d * step[2] - loss_start[2]) / loss_step[2]
-                g = np.float32(level[d] * np.exp(-DECIBEL * _at(loss, ca, ce, cd)))
+                lost = _lost(
+                    losses, start[0] + a * step[0], start[1] + e * step[1], start[2] + d * step[2]
+                )
+                g = np.float32(level[d] * np.exp(-DECIBEL * lost))
                 signal[a, e, 0, d] *= g
                 signal[a, e, 1, d] *= g
 
@@ -107,9 +118,7 @@ def deposit(
     gain: float,
     start: FloatArray,
     step: FloatArray,
-    loss: Float32Array,
-    loss_start: FloatArray,
-    loss_step: FloatArray,
+    losses: Losses,
 ) -> None:
     """Add every scatterer's echo to the eight samples around it, with the phase of its place.
 
@@ -118,27 +127,15 @@ def deposit(
     """
     n0, n1, n2 = signal.shape[0], signal.shape[1], signal.shape[3]
     for i in range(len(points)):
-        z = points[i, 2]
-        if z <= 0:
+        if points[i, 2] <= 0:
             continue
-        x, y = points[i, 0] / z, points[i, 1] / z
-        angle_a = np.arctan(x)
-        a = (angle_a - start[0]) / step[0]
-        if a < 0 or a >= n0 - 1:
-            continue
-        angle_e = np.arctan(y)
-        e = (angle_e - start[1]) / step[1]
-        r = z * np.sqrt(1 + x * x + y * y)
+        azimuth, elevation, r, jacobian = _beam(points[i, 0], points[i, 1], points[i, 2])
+        a, e = (azimuth - start[0]) / step[0], (elevation - start[1]) / step[1]
         d = (r - start[2]) / step[2]
-        if e < 0 or e >= n1 - 1 or d < 0 or d >= n2 - 1:
+        if a < 0 or a >= n0 - 1 or e < 0 or e >= n1 - 1 or d < 0 or d >= n2 - 1:
             continue
-        lost = _at(
-            loss,
-            (angle_a - loss_start[0]) / loss_step[0],
-            (angle_e - loss_start[1]) / loss_step[1],
-            (r - loss_start[2]) / loss_step[2],
-        )
-        w = amplitude[i] * np.exp(DECIBEL * (gain * r - lost)) / (r * np.sqrt(_jacobian(x, y)))
+        lost = _lost(losses, azimuth, elevation, r)
+        w = amplitude[i] * np.exp(DECIBEL * (gain * r - lost)) / (r * np.sqrt(jacobian))
         re, im = w * np.cos(twice_k * r), w * np.sin(twice_k * r)
         ia, ie, k = int(a), int(e), int(d)
         fa, fe, fd = a - ia, e - ie, d - k
@@ -296,52 +293,33 @@ class BeamGrid:
         return [(a, b) for a, b in pairwise(edges.tolist())]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Losses:
-    """What is lost on the way to a sample and back, on a coarse grid over the whole pyramid.
+def losses_of(grid: BeamGrid, echoes: Echoes, contact: FloatArray) -> Losses:
+    """Attenuation by the scatterers' tissue, summed along each beam.
 
-    Attributes
+    Parameters
     ----------
-    decibel : (A, E, D) float32
-        Two-way, beyond that of blood.
-    start, step : (3,)
-        Of azimuth and elevation (rad) and distance (mm).
+    grid : BeamGrid
+    echoes : Echoes
+    contact : (p, q) dB
+        Gain over the pyramid, at directions evenly spaced from edge to edge.
     """
-
-    decibel: Float32Array
-    start: FloatArray
-    step: FloatArray
-
-    @classmethod
-    def of(cls, grid: BeamGrid, echoes: Echoes, contact: FloatArray) -> Losses:
-        """Attenuation by the scatterers' tissue, summed along each beam.
-
-        Parameters
-        ----------
-        grid : BeamGrid
-        echoes : Echoes
-        contact : (p, q) dB
-            Gain over the pyramid, at directions evenly spaced from edge to edge.
-        """
-        axes = (grid.azimuth, grid.elevation, grid.distance)
-        wide = (2.2, 2.2, 3.0)
-        reach = np.array([(x.count + 2 * x.margin) * x.step for x in axes])
-        start = np.array([x.start - x.margin * x.step for x in axes])
-        count = [math.ceil(r / (w * x.step)) + 1 for r, w, x in zip(reach, wide, axes, strict=True)]
-        step = reach / (np.array(count) - 1)
-        start[2] = max(start[2], 0.5 * step[2])
-        loss = np.zeros(count, dtype=np.float32)
-        add_losses(loss, echoes.points, echoes.loss, start, step)
-        # mm to cm, there and back; of the own cell half.
-        path = (0.2 * step[2]) * (np.cumsum(loss, axis=2) - 0.5 * loss)
-        p, q = (np.linspace(0, n - 1, m) for n, m in zip(contact.shape, count[:2], strict=True))
-        i, j = (
-            np.minimum(v.astype(int), n - 2) for v, n in zip((p, q), contact.shape, strict=True)
-        )
-        x, y = (p - i)[:, None], (q - j)[None]
-        gain = (1 - x) * (1 - y) * contact[i][:, j] + (1 - x) * y * contact[i][:, j + 1]
-        gain += x * (1 - y) * contact[i + 1][:, j] + x * y * contact[i + 1][:, j + 1]
-        return cls((path - gain[..., None]).astype(np.float32), start, step)
+    axes = (grid.azimuth, grid.elevation, grid.distance)
+    wide = (2.2, 2.2, 3.0)
+    reach = np.array([(x.count + 2 * x.margin) * x.step for x in axes])
+    start = np.array([x.start - x.margin * x.step for x in axes])
+    count = [math.ceil(r / (w * x.step)) + 1 for r, w, x in zip(reach, wide, axes, strict=True)]
+    step = reach / (np.array(count) - 1)
+    start[2] = max(start[2], 0.5 * step[2])
+    loss = np.zeros(count, dtype=np.float32)
+    add_losses(loss, echoes.points, echoes.loss, start, step)
+    # mm to cm, there and back; of the own cell half.
+    path = (0.2 * step[2]) * (np.cumsum(loss, axis=2) - 0.5 * loss)
+    p, q = (np.linspace(0, n - 1, m) for n, m in zip(contact.shape, count[:2], strict=True))
+    i, j = (np.minimum(v.astype(int), n - 2) for v, n in zip((p, q), contact.shape, strict=True))
+    x, y = (p - i)[:, None], (q - j)[None]
+    gain = (1 - x) * (1 - y) * contact[i][:, j] + (1 - x) * y * contact[i][:, j + 1]
+    gain += x * (1 - y) * contact[i + 1][:, j] + x * y * contact[i + 1][:, j + 1]
+    return Losses((path - gain[..., None]).astype(np.float32), start, step)
 
 
 def render_window(
@@ -382,16 +360,20 @@ def render_window(
     )
     step = np.array([az.step, el.step, along.step])
     distance = start[2] + step[2] * np.arange(shape[3])
-    signal = _noise(rng, shape)
-    level = _blood(a, distance) / np.prod([np.linalg.norm(x.kernel) for x in (az, el, along)])
-    add_noise(signal, level, start, step, losses.decibel, losses.start, losses.step)
+    # Complex Gaussian noise of mean power 1, times what blood and reverberations have of it.
+    signal = rng.standard_normal(shape, dtype=np.float32)
+    signal *= np.float32(math.sqrt(0.5))
     gain_per_mm = (
         0.2 * a.frequency_mhz * (a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz)
     )
+    blood = 10 ** ((a.blood_db + gain_per_mm * distance) / 20)
+    haze = 10 ** (a.haze_db / 20) * np.exp(-np.maximum(distance - a.depth_mm[0], 0) / a.haze_mm)
+    level = np.hypot(blood, haze) / np.prod([np.linalg.norm(x.kernel) for x in (az, el, along)])
+    add_noise(signal, level, start, step, losses)
     energy = az.energy * el.energy * along.energy
     deposit(
         signal, echoes.points, echoes.amplitude / math.sqrt(energy), 2 * a.wave_number, gain_per_mm,
-        start, step, losses.decibel, losses.start, losses.step,
+        start, step, losses,
     )  # fmt: skip
     signal = blur_across(signal, az.kernel, el.kernel)
     compensation = 0.2 * a.frequency_mhz * a.compensation_db_per_cm_mhz
@@ -399,20 +381,3 @@ def render_window(
     hiss /= math.sqrt(2) * np.linalg.norm(along.kernel)
     signal += hiss.astype(np.float32) * rng.standard_normal(signal.shape, dtype=np.float32)
     return np.asarray(envelope(signal, along.kernel))
-
-
-def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32Array:
-    """Real and imaginary parts of complex Gaussian noise of mean power 1."""
-    noise = rng.standard_normal(shape, dtype=np.float32)
-    noise *= np.float32(math.sqrt(0.5))
-    return noise
-
-
-def _blood(a: Acquisition, distance: FloatArray) -> FloatArray:
-    """Amplitude of noise from blood and reverberations over distance, after compensation."""
-    gain = (
-        0.2 * a.frequency_mhz * (a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz)
-    )
-    blood = 10 ** ((a.blood_db + gain * distance) / 20)
-    haze = 10 ** (a.haze_db / 20) * np.exp(-np.maximum(distance - a.depth_mm[0], 0) / a.haze_mm)
-    return np.asarray(np.hypot(blood, haze))

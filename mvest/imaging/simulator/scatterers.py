@@ -6,9 +6,8 @@ A scatterer keeps its material coordinates in all frames, so that speckle moves 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
-import numba as nb
 import numpy as np
 
 from mvest.typing import FloatArray
@@ -35,28 +34,9 @@ class Material:
     fineness: float = 1.0
 
 
-class TissuePart(Protocol):
-    """A piece of tissue that scatterers can be sown into."""
-
-    @property
-    def material(self) -> Material:
-        """Its properties."""
-
-    @property
-    def volume(self) -> float:
-        """mm^3 in the first frame."""
-
-    def sow(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Material coordinates ``(count, 3)`` of scatterers, uniform over the volume."""
-
-    def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
-        """Positions ``(n, 3)`` mm in valve axes, and ``(n,)`` how squarely sound hits (0 to 1)."""
-
-    def strength(self, seeds: FloatArray) -> FloatArray:
-        """Amplitude ``(n,)`` relative to the material's."""
-
-    def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
-        """``(n,)`` from 0 to 1, the share of dense tissue."""
+Sowing: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Of scatterers, uniform over a part: material coordinates ``(n, 3)``, amplitudes relative to the
+material's ``(n,)`` and shares of dense tissue ``(n,)``, 0 to 1."""
 
 
 def _differences(points: FloatArray, axis: int, closed: bool) -> FloatArray:
@@ -68,6 +48,26 @@ def _differences(points: FloatArray, axis: int, closed: bool) -> FloatArray:
 def _unit(vectors: FloatArray) -> FloatArray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, 1e-9))
+
+
+def _sum(vectors: FloatArray) -> FloatArray:
+    """Of the components."""
+    return np.asarray(vectors[:, 0] + vectors[:, 1] + vectors[:, 2])
+
+
+def _in_cells(
+    grid: FloatArray, seeds: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:
+    """Where seeds lie in cells of a grid, closed along columns, and the cells' corners.
+
+    Rows and columns of ``grid (R, C, ...)`` are the first two coordinates of the seeds.
+    """
+    rows, columns = grid.shape[:2]
+    row, column = np.minimum(seeds[:, 0].astype(np.int64), rows - 2), seeds[:, 1].astype(np.int64)
+    shape = (len(seeds), *[1] * (grid.ndim - 2))
+    x, y = (seeds[:, 0] - row).reshape(shape), (seeds[:, 1] - column).reshape(shape)
+    a, b = column % columns, (column + 1) % columns
+    return x, y, (grid[row, a], grid[row, b], grid[row + 1, a], grid[row + 1, b])
 
 
 def normals(points: FloatArray) -> FloatArray:
@@ -115,8 +115,8 @@ class TissueSheet:
         """mm^3 in the first frame."""
         return float(self._cells.sum())
 
-    def sow(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Rows, columns and places along the normal ``(count, 3)``."""
+    def sow(self, rng: np.random.Generator, count: int) -> Sowing:
+        """Scatterers at rows, columns and places along the normal; none is of dense tissue."""
         cells = self._cells
         each = rng.multinomial(count, cells.ravel() / cells.sum())
         seeds = rng.random((count, 3))
@@ -124,22 +124,26 @@ class TissueSheet:
         seeds[:, 0] += cell // cells.shape[1]
         seeds[:, 1] += cell % cells.shape[1]
         seeds[:, 2] = self.span[0] + (self.span[1] - self.span[0]) * seeds[:, 2]
-        return seeds
+        x, y, (a, b, c, d) = _in_cells(self.relative, seeds)
+        relative = (1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d)
+        return seeds, relative * np.exp(-self.fade * np.abs(seeds[:, 2])), np.zeros(count)
 
     def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
         """Positions ``(n, 3)`` and ``|normal . line of sight|`` ``(n,)``."""
-        p = self.points[frame]
-        return _on_sheet(p, normals(p), self.thickness, seeds, apex)
 
-    def strength(self, seeds: FloatArray) -> FloatArray:
-        """Amplitude ``(n,)`` relative to the material's."""
-        return np.asarray(
-            _bilinear(self.relative, seeds) * np.exp(-self.fade * np.abs(seeds[:, 2]))
-        )
+        def at(grid: FloatArray) -> FloatArray:
+            x, y, (a, b, c, d) = _in_cells(grid, seeds)
+            first = (1 - x) * (1 - y) * a + (1 - x) * y * b
+            return np.asarray(first + (x * (1 - y) * c + x * y * d))
 
-    def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
-        """``(n,)`` zeros: sheets hold no dense tissue."""
-        return np.zeros(len(seeds))
+        points = self.points[frame]
+        on_grid, normal = at(points), at(normals(points))
+        size = np.maximum(np.sqrt(_sum(normal * normal)), 1e-9)
+        sight = on_grid - apex
+        cosine = np.abs(_sum(sight * normal / size[:, None]))
+        cosine /= np.maximum(np.sqrt(_sum(sight * sight)), 1e-9)
+        away = normal / size[:, None] * at(self.thickness)[:, None] * seeds[:, 2:]
+        return on_grid + away, np.minimum(cosine, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,15 +183,17 @@ class Cord:
         """mm^3 in the first frame."""
         return float(self._cells.sum())
 
-    def sow(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Places along the line, and across it in the unit disk ``(count, 3)``."""
+    def sow(self, rng: np.random.Generator, count: int) -> Sowing:
+        """Scatterers at places along the line, and across it in the unit disk."""
         cells = self._cells
         each = rng.multinomial(count, cells / cells.sum())
         seeds = rng.random((count, 3))
         radius, angle = np.sqrt(seeds[:, 1]), 2 * np.pi * seeds[:, 2]
         seeds[:, 0] += np.repeat(np.arange(len(cells)), each)
         seeds[:, 1], seeds[:, 2] = radius * np.cos(angle), radius * np.sin(angle)
-        return seeds
+        values = self._ends(self.dense)
+        dense = np.interp(seeds[:, 0], np.arange(len(values)), values)
+        return seeds, np.ones(count), dense
 
     def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
         """Positions ``(n, 3)`` and the sine between cord and line of sight ``(n,)``."""
@@ -199,92 +205,18 @@ class Cord:
         u = _unit(np.cross(tangent, axis))
         v = np.cross(tangent, u)
         p, tangent, u, v = (self._ends(x) for x in (p, tangent, u, v))
-        return _on_cord(p, tangent, u, v, self._ends(self.radius), seeds, apex)
+        a = np.minimum(seeds[:, 0].astype(np.int64), len(p) - 2)
+        x = seeds[:, :1] - a[:, None]
 
-    def strength(self, seeds: FloatArray) -> FloatArray:
-        """Amplitude ``(n,)`` relative to the material's: 1."""
-        return np.ones(len(seeds))
+        def at(values: FloatArray) -> FloatArray:
+            return np.asarray((1 - x) * values[a] + x * values[a + 1])
 
-    def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
-        """``(n,)`` from 0 to 1, the share of dense tissue."""
-        values = self._ends(self.dense)
-        return np.asarray(np.interp(seeds[:, 0], np.arange(len(values)), values))
-
-
-@nb.njit(cache=True)
-def _bilinear(values: FloatArray, seeds: FloatArray) -> FloatArray:
-    """Values ``(R, C)`` at rows and columns ``(n, 2 or more)``, closed along columns."""
-    rows, columns = values.shape
-    out = np.empty(len(seeds))
-    for i in range(len(seeds)):
-        a, b = min(int(seeds[i, 0]), rows - 2), int(seeds[i, 1]) % columns
-        c = (b + 1) % columns
-        x, y = seeds[i, 0] - a, seeds[i, 1] - int(seeds[i, 1])
-        out[i] = (1 - x) * ((1 - y) * values[a, b] + y * values[a, c]) + x * (
-            (1 - y) * values[a + 1, b] + y * values[a + 1, c]
-        )
-    return out
+        across = seeds[:, 1:2] * at(u) + seeds[:, 2:] * at(v)
+        sight = at(p) - apex
+        cosine = _sum(sight * at(tangent))
+        sine = np.sqrt(np.maximum(1 - cosine**2 / np.maximum(_sum(sight * sight), 1e-9), 0.0))
+        return at(p) + at(self._ends(self.radius)[:, None]) * across, sine
 
 
-@nb.njit(cache=True)
-def _on_sheet(
-    points: FloatArray,
-    normals: FloatArray,
-    thickness: FloatArray,
-    seeds: FloatArray,
-    apex: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    rows, columns = thickness.shape
-    out, facing = np.empty((len(seeds), 3)), np.empty(len(seeds))
-    n = np.empty(3)
-    for i in range(len(seeds)):
-        a, b = min(int(seeds[i, 0]), rows - 2), int(seeds[i, 1]) % columns
-        c = (b + 1) % columns
-        x, y = seeds[i, 0] - a, seeds[i, 1] - int(seeds[i, 1])
-        w0, w1, w2, w3 = (1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y
-        t = w0 * thickness[a, b] + w1 * thickness[a, c]
-        t += w2 * thickness[a + 1, b] + w3 * thickness[a + 1, c]
-        size = 0.0
-        for d in range(3):
-            n[d] = w0 * normals[a, b, d] + w1 * normals[a, c, d]
-            n[d] += w2 * normals[a + 1, b, d] + w3 * normals[a + 1, c, d]
-            size += n[d] * n[d]
-        size = max(np.sqrt(size), 1e-9)
-        dot = square = 0.0
-        for d in range(3):
-            p = w0 * points[a, b, d] + w1 * points[a, c, d]
-            p += w2 * points[a + 1, b, d] + w3 * points[a + 1, c, d]
-            out[i, d] = p + n[d] / size * t * seeds[i, 2]
-            sight = p - apex[d]
-            dot += sight * n[d] / size
-            square += sight * sight
-        facing[i] = min(abs(dot) / max(np.sqrt(square), 1e-9), 1.0)
-    return out, facing
-
-
-@nb.njit(cache=True)
-def _on_cord(
-    points: FloatArray,
-    tangent: FloatArray,
-    u: FloatArray,
-    v: FloatArray,
-    radius: FloatArray,
-    seeds: FloatArray,
-    apex: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    out, facing = np.empty((len(seeds), 3)), np.empty(len(seeds))
-    for i in range(len(seeds)):
-        a = min(int(seeds[i, 0]), len(points) - 2)
-        x = seeds[i, 0] - a
-        r = (1 - x) * radius[a] + x * radius[a + 1]
-        dot = square = 0.0
-        for d in range(3):
-            p = (1 - x) * points[a, d] + x * points[a + 1, d]
-            across = seeds[i, 1] * ((1 - x) * u[a, d] + x * u[a + 1, d])
-            across += seeds[i, 2] * ((1 - x) * v[a, d] + x * v[a + 1, d])
-            out[i, d] = p + r * across
-            sight = p - apex[d]
-            dot += sight * ((1 - x) * tangent[a, d] + x * tangent[a + 1, d])
-            square += sight * sight
-        facing[i] = np.sqrt(max(1.0 - dot * dot / max(square, 1e-9), 0.0))
-    return out, facing
+TissuePart: TypeAlias = TissueSheet | Cord
+"""A piece of tissue that scatterers can be sown into."""

@@ -8,12 +8,13 @@ Positions are mm in the valve's own axes. Each part states what it does to sound
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.probe import Probe
+from mvest.imaging.simulator.acquisition import Acquisition, Probe
 from mvest.imaging.simulator.scatterers import Cord, Material, TissuePart, TissueSheet, normals
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.typing import FloatArray
@@ -21,15 +22,14 @@ from mvest.typing import FloatArray
 ROWS = 33
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Heart:
-    """Moving grids ``(T, R, C, 3)`` mm of inner surfaces, and lines of muscles.
+class Heart(NamedTuple):
+    """What lies around a valve, in motion: walls of the chambers and papillary muscles.
 
     Attributes
     ----------
-    ventricle, atrium, aorta : (T, R, C, 3)
-        Rows lead away from the valve, columns run around.
-    ventricle_thickness, atrium_thickness, aorta_thickness : (R, C)
+    ventricle, atrium, aorta : (T, R, C, 3) mm and (R, C) mm
+        Inner surface, whose rows lead away from the valve and whose columns run around, and
+        thickness of the wall.
     muscles : tuple of (T, m, 3)
         From each papillary tip to the ventricle's wall.
     muscle_radius : (m,)
@@ -37,12 +37,9 @@ class Heart:
         Share of the outflow tract in the ventricle's base, 0 (at the back) to 1.
     """
 
-    ventricle: FloatArray
-    atrium: FloatArray
-    aorta: FloatArray
-    ventricle_thickness: FloatArray
-    atrium_thickness: FloatArray
-    aorta_thickness: FloatArray
+    ventricle: tuple[FloatArray, FloatArray]
+    atrium: tuple[FloatArray, FloatArray]
+    aorta: tuple[FloatArray, FloatArray]
     muscles: tuple[FloatArray, ...]
     muscle_radius: FloatArray
     outflow: FloatArray
@@ -144,13 +141,11 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     wall *= 1 - 0.35 * _step((u - 0.75) / 0.25)
 
     muscles, fat = _muscles(valve, ventricle, rng)
+    atrium = _atrium(annulus, angle, apex, rng)
     return Heart(
-        ventricle,
-        _atrium(annulus, angle, apex, rng),
-        aorta,
-        np.maximum(wall, 2.0),
-        np.full((ROWS, len(angle)), rng.uniform(2.0, 3.2)),
-        np.full((len(along), len(around)), rng.uniform(1.6, 2.2)),
+        (ventricle, np.maximum(wall, 2.0)),
+        (atrium, np.full((ROWS, len(angle)), rng.uniform(2.0, 3.2))),
+        (aorta, np.full((len(along), len(around)), rng.uniform(1.6, 2.2))),
         muscles,
         fat,
         outflow[:, 0],
@@ -263,10 +258,10 @@ def _wall_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[
     wall, vessel = Material("wall", a.wall_db), Material("vessel", a.vessel_db)
     muscle = Material("papillary", a.papillary_db, specular=False)
     parts: list[TissuePart] = []
-    for material, points, thickness, span in (
-        (wall, heart.ventricle, heart.ventricle_thickness, (0.0, 1.0)),
-        (vessel, heart.atrium, heart.atrium_thickness, (-1.0, 0.0)),
-        (vessel, heart.aorta, heart.aorta_thickness, (-0.5, 0.5)),
+    for material, (points, thickness), span in (
+        (wall, heart.ventricle, (0.0, 1.0)),
+        (vessel, heart.atrium, (-1.0, 0.0)),
+        (vessel, heart.aorta, (-0.5, 0.5)),
     ):
         parts.append(
             TissueSheet(material, points, thickness, span, _mottled(thickness.shape, 2.0, rng))
@@ -281,14 +276,15 @@ def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list
     free = 1 - heart.outflow
     pericardium = Material("pericardium", a.vessel_db + 2.0)
     around = Material("surroundings", a.wall_db - 2.0, specular=False, fineness=0.5)
-    outside = heart.ventricle + heart.ventricle_thickness[..., None] * normals(heart.ventricle)
-    shape = heart.ventricle_thickness.shape
+    points, thickness = heart.ventricle
+    outside, shape = points + thickness[..., None] * normals(points), thickness.shape
     parts: list[TissuePart] = [
         TissueSheet(
             pericardium, outside, np.full(shape, 1.2), (0.0, 1.0), np.tile(free, (shape[0], 1))
         )
     ]
-    atrium = heart.atrium - heart.atrium_thickness[..., None] * normals(heart.atrium)
+    points, thickness = heart.atrium
+    atrium = points - thickness[..., None] * normals(points)
     # Close to the annulus the atrium's wall turns outward, and its normal into the ventricle.
     for points, side in ((outside, 1.0), (atrium[:, 4:], -1.0)):
         thickness = np.tile(0.02 + SURROUNDINGS_MM * free, (points.shape[1], 1))
@@ -353,45 +349,23 @@ class Echoes:
     loss: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Parts with their scatterers.
+class Sown(NamedTuple):
+    """A part with its scatterers.
 
     Attributes
     ----------
-    parts : tuple of TissuePart
-    seeds : tuple of (n, 3)
-        Material coordinates in each part.
-    strengths : tuple of (n,)
+    part : TissuePart
+    seeds : (n, 3)
+        Material coordinates.
+    strength : (n,)
         Amplitude of each scatterer, but for the angle.
-    losses : tuple of (n,)
-    acquisition : Acquisition
-    probe : Probe
+    loss : (n,)
     """
 
-    parts: tuple[TissuePart, ...]
-    seeds: tuple[FloatArray, ...]
-    strengths: tuple[FloatArray, ...]
-    losses: tuple[FloatArray, ...]
-    acquisition: Acquisition
-    probe: Probe
-
-    def echoes(self, frame: int) -> Echoes:
-        """The scatterers where they are in one frame."""
-        apex = self.probe.apex_in_valve
-        floor = 10 ** (self.acquisition.angle_floor_db / 20)
-        points, amplitudes = [], []
-        for part, seeds, strength in zip(self.parts, self.seeds, self.strengths, strict=True):
-            place, facing = part.place(frame, seeds, apex)
-            points.append(self.probe.to_probe(place))
-            if part.material.specular:
-                seen = floor + (1 - floor) * facing**self.acquisition.angle_exponent
-                amplitudes.append(strength * seen)
-            else:
-                amplitudes.append(strength)
-        return Echoes(
-            np.concatenate(points), np.concatenate(amplitudes), np.concatenate(self.losses)
-        )
+    part: TissuePart
+    seeds: FloatArray
+    strength: FloatArray
+    loss: FloatArray
 
 
 def cell_volume(acquisition: Acquisition, distance_mm: float) -> float:
@@ -402,27 +376,39 @@ def cell_volume(acquisition: Acquisition, distance_mm: float) -> float:
 
 def make_scene(
     valve: MovingValve, acquisition: Acquisition, probe: Probe, rng: np.random.Generator
-) -> Scene:
+) -> list[Sown]:
     """The heart around a valve with scatterers.
 
     Their number gives each resolution cell at the valve as many as the acquisition says; the number
     in thin tissue is a multiple, and all are at least 8 per part.
     """
+    a = acquisition
     heart = make_heart(valve, probe.apex_in_valve, rng)
-    parts = make_parts(valve, heart, acquisition, rng)
     distance = float(np.linalg.norm(probe.apex_in_valve))
-    density = acquisition.scatterers_per_cell / cell_volume(acquisition, distance)
-    seeds, strengths, losses = [], [], []
-    for part in parts:
+    density = a.scatterers_per_cell / cell_volume(a, distance)
+    more = max(a.attenuation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz, 0.0)
+    scene = []
+    for part in make_parts(valve, heart, a, rng):
         count = max(8, round(density * part.material.fineness * part.volume))
-        own = part.sow(rng, count)
+        seeds, strength, dense = part.sow(rng, count)
         share = part.volume / count
-        loss = acquisition.frequency_mhz * max(
-            acquisition.attenuation_db_per_cm_mhz - acquisition.blood_attenuation_db_per_cm_mhz,
-            0.0,
-        ) + acquisition.shadow_db_per_cm * part.density_of_shadow(own)
-        seeds.append(own)
+        loss = a.frequency_mhz * more + a.shadow_db_per_cm * dense
         level = 10 ** (part.material.echo_db / 20) * np.sqrt(share)
-        strengths.append(level * part.strength(own))
-        losses.append(share * loss)
-    return Scene(tuple(parts), tuple(seeds), tuple(strengths), tuple(losses), acquisition, probe)
+        scene.append(Sown(part, seeds, level * strength, share * loss))
+    return scene
+
+
+def scene_echoes(
+    scene: Sequence[Sown], frame: int, acquisition: Acquisition, probe: Probe
+) -> Echoes:
+    """The scatterers where they are in one frame."""
+    apex, floor = probe.apex_in_valve, 10 ** (acquisition.angle_floor_db / 20)
+    points, amplitudes = [], []
+    for part, seeds, strength, _ in scene:
+        place, facing = part.place(frame, seeds, apex)
+        points.append(probe.to_world(place))
+        if part.material.specular:
+            strength = strength * (floor + (1 - floor) * facing**acquisition.angle_exponent)
+        amplitudes.append(strength)
+    losses = np.concatenate([sown.loss for sown in scene])
+    return Echoes(np.concatenate(points), np.concatenate(amplitudes), losses)

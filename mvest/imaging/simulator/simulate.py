@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numba as nb
 import numpy as np
@@ -15,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
-from mvest.imaging.simulator.acquisition import Acquisition
-from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
-from mvest.imaging.simulator.probe import Probe
-from mvest.imaging.simulator.scene import Echoes, make_scene
+from mvest.imaging.simulator.acquisition import Acquisition, Probe
+from mvest.imaging.simulator.beams import BeamGrid, losses_of, render_window
+from mvest.imaging.simulator.scene import make_scene, scene_echoes
 from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
@@ -35,22 +35,14 @@ def compress(envelope: Float32Array, acquisition: Acquisition) -> Float32Array:
     return np.clip(level, 0, 255, out=level)
 
 
-def volume_frame(
-    acquisition: Acquisition, probe: Probe
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Spacing (3,), direction (3, 3) and origin (3,) of the volume.
+def volume_origin(acquisition: Acquisition) -> FloatArray:
+    """``(3,)`` mm: the volume is centred across the beam and begins at the nearest middle sample.
 
-    Its axes are azimuth, elevation and beam; it is centred across the beam and begins where the
-    nearest sample of the middle beam lies.
+    Its axes are those of the world: azimuth, elevation and beam.
     """
-    spacing = np.full(3, acquisition.voxel_mm)
     i, j, _ = acquisition.shape
-    corner = [
-        -0.5 * (i - 1) * acquisition.voxel_mm,
-        -0.5 * (j - 1) * acquisition.voxel_mm,
-        acquisition.depth_mm[0],
-    ]
-    return spacing, probe.axes, probe.apex + probe.axes @ np.array(corner)
+    across = (-0.5 * (i - 1) * acquisition.voxel_mm, -0.5 * (j - 1) * acquisition.voxel_mm)
+    return np.array([*across, acquisition.depth_mm[0]])
 
 
 def scan_convert(levels: Float32Array, grid: BeamGrid) -> NDArray[np.uint8]:
@@ -138,34 +130,33 @@ def simulate_volume(
     chosen = _chosen(valve, frames)
     if seed < 0:
         raise InputError(f"simulated volume, seed = {seed}, expected >= 0")
-    depth = probe.to_probe(np.zeros(3))[2]
-    if depth <= acquisition.depth_mm[0]:
+    about = probe.to_world(np.zeros(3))
+    if about[2] <= acquisition.depth_mm[0]:
         raise InputError(
-            f"simulated volume, probe: the valve lies {depth:.1f} mm along the beam, "
+            f"simulated volume, probe: the valve lies {about[2]:.1f} mm along the beam, "
             f"expected more than the nearest depth {acquisition.depth_mm[0]:g} mm"
         )
     rng = np.random.default_rng([seed, 0])
     scene = make_scene(valve, acquisition, probe, rng)
     grid = BeamGrid.of(acquisition)
-    beats = _displacements(acquisition, probe, rng)
-    contact = _contact(acquisition, rng)
+    beats = _displacements(acquisition, rng)
+    contact = acquisition.contact_db * rng.standard_normal((7, 7))
     out = np.empty((len(chosen), *acquisition.shape), dtype=np.uint8)
     envelope = np.empty(grid.shape, dtype=np.float32)
     for k, frame in enumerate(chosen):
         noise = np.random.default_rng([seed, 1, frame])
-        echoes = scene.echoes(frame)
-        losses = Losses.of(grid, echoes, contact)
-        for window, (turn, about, shift) in zip(grid.windows(), beats, strict=True):
+        echoes = scene_echoes(scene, frame, acquisition, probe)
+        losses = losses_of(grid, echoes, contact)
+        for window, turn, shift in zip(grid.windows(), *beats, strict=True):
             points = (echoes.points - about) @ turn.T + (about + shift)
-            moved = Echoes(points, echoes.amplitude, echoes.loss)
+            moved = replace(echoes, points=points)
             envelope[window[0] : window[1]] = render_window(grid, moved, losses, window, noise)
         out[k] = scan_convert(compress(envelope, acquisition), grid)
-    spacing, direction, origin = volume_frame(acquisition, probe)
     return VolumeSequence(
         out,
-        spacing,
-        direction,
-        origin,
+        np.full(3, acquisition.voxel_mm),
+        np.eye(3),
+        volume_origin(acquisition),
         np.asarray(valve.times[chosen]),
         Modality.ULTRASOUND,
         f"simulated: {valve.name}, seed {seed}",
@@ -202,23 +193,14 @@ def _chosen(valve: MovingValve, frames: Sequence[int] | None) -> list[int]:
 
 
 def _displacements(
-    acquisition: Acquisition, probe: Probe, rng: np.random.Generator
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Turn (3, 3), centre (3,) and shift (3,) of the scene in each beat, in the probe's axes.
+    acquisition: Acquisition, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Turns ``(B, 3, 3)`` about the valve and shifts ``(B, 3)`` of the scene in each beat.
 
     The mean shift is zero: the truth is the mean of the beats.
     """
-    about = probe.to_probe(np.zeros(3))
     turn = Rotation.from_rotvec(
         np.deg2rad(acquisition.beat_turn_deg) * rng.standard_normal((acquisition.beats, 3))
     ).as_matrix()
     shift = acquisition.beat_shift_mm * rng.standard_normal((acquisition.beats, 3))
-    shift -= shift.mean(axis=0)
-    if acquisition.beats == 1:
-        turn = np.eye(3)[None]
-    return [(turn[b], about, shift[b]) for b in range(acquisition.beats)]
-
-
-def _contact(acquisition: Acquisition, rng: np.random.Generator) -> FloatArray:
-    """Gain ``(7, 7)`` dB over the pyramid."""
-    return np.asarray(acquisition.contact_db * rng.standard_normal((7, 7)))
+    return turn if acquisition.beats > 1 else np.eye(3)[None], shift - shift.mean(axis=0)

@@ -31,9 +31,9 @@ from mvest.imaging.detection.trained_model import (
     load_model,
     save_model,
 )
-from mvest.imaging.simulator.acquisition import SMALL
 from mvest.simulation.trials import KINDS, WITHOUT_VALVE, Trial
 from tests.experiments.configured import composed, plain
+from tests.imaging.simulator.made_up_valve import SMALL
 
 STUDY = (
     "experiment=imaging",

@@ -11,15 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mvest.imaging.detection import leaflets, pose_search
 from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.pose_search import MODES
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.valve_sequence import MovingValve, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.template import Template
-from tests.made_up_sequence import leaflets
+from tests import made_up_sequence
 
 LAYOUT = ValveLayout(16, 7)
 FIT = FitSettings((10, 12, 12), (6.0, 4.0, 3.0))
@@ -39,7 +41,9 @@ def moving_valve(number, frames=4, layout=LAYOUT):
     phi, s = np.deg2rad(layout.phi), layout.s
     waves = np.stack([np.sin(phi) * s, np.cos(phi) * s, np.sin(2 * phi) * s, np.cos(2 * phi)], 1)
     closures = np.linspace(0, 1, frames) if frames > 1 else [0.5]
-    vertices = np.stack([leaflets(layout, c) * stretch + waves @ bump for c in closures])
+    vertices = np.stack(
+        [made_up_sequence.leaflets(layout, c) * stretch + waves @ bump for c in closures]
+    )
     tips = TIPS * stretch + rng.standard_normal((frames, 2, 3))
     return MovingValve(
         f"made up {number}",
@@ -208,8 +212,6 @@ def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
 
     Poses are rated `best` at most, and the boundary `seen`.
     """
-    from mvest.imaging.detection.shape_start import MODES
-
     layout = shape.layout
 
     def of(name):
@@ -233,15 +235,7 @@ def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
 
 def use_geometry(monkeypatch, truths):
     """Let every stage see geometry instead of ranks; places lie on a grid about the valve."""
-    from mvest.imaging.detection import (
-        boundary,
-        landmark_detector,
-        pose_search,
-        rim_detector,
-        shape_start,
-    )
-
-    for module in (boundary, landmark_detector, pose_search, rim_detector, shape_start):
+    for module in (leaflets, pose_search):
         monkeypatch.setattr(module, "features", geometry)
     ticks = np.arange(-30.0, 31.0, 6.0)
     grid = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)

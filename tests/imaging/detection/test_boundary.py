@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.detection import boundary
-from mvest.imaging.detection.boundary import BoundaryDetector, boundary_samples, leaflet_axes
+from mvest.imaging.detection import leaflets as module
+from mvest.imaging.detection.leaflets import boundary_samples, find_boundary, leaflet_axes
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from tests.imaging.detection.made_up import (
     LAYOUT,
     TIPS,
@@ -71,7 +71,7 @@ def test_the_gap_to_an_offset_surface_is_the_offset(distance):
     n = normals(x, FINE)
     inner = np.flatnonzero((FINE.s > 0.15) & (FINE.s < 0.85))
     true = TrueValve(x + distance * n, TIPS, poses(1))
-    gap = boundary._gap(x[inner], n[inner], inner, true, FINE)
+    gap = module._gap(x[inner], n[inner], inner, true, FINE)
     assert np.median(np.abs(gap - distance)) < 0.05
     # Near the commissures an offset surface folds.
     assert np.mean(np.abs(gap - distance) < 0.4) > 0.9
@@ -86,7 +86,7 @@ def test_the_gap_is_along_the_guess_normal_not_the_shortest():
     facing = normals(grid, LAYOUT)[at]
     slanted = (facing + np.array([[1.0, 0, 0]])) / np.sqrt(2)
     start = grid[at] - 1.0 * facing
-    gap = boundary._gap(start, slanted, at, true, LAYOUT)
+    gap = module._gap(start, slanted, at, true, LAYOUT)
     assert gap[0] == pytest.approx(np.sqrt(2), abs=1e-9)
 
 
@@ -94,13 +94,15 @@ def test_the_gap_is_along_the_guess_normal_not_the_shortest():
 def test_the_leaflets_are_found_along_their_normals(shape, reach, monkeypatch):
     # A sign, a step or a vertex lost between places and offsets is seen here; what is believed less
     # the farther it is comes out a little short.
-    monkeypatch.setattr(boundary, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     guess = placed(shape, poses(1, 3), np.zeros(2))
     n = normals(guess.vertices, LAYOUT)
     by = np.random.default_rng(0).uniform(-0.3 * reach, 0.3 * reach, LAYOUT.size)
     true = TrueValve(guess.vertices + by[:, None] * n, guess.tips, guess.pose)
-    detector = BoundaryDetector(boundary_oracle([true], LAYOUT))
-    found, offset, std, confidence = detector(NumberedFrame(), guess.vertices, LAYOUT, reach)
+    trees = {"boundary": boundary_oracle([true], LAYOUT)}
+    found, offset, std, confidence = find_boundary(
+        NumberedFrame(), trees, guess.vertices, LAYOUT, reach
+    )
     np.testing.assert_allclose(found, n, atol=1e-12)
     assert np.abs(offset - by).max() < 0.25
     assert np.all(confidence > 0.9)
@@ -110,17 +112,19 @@ def test_the_leaflets_are_found_along_their_normals(shape, reach, monkeypatch):
 @pytest.mark.parametrize("reach", [6.0, 3.3])
 def test_what_sees_nothing_pulls_nowhere_and_is_unsure(shape, reach, monkeypatch):
     # Places that reach farther to one side than to the other pull to that side.
-    monkeypatch.setattr(boundary, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     guess = placed(shape, poses(1, 3), np.zeros(2))
-    blind = BoundaryDetector(Oracle(1, lambda x: np.full((len(x), 1), 0.02)))
-    _, offset, std, confidence = blind(NumberedFrame(), guess.vertices, LAYOUT, reach)
+    blind = {"boundary": Oracle(1, lambda x: np.full((len(x), 1), 0.02))}
+    _, offset, std, confidence = find_boundary(
+        NumberedFrame(), blind, guess.vertices, LAYOUT, reach
+    )
     np.testing.assert_allclose(offset, 0, atol=1e-9)
     assert np.all(std > 0.3 * reach)
     np.testing.assert_allclose(confidence, 0.02)
 
 
 def test_samples_are_rated_by_their_distance_from_the_true_leaflet(shape, monkeypatch):
-    monkeypatch.setattr(boundary, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     true = placed(shape, poses(1, 5), 0.5 * shape.std[:6])
     x, y = boundary_samples(NumberedFrame(), true, shape, 720, np.random.default_rng(0))
     assert y.shape == (len(x), 1)

@@ -13,13 +13,14 @@ from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     REFINEMENTS,
     SCALE_MM,
-    PoseSearch,
-    PositionDetector,
     coarse_samples,
     fine_samples,
+    likely_places,
     pose_error,
     position_samples,
+    refined,
     refinement_samples,
+    search_poses,
 )
 from tests.imaging.detection.made_up import (
     NumberedFrame,
@@ -43,8 +44,9 @@ def true(shape, monkeypatch):
 
 
 def search(shape, true, share=0.8):
-    rating = rating_oracle([true], shape)
-    return PoseSearch(rating, rating, (refinement_oracle([true], share),) * 3)
+    rating, refinement = rating_oracle([true], shape), refinement_oracle([true], share)
+    steps = {f"pose_refine_{k}": refinement for k in range(len(REFINEMENTS))}
+    return {"pose_coarse": rating, "pose_fine": rating, **steps}
 
 
 def test_the_error_of_a_pose_is_how_far_it_lays_points_astray(shape, true):
@@ -56,23 +58,28 @@ def test_the_error_of_a_pose_is_how_far_it_lays_points_astray(shape, true):
     assert pose_error(about, true, shape)[0] > 20.0
 
 
-def test_the_search_finds_the_pose_from_places_nearby(shape, true):
+def searched(shape, true, places, count, monkeypatch, share=0.8):
+    monkeypatch.setattr(pose_search, "likely_places", lambda frame, trees, count: places)
+    return search_poses(NumberedFrame(), search(shape, true, share), count)
+
+
+def test_the_search_finds_the_pose_from_places_nearby(shape, true, monkeypatch):
     # Orientations tied to the wrong places, or the coarse rating taken upside down.
     rng = np.random.default_rng(0)
     places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0], [0, -25.0, 9.0]])
-    found, ratings = search(shape, true)(NumberedFrame(), places, 4)
+    found, ratings = searched(shape, true, places, 4, monkeypatch)
     assert len(found) == 4
     assert np.all(np.diff(ratings) <= 0)
     assert pose_error(found, true, shape)[0] < 1.0
     order = rng.permutation(3)
-    again, _ = search(shape, true)(NumberedFrame(), places[order], 1)
+    again, _ = searched(shape, true, places[order], 1, monkeypatch)
     assert pose_error(again, true, shape)[0] < 1.0
 
 
-def test_the_coarse_rating_alone_is_near_already(shape, true):
+def test_the_coarse_rating_alone_is_near_already(shape, true, monkeypatch):
     # Without refinement what the grid of orientations has: the best rated, not the worst.
     places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0]])
-    found, _ = search(shape, true, 0.0)(NumberedFrame(), places, 10)
+    found, _ = searched(shape, true, places, 10, monkeypatch, 0.0)
     assert np.all(pose_error(found, true, shape) < 16.0)
     assert pose_error(found, true, shape)[0] < 8.0
 
@@ -81,7 +88,7 @@ def test_refinement_takes_back_a_share_at_every_step(shape, true):
     # One step skipped, or a step applied in world axes, leaves more than this.
     start = true.pose.moved(np.array([[6.0, -4.0, 3.0, 0.3, -0.2, 0.3, 0.1]]))
     before = start.towards(true.pose)[0]
-    found, _ = search(shape, true, 0.5).refined(NumberedFrame(), start, 1)
+    found, _ = refined(NumberedFrame(), search(shape, true, 0.5), start)
     after = found.towards(true.pose)[0]
     np.testing.assert_allclose(after[6], before[6] / 8, atol=1e-9)
     assert np.linalg.norm(after[:3]) == pytest.approx(np.linalg.norm(before[:3]) / 8, rel=0.05)
@@ -89,16 +96,13 @@ def test_refinement_takes_back_a_share_at_every_step(shape, true):
 
 def test_ratings_belong_to_the_poses_they_come_with(shape, true):
     start = true.pose.repeated(3).moved(np.diag([9.0, 1.0, 4.0]) @ np.eye(3, 7))
-    rating = rating_oracle([true], shape)
-    still = PoseSearch(rating, rating, ())
-    found, ratings = still.refined(NumberedFrame(), start, 3)
-    np.testing.assert_allclose(found.centre, start.centre[[1, 2, 0]])
-    np.testing.assert_allclose(ratings, np.exp(-np.array([1.0, 4.0, 9.0]) / 6.0))
-    assert len(still.refined(NumberedFrame(), start, 1)[0]) == 1
+    found, ratings = refined(NumberedFrame(), search(shape, true, 0.0), start)
+    np.testing.assert_allclose(found.centre, start.centre)
+    np.testing.assert_allclose(ratings, np.exp(-np.array([9.0, 1.0, 4.0]) / 6.0))
 
 
-def test_no_places_give_no_poses(shape, true):
-    found, ratings = search(shape, true)(NumberedFrame(), np.zeros((0, 3)), 3)
+def test_no_places_give_no_poses(shape, true, monkeypatch):
+    found, ratings = searched(shape, true, np.zeros((0, 3)), 3, monkeypatch)
     assert len(found) == len(ratings) == 0
 
 
@@ -187,12 +191,11 @@ def test_the_best_place_is_first_and_others_are_apart(shape, monkeypatch):
     # Without suppression all places crowd about the first.
     true = placed(shape, poses(1, 2), np.zeros(2))
     use_geometry(monkeypatch, [true])
-    places, ratings = PositionDetector(position_oracle([true]))(NumberedFrame(), 6)
+    places = likely_places(NumberedFrame(), {"position": position_oracle([true])}, 6)
     assert places.shape == (6, 3)
     gap = np.linalg.norm(places - true.pose.centre, axis=1)
     assert np.argmin(gap) == 0
     assert gap[0] < 6.0
-    assert np.all(np.diff(ratings) <= 0)
     between = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(6, dtype=bool)]
     assert between.min() >= 0.8 * pose_search.NEAR_MM
 
@@ -200,17 +203,14 @@ def test_the_best_place_is_first_and_others_are_apart(shape, monkeypatch):
 def test_fewer_places_than_asked_for_are_all_there_are(monkeypatch):
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.array([[0.0, 0, 0], [1.0, 0, 0]]))
     monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    flat = Oracle(1, lambda x: x[:, :1])
-    places, ratings = PositionDetector(flat)(NumberedFrame(), 5)
-    np.testing.assert_array_equal(places, [[1.0, 0, 0]])
-    np.testing.assert_array_equal(ratings, [1.0])
+    flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
+    np.testing.assert_array_equal(likely_places(NumberedFrame(), flat, 5), [[1.0, 0, 0]])
 
 
 def test_nowhere_to_look_gives_no_places(monkeypatch):
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
-    places, ratings = PositionDetector(Oracle(1, lambda x: x[:, :1]))(NumberedFrame(), 5)
-    assert places.shape == (0, 3)
-    assert ratings.shape == (0,)
+    flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
+    assert likely_places(NumberedFrame(), flat, 5).shape == (0, 3)
 
 
 def test_places_are_voxels_of_the_field_of_view(frame):

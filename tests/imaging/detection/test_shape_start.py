@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from mvest.imaging.detection import shape_start
+from mvest.imaging.detection import pose_search
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.shape_start import MODES, ShapeStart, shape_start_samples
+from mvest.imaging.detection.pose_search import MODES, shape_start_samples, starting_shape
 from tests.imaging.detection.made_up import (
     NumberedFrame,
     geometry,
@@ -17,12 +17,11 @@ from tests.imaging.detection.made_up import (
 
 def test_coefficients_and_tips_come_back_as_they_were_learned(shape, monkeypatch):
     # What samples divide by the deviation or subtract is multiplied and added again.
-    monkeypatch.setattr(shape_start, "features", geometry)
+    monkeypatch.setattr(pose_search, "features", geometry)
     b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
     true = placed(shape, poses(1, 2), b)
-    found, tips = ShapeStart(start_oracle([true], shape, MODES))(
-        NumberedFrame(), true.pose.repeated(2), shape
-    )
+    trees = {"shape": start_oracle([true], shape, MODES)}
+    found, tips = starting_shape(NumberedFrame(), trees, true.pose.repeated(2), shape)
     assert found.shape == (2, MODES)
     np.testing.assert_allclose(found[1], b, atol=1e-9)
     np.testing.assert_allclose(tips[1], true.tips, atol=1e-9)
@@ -30,7 +29,7 @@ def test_coefficients_and_tips_come_back_as_they_were_learned(shape, monkeypatch
 
 def test_samples_show_the_valve_as_seen_from_a_missed_pose(shape, monkeypatch):
     # Seen from the true pose instead, all samples would say the same.
-    monkeypatch.setattr(shape_start, "features", geometry)
+    monkeypatch.setattr(pose_search, "features", geometry)
     b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
     true = placed(shape, poses(1, 2), b)
     x, y = shape_start_samples(NumberedFrame(), true, shape, 25, np.random.default_rng(1))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mvest.imaging.detection import pose_search, tracking
-from mvest.imaging.detection.detect import NoValveError, fit_frame, search_frame
-from mvest.imaging.detection.landmark_detector import landmark_points
+from mvest.imaging.detection.detect import NoValveError, fit_frame
+from mvest.imaging.detection.leaflets import landmark_points
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import PoseSearch, PositionDetector
+from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
@@ -32,6 +32,7 @@ from tests.imaging.detection.made_up import (
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
 TOLD = TrackingSettings(fit=FIT)
+STEPS = [f"pose_refine_{k}" for k in range(3)]
 UNSMOOTHED = replace(TOLD, smoothing_s=(0.0, 0.0, 0.0))
 
 
@@ -228,7 +229,8 @@ def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths):
     ]
     model = oracle_model(shape, truths)
     astray = oracle_model(shape, elsewhere)
-    model.poses, model.position = astray.poses, astray.position
+    for name in ("position", "pose_coarse", "pose_fine", *STEPS):
+        model.boosters[name] = astray.boosters[name]
     frames = [NumberedFrame(k) for k in range(4)]
     lost = tracking._trajectory(frames, TIMES, model, UNSMOOTHED, {})
     expected = np.concatenate([t.pose.centre for t in truths])
@@ -281,10 +283,11 @@ def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, tru
     wrong = rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
     rating = Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
     model = oracle_model(shape, truths)
-    model.poses = PoseSearch(rating, rating, ())
+    still = Oracle(7, lambda x: np.zeros((len(x), 7)))
+    model.boosters.update(dict.fromkeys(STEPS, still), pose_coarse=rating, pose_fine=rating)
     frames = [NumberedFrame(k) for k in range(4)]
-    model.position = PositionDetector(position_oracle([*truths[:2], far, truths[3]]))
-    alone = search_frame(frames[2], model, 1)[0]
+    model.boosters["position"] = position_oracle([*truths[:2], far, truths[3]])
+    alone = search_poses(frames[2], model.boosters, 1)[0]
     assert np.linalg.norm(alone.centre - far.pose.centre) < 6
     found = tracking._trajectory(frames, TIMES, model, UNSMOOTHED, {})
     expected = np.concatenate([t.pose.centre for t in truths])
@@ -315,20 +318,11 @@ def test_hypotheses_that_are_about_the_same_count_once():
 
 
 UNEVEN = np.array([0.0, 0.02, 0.03, 0.07, 0.08, 0.13, 0.15])
-S = np.array([0.0, 0.5, 1.0])
 
 
-def smooth(vertices, tips=None, weight=None, frame_weight=None, times=(0.06, 0.06, 0.06)):
-    count = len(UNEVEN)
-    return smooth_in_time(
-        UNEVEN,
-        vertices,
-        np.zeros((count, 2, 3)) if tips is None else tips,
-        np.ones(vertices.shape[:2]) if weight is None else weight,
-        np.ones(count) if frame_weight is None else frame_weight,
-        S,
-        times,
-    )
+def smooth(points, weight=None, times=(0.06, 0.06, 0.06)):
+    weight = np.ones(points.shape[:2]) if weight is None else weight
+    return smooth_in_time(UNEVEN, points, weight, np.asarray(times))
 
 
 def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
@@ -336,22 +330,18 @@ def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
     rng = np.random.default_rng(0)
     start, speed = rng.standard_normal((2, 3, 3)) * 10
     line = start + UNEVEN[:, None, None] * speed * 10
-    weight = rng.uniform(0.05, 1.0, (len(UNEVEN), 3))
-    vertices, tips = smooth(line, line[:, :2], weight, weight[:, 0])
-    np.testing.assert_allclose(vertices, line, atol=1e-7)
-    np.testing.assert_allclose(tips, line[:, :2], atol=1e-7)
+    found = smooth(line, rng.uniform(0.05, 1.0, (len(UNEVEN), 3)))
+    np.testing.assert_allclose(found, line, atol=1e-7)
 
 
 def test_no_smoothing_is_none_at_all():
     x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
-    vertices, tips = smooth(x, x[:, :2], times=(0.0, 0.0, 0.0))
-    np.testing.assert_array_equal(vertices, x)
-    np.testing.assert_array_equal(tips, x[:, :2])
-    # The annulus alone: the free edge stays as it is, what is in between moves a little.
+    np.testing.assert_array_equal(smooth(x, times=(0.0, 0.0, 0.0)), x)
+    # Each point by its own time.
     x = np.repeat(x[:, :1], 3, 1)
-    vertices, _ = smooth(x, times=(0.06, 0.0, 0.0))
-    np.testing.assert_allclose(vertices[:, 2], x[:, 2], atol=1e-9)
-    moved = np.abs(vertices - x).mean(axis=(0, 2))
+    found = smooth(x, times=(0.06, 0.03, 0.0))
+    np.testing.assert_allclose(found[:, 2], x[:, 2], atol=1e-9)
+    moved = np.abs(found - x).mean(axis=(0, 2))
     assert moved[0] > moved[1] > 0.01
 
 
@@ -361,19 +351,16 @@ def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
     x[3] = 5.0
     weight = np.ones((len(UNEVEN), 3))
     weight[3] = [1.0, 1.0, 0.01]
-    vertices, _ = smooth(x, weight=weight, times=(0.02, 0.02, 0.02))
-    assert vertices[3, 2, 0] < 0.5
-    assert vertices[3, 0, 0] > 2 * vertices[3, 2, 0]
-    assert np.abs(vertices[[0, 6], 2]).max() < 0.3
+    found = smooth(x, weight, (0.02, 0.02, 0.02))
+    assert found[3, 2, 0] < 0.5
+    assert found[3, 0, 0] > 2 * found[3, 2, 0]
+    assert np.abs(found[[0, 6], 2]).max() < 0.3
 
 
 def test_weights_count_relative_to_the_others():
     x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
-    rng = np.random.default_rng(1)
-    weight = rng.uniform(0.2, 1.0, (len(UNEVEN), 3))
-    np.testing.assert_allclose(
-        smooth(x, weight=weight)[0], smooth(x, weight=0.3 * weight)[0], atol=1e-9
-    )
+    weight = np.random.default_rng(1).uniform(0.2, 1.0, (len(UNEVEN), 3))
+    np.testing.assert_allclose(smooth(x, weight), smooth(x, 0.3 * weight), atol=1e-9)
 
 
 def test_fast_changes_go_and_slow_ones_stay():
@@ -381,9 +368,7 @@ def test_fast_changes_go_and_slow_ones_stay():
     times = 0.01 * np.arange(60)
     slow, fast = (np.sin(2 * np.pi * times / period) for period in (1.5, 0.03))
     x = np.stack([slow, fast, slow + fast], axis=1)[..., None] * np.ones(3)
-    found, _ = smooth_in_time(
-        times, x, np.zeros((60, 2, 3)), np.ones((60, 3)), np.ones(60), S, (0.06, 0.06, 0.0)
-    )
+    found = smooth_in_time(times, x, np.ones((60, 3)), np.full(3, 0.06))
     inner = slice(10, -10)
     np.testing.assert_allclose(found[inner, 0], x[inner, 0], atol=0.06)
     assert np.abs(found[inner, 1]).max() < 0.05
@@ -392,8 +377,5 @@ def test_fast_changes_go_and_slow_ones_stay():
 
 def test_two_frames_are_left_as_they_are():
     x = np.random.default_rng(0).standard_normal((2, 3, 3))
-    found, tips = smooth_in_time(
-        np.array([0.0, 0.1]), x, x[:, :2], np.ones((2, 3)), np.ones(2), S, (0.1, 0.1, 0.1)
-    )
+    found = smooth_in_time(np.array([0.0, 0.1]), x, np.ones((2, 3)), np.full(3, 0.1))
     np.testing.assert_array_equal(found, x)
-    np.testing.assert_array_equal(tips, x[:, :2])

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.imaging.detection.detect import fit_frame, search_frame
+from mvest.imaging.detection.detect import fit_frame
+from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from tests.imaging.detection.made_up import FIT
 
@@ -56,7 +57,7 @@ def test_shapes_and_accuracy_come_back(trained, loaded):
 def test_a_valve_is_found_alike(trained, loaded, seen_valve):
     # The whole way from a frame to a valve: a stage tied to the trees of another is seen here.
     frame, true = seen_valve
-    poses = [search_frame(frame, model, 2)[0] for model in (trained, loaded)]
+    poses = [search_poses(frame, model.boosters, 2)[0] for model in (trained, loaded)]
     np.testing.assert_array_equal(poses[0].centre, poses[1].centre)
     found = [fit_frame(frame, model, true.pose, FIT) for model in (trained, loaded)]
     np.testing.assert_allclose(found[0].vertices, found[1].vertices, atol=1e-2)
@@ -145,10 +146,6 @@ def spoiled(name):
     return of
 
 
-def without_a_stage(about):
-    del about["trees"]["free_edge"]
-
-
 BAD = {
     "another format": (told(lambda a: a.update(format="mvest case")), "'mvest case'"),
     "another version": (told(lambda a: a.update(version=99)), "99"),
@@ -164,17 +161,12 @@ BAD = {
     "nothing about itself": (lambda a: a.pop("about"), "about"),
     "no mean": (lambda a: a.pop("shape.mean"), "shape.mean"),
     "no trees": (lambda a: a.pop("trees.boundary.0"), "trees.boundary.0"),
-    "a stage missing": (told(without_a_stage), "free_edge"),
     "fewer deviations": (one_less("shape.std"), "shape"),
     "flat tips": (one_less("shape.tips"), "shape"),
     "flat modes": (one_less("shape.modes"), "shape"),
     "no numbers": (spoiled("shape.mean"), "shape"),
     "accuracy of another layout": (one_less("accuracy.std_mm"), "accuracy"),
     "half an accuracy": (lambda a: a.pop("accuracy.samples"), "accuracy.samples"),
-    "fewer outputs": (told(lambda a: a["trees"].update(annulus=1)), "annulus"),
-    "no outputs": (told(lambda a: a["trees"].update(boundary=0)), "boundary"),
-    "one region": (told(lambda a: a.update(region_names=["anterior"])), "region_names"),
-    "no outputs but words": (told(lambda a: a["trees"].update(boundary="one")), "boundary"),
     "no trees but words": (
         lambda a: a.update({"trees.boundary.0": np.frombuffer(b"tree", np.uint8)}),
         "boundary",
@@ -231,13 +223,6 @@ def test_damaged_files_are_refused(path, tmp_path, seed):
 def test_a_file_that_is_not_there_and_a_folder_are_refused(tmp_path):
     refused(tmp_path / "none.npz", "is missing")
     refused(tmp_path, "cannot be read")
-
-
-def test_a_model_without_all_stages_is_refused(trained):
-    boosters = dict(trained.boosters)
-    del boosters["landmark_4"], boosters["position"]
-    with pytest.raises(InputError, match="no trees for position, landmark_4"):
-        DetectionModel(trained.shape, boosters, {})
 
 
 def test_accuracy_is_kept_apart_from_shapes(trained):

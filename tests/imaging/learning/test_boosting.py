@@ -1,8 +1,9 @@
-"""Trees: what they learn, that they come back from text, and that no bad text reaches LightGBM."""
+"""Trees: what they learn, that they say what LightGBM says, and that no bad text is taken."""
 
 import pickle
 from dataclasses import replace
 
+import lightgbm
 import numpy as np
 import pytest
 
@@ -54,6 +55,15 @@ def test_texts_and_pickles_are_the_same_trees(trained):
         other(x[:, :5])
 
 
+@pytest.mark.parametrize("objective", ["regression", "cross_entropy"])
+def test_answers_are_those_of_lightgbm_to_the_last_bit(objective):
+    x, _ = samples(400)
+    y = 1.0 / (1.0 + np.exp(-x[:, :1].astype(float) * x[:, 1:2]))
+    trees = train_boosters(x, y, replace(SMALL, trees=60), 1, objective)
+    other = lightgbm.Booster(model_str=trees.texts[0]).predict(3 * x, num_threads=1)
+    np.testing.assert_array_equal(trees(3 * x)[:, 0], other)
+
+
 def test_probabilities_lie_between_0_and_1():
     # The sigmoid is part of what is kept: without it outputs are odds of any size.
     x, _ = samples()
@@ -64,13 +74,6 @@ def test_probabilities_lie_between_0_and_1():
     assert found.max() <= 1
     assert found[x[:, 0] > 0.3].mean() > 0.8
     assert found[x[:, 0] < -0.3].mean() < 0.2
-
-
-def test_samples_count_by_their_weight():
-    x, _ = samples()
-    y = np.where(np.arange(len(x)) % 2, 1.0, -1.0)[:, None]
-    weight = np.where(np.arange(len(x)) % 2, 100.0, 1.0)
-    assert train_boosters(x, y, SMALL, 1, weight=weight)(x).mean() > 0.8
 
 
 def test_no_samples_have_no_outputs(trained):
@@ -122,9 +125,7 @@ BAD = {
     "cut in the header": lambda t: t[:200],
     "without its end": lambda t: t.replace("end of trees\n", ""),
     "a tree fewer": lambda t: t[: t.index("Tree=3")] + "end of trees\n",
-    "sizes of trees": lambda t: spoiled(t, "tree_sizes", first("99999")),
     "another version": lambda t: spoiled(t, "version", lambda v: "v9"),
-    "more features": lambda t: spoiled(t, "max_feature_idx", lambda v: "900"),
     "several classes": lambda t: spoiled(t, "num_class", lambda v: "3"),
     "another objective": lambda t: spoiled(t, "objective", lambda v: "multiclass num_class:3"),
     "a feature that is not there": lambda t: spoiled(t, "split_feature", first("999999")),
@@ -142,17 +143,15 @@ BAD = {
     "categories": lambda t: spoiled(t, "num_cat", lambda v: "1"),
     "a split by category": lambda t: spoiled(t, "decision_type", first("1")),
     "linear leaves": lambda t: spoiled(t, "is_linear", lambda v: "1"),
-    "an unknown field": lambda t: t.replace("num_class=1", "num_class=1\nmonotone=1"),
 }
 
 
 @pytest.mark.parametrize("how", list(BAD))
-def test_a_malformed_text_is_refused_before_lightgbm_sees_it(trained, how, capfd):
-    # Several of these end the whole process in LightGBM 4, or let it read beyond its arrays.
+def test_a_malformed_text_is_refused(trained, how):
+    # Several of these would read beyond arrays, or go round without end.
     bad = BAD[how](trained.texts[0])
     assert bad != trained.texts[0]
     with pytest.raises(InputError, match=r"^model\.npz, annulus: no trees") as told:
         Boosters((bad,), "model.npz, annulus")
     assert "\n" not in str(told.value)
     assert len(str(told.value)) < 200
-    assert capfd.readouterr() == ("", "")

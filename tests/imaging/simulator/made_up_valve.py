@@ -3,10 +3,21 @@
 import numpy as np
 
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.valve.anatomy.template import Template
 
 FRAMES = 3
+
+SMALL = Acquisition(
+    axial_mm=2.2,
+    lateral_deg=4.0,
+    elevation_deg=5.0,
+    depth_mm=(4.0, 100.0),
+    voxel_mm=2.0,
+    shape=(48, 40, 48),
+)
+"""A coarse and fast scanner."""
 
 
 def made_up_valve() -> MovingValve:

@@ -4,9 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.imaging.simulator.acquisition import SMALL, Acquisition
-from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.beams import BeamGrid, losses_of, render_window
 from mvest.imaging.simulator.scene import Echoes, cell_volume
+from tests.imaging.simulator.made_up_valve import SMALL
 
 QUIET = replace(
     Acquisition(),
@@ -24,7 +25,7 @@ FLAT = np.zeros((3, 3))
 
 def render(acquisition, echoes, losses=None, seed=0):
     grid = BeamGrid.of(acquisition)
-    losses = losses or Losses.of(grid, echoes, FLAT)
+    losses = losses or losses_of(grid, echoes, FLAT)
     rng = np.random.default_rng(seed)
     return grid, render_window(grid, echoes, losses, (0, grid.azimuth.count), rng)
 
@@ -132,7 +133,7 @@ def slab(level):
 def test_attenuation_is_what_the_tissue_is_given_there_and_back():
     # 5 dB/cm over 1 cm, twice: 10 dB; a slanted beam runs through more of it.
     grid = BeamGrid.of(QUIET)
-    losses = Losses.of(grid, slab(5.0), FLAT)
+    losses = losses_of(grid, slab(5.0), FLAT)
     a = losses.start[0] + losses.step[0] * np.arange(losses.decibel.shape[0])
     e = losses.start[1] + losses.step[1] * np.arange(losses.decibel.shape[1])
     within = (a < -0.09) & (a > -0.3)
@@ -147,7 +148,7 @@ def test_attenuation_is_what_the_tissue_is_given_there_and_back():
 
 def test_there_is_shadow_behind_dense_tissue_and_nowhere_else():
     grid = BeamGrid.of(QUIET)
-    losses = Losses.of(grid, slab(10.0), FLAT)
+    losses = losses_of(grid, slab(10.0), FLAT)
     points = [[-8.0, 0.0, 60.0], [8.0, 0.0, 60.0], [-5.0, 0.0, 33.0]]
     for point, expected in zip(points, (-20.0 * np.hypot(1, 8 / 60), 0.0, 0.0), strict=True):
         _, plain = render(QUIET, echoes([point]))

@@ -31,7 +31,7 @@ def ring() -> Cord:
 
 @pytest.mark.parametrize("part", [tube(), ring()])
 def test_scatterers_move_with_the_tissue(part):
-    seeds = part.sow(np.random.default_rng(0), 500)
+    seeds, *_ = part.sow(np.random.default_rng(0), 500)
     first, _ = part.place(0, seeds, FAR)
     second, _ = part.place(1, seeds, FAR)
     # The ring's reference direction stays in space: along its axis, turned ones stay on it.
@@ -45,7 +45,7 @@ def test_scatterers_move_with_the_tissue(part):
 
 def test_a_sheet_fills_its_thickness_outside_of_its_grid():
     sheet = tube()
-    place, _ = sheet.place(0, sheet.sow(np.random.default_rng(0), 4000), FAR)
+    place, _ = sheet.place(0, sheet.sow(np.random.default_rng(0), 4000)[0], FAR)
     radius = np.linalg.norm(place[:, :2], axis=1)
     assert radius.min() > 19.9
     assert 21.8 < radius.max() < 22.01
@@ -57,8 +57,10 @@ def test_a_sheet_fills_its_thickness_outside_of_its_grid():
 
 
 def test_echoes_fade_away_from_the_grid_where_told():
-    seeds = np.array([[2.0, 3.0, 0.0], [2.0, 3.0, 1.0]])
-    np.testing.assert_allclose(tube().strength(seeds), [1, np.exp(-2)])
+    seeds, strength, dense = tube().sow(np.random.default_rng(0), 500)
+    np.testing.assert_allclose(strength, np.exp(-2 * seeds[:, 2]))
+    assert np.ptp(seeds[:, 2]) > 0.9
+    assert not dense.any()
 
 
 def test_facing_is_the_cosine_between_normal_and_line_of_sight():
@@ -70,7 +72,7 @@ def test_facing_is_the_cosine_between_normal_and_line_of_sight():
 
 def test_a_cord_is_round_and_seen_best_from_the_side():
     cord = ring()
-    seeds = cord.sow(np.random.default_rng(0), 3000)
+    seeds, *_ = cord.sow(np.random.default_rng(0), 3000)
     place, facing = cord.place(0, seeds, FAR)
     across = np.hypot(np.linalg.norm(place[:, :2], axis=1) - 10, place[:, 2])
     assert across.max() < 1.51
@@ -83,5 +85,7 @@ def test_a_cord_is_round_and_seen_best_from_the_side():
 
 def test_dense_tissue_is_where_the_cord_has_it():
     # Between the last point and the first one the closed line goes on.
-    share = ring().density_of_shadow(np.array([[0.0, 0, 0], [15.0, 0, 0], [59.9, 0, 0]]))
-    np.testing.assert_allclose(share, [1, 0, 1], atol=0.02)
+    seeds, strength, dense = ring().sow(np.random.default_rng(0), 2000)
+    np.testing.assert_allclose(dense, np.cos(2 * np.pi * seeds[:, 0] / 60) ** 2, atol=0.02)
+    assert seeds[:, 0].max() > 59.5
+    assert np.all(strength == 1)

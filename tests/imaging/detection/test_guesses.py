@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses, missed_shapes
+from mvest.imaging.detection.shape_model import Misses, TrueValve, missed_poses, missed_shapes
 from tests.imaging.detection.made_up import LAYOUT, TIPS, placed, poses
 from tests.made_up_sequence import leaflets
 

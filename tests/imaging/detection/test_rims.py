@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.detection import rim_detector
-from mvest.imaging.detection.rim_detector import RimDetector, rim_axes, rim_samples
+from mvest.imaging.detection import leaflets as module
+from mvest.imaging.detection.leaflets import RIMS, find_rim, rim_axes, rim_samples
+from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.truth import TrueValve
 from tests.imaging.detection.made_up import (
     LAYOUT,
     TIPS,
@@ -56,15 +56,16 @@ def test_away_is_the_direction_in_which_the_leaflet_ends():
         assert rim_axes(leaflets(fine, 1.0), fine, 0)[fine.column(phi), 2, 1] < 0.9
 
 
-@pytest.mark.parametrize("row", [0, -1])
-def test_the_rim_moves_to_where_votes_say_it_is(shape, row, monkeypatch):
+@pytest.mark.parametrize("rim", RIMS)
+def test_the_rim_moves_to_where_votes_say_it_is(shape, rim, monkeypatch):
     # Offsets taken along the wrong axes, or added twice in the second round, miss it.
-    monkeypatch.setattr(rim_detector, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     guess = placed(shape, poses(1, 3), np.zeros(2))
     by = 2.0 * np.random.default_rng(0).standard_normal((LAYOUT.size, 3))
     true = TrueValve(guess.vertices + by, guess.tips, guess.pose)
-    detector = RimDetector(row, rim_oracle([true], LAYOUT, row))
-    axes, offset, spread = detector(NumberedFrame(), guess.vertices, LAYOUT, 0.0)
+    row = RIMS[rim]
+    trees = {rim: rim_oracle([true], LAYOUT, row)}
+    axes, offset, spread = find_rim(NumberedFrame(), trees, rim, guess.vertices, LAYOUT, 0.0)
     at = LAYOUT.annulus if row == 0 else LAYOUT.free_edge
     expected = np.einsum("cij,ci->cj", axes[:, :, 1:], by[at])
     np.testing.assert_allclose(offset, expected, atol=1e-6)
@@ -74,19 +75,19 @@ def test_the_rim_moves_to_where_votes_say_it_is(shape, row, monkeypatch):
 
 def test_a_second_round_takes_back_what_the_first_left(shape, monkeypatch):
     # Votes that see three quarters of the way: one round leaves a quarter, two a sixteenth.
-    monkeypatch.setattr(rim_detector, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     guess = placed(shape, poses(1, 3), np.zeros(2))
     axes = rim_axes(guess.vertices, LAYOUT, 0)
     vertices = guess.vertices.copy()
     vertices[LAYOUT.annulus] += 3.0 * axes[:, :, 1]
     right = rim_oracle([TrueValve(vertices, guess.tips, guess.pose)], LAYOUT, 0)
-    short = RimDetector(0, Oracle(2, lambda x: 0.75 * right(x)))
-    _, offset, _ = short(NumberedFrame(), guess.vertices, LAYOUT, 0.0)
+    short = {"annulus": Oracle(2, lambda x: 0.75 * right(x))}
+    _, offset, _ = find_rim(NumberedFrame(), short, "annulus", guess.vertices, LAYOUT, 0.0)
     np.testing.assert_allclose(offset[:, 0], 3.0, atol=3.0 / 16 + 0.05)
 
 
 def test_some_wrong_votes_are_outvoted_and_told_by_the_spread(shape, monkeypatch):
-    monkeypatch.setattr(rim_detector, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     guess = placed(shape, poses(1, 3), np.zeros(2))
     right = rim_oracle([guess], LAYOUT, 0)
     rng = np.random.default_rng(1)
@@ -96,38 +97,38 @@ def test_some_wrong_votes_are_outvoted_and_told_by_the_spread(shape, monkeypatch
         wrong = rng.random(len(x)) < 0.2
         return said + wrong[:, None] * np.array([9.0, 9.0])
 
-    detector = RimDetector(0, Oracle(2, answer))
-    _, offset, spread = detector(NumberedFrame(), guess.vertices, LAYOUT, 0.0)
+    trees = {"annulus": Oracle(2, answer)}
+    _, offset, spread = find_rim(NumberedFrame(), trees, "annulus", guess.vertices, LAYOUT, 0.0)
     assert np.linalg.norm(offset, axis=1).mean() < 0.35
     assert np.all(spread > 0.2)
 
 
-@pytest.mark.parametrize("row", [0, -1])
-def test_samples_say_where_the_true_rim_is(shape, row, monkeypatch):
+@pytest.mark.parametrize("rim", RIMS)
+def test_samples_say_where_the_true_rim_is(shape, rim, monkeypatch):
     # Learning from candidates of one rim towards the other, or in world axes, is seen here.
-    monkeypatch.setattr(rim_detector, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     true = placed(shape, poses(1, 5), 0.5 * shape.std[:6])
     rng = np.random.default_rng(0)
-    x, y = rim_samples(NumberedFrame(), true, shape, row, 240, rng)
+    x, y = rim_samples(NumberedFrame(), true, shape, rim, 240, rng)
     assert y.shape == (len(x), 2)
     points, rotation, _, _ = seen(x)
     aim = points + np.einsum("pij,pj->pi", rotation[:, :, 1:], y)
-    rim = true.vertices.reshape(LAYOUT.rows, LAYOUT.columns, 3)[row]
+    there = true.vertices.reshape(LAYOUT.rows, LAYOUT.columns, 3)[RIMS[rim]]
     # The aim is abreast of the true rim's vertex: off it along the rim only.
-    gap = rim - aim[:, None]
+    gap = there - aim[:, None]
     off = np.linalg.norm(np.einsum("pij,pci->pcj", rotation[:, :, 1:], gap), axis=2).min(axis=1)
     assert np.all(np.abs(y) <= 8.0)
     free = np.abs(y).max(axis=1) < 8.0
     assert off[free].max() < 1e-6
-    assert np.linalg.norm(points[:, None] - rim, axis=2).min(axis=1).mean() < 6.0
+    assert np.linalg.norm(points[:, None] - there, axis=2).min(axis=1).mean() < 6.0
 
 
 def test_the_valves_own_tips_play_no_part(shape, monkeypatch):
-    monkeypatch.setattr(rim_detector, "features", geometry)
+    monkeypatch.setattr(module, "features", geometry)
     x = leaflets(LAYOUT, 0.3)
     a, b = TrueValve.of(x, TIPS, shape), TrueValve.of(x, TIPS - np.array([0, 0, 1.0]), shape)
     found = [
-        rim_samples(NumberedFrame(), true, shape, 0, 60, np.random.default_rng(2))[1]
+        rim_samples(NumberedFrame(), true, shape, "annulus", 60, np.random.default_rng(2))[1]
         for true in (a, b)
     ]
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
