@@ -1,0 +1,52 @@
+"""All files of other programs that are read, and the page of the documentation that lists them.
+
+``python -m tests.exchange.variants`` writes the page from the makers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.exchange.markup_variants import markup_variants
+from tests.exchange.surface_variants import surface_variants
+from tests.exchange.variant import Variant
+from tests.exchange.volume_variants import label_variants, volume_variants
+from tests.places import ROOT
+
+SURFACES = tuple(surface_variants())
+VOLUMES = tuple(volume_variants())
+LABELS = tuple(label_variants())
+MARKUPS = tuple(markup_variants())
+PAGE = ROOT / "docs" / "formats.md"
+HEAD = """# Formats that are read
+
+Each line stands for files that the tests make with the libraries that other programs write them
+with (VTK, trimesh, meshio, SimpleITK, nibabel, pynrrd, slicerio) and that mvest reads as they were
+written. A dot separates what can be combined. What a file does not state (units, times, which
+leaflet is which) is asked for in one line. Each library that reads a file runs in a process whose
+memory and time are bounded, so a damaged file costs one line.
+
+| format | variants | files tested |
+|---|---|---|
+"""
+
+
+def page() -> str:
+    """The page, a line for all variants of a format with the same number of options."""
+    rows: dict[tuple[str, int], list[Variant]] = {}
+    for variant in (*SURFACES, *VOLUMES, *LABELS, *MARKUPS):
+        rows.setdefault((variant.format, len(variant.options)), []).append(variant)
+    lines = [
+        f"| {form} | {_options(variants)} | {len(variants)} |"
+        for (form, _), variants in rows.items()
+    ]
+    return HEAD + "\n".join(lines) + "\n"
+
+
+def _options(variants: list[Variant]) -> str:
+    columns = zip(*(variant.options for variant in variants), strict=True)
+    return " · ".join(", ".join(dict.fromkeys(column)) for column in columns)
+
+
+if __name__ == "__main__":
+    Path(PAGE).write_text(page(), encoding="utf-8")

@@ -1,0 +1,211 @@
+"""Volumes and label maps in the variants that SimpleITK, nibabel, pynrrd and slicerio write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import nrrd
+import numpy as np
+import SimpleITK
+import slicerio
+from scipy.spatial.transform import Rotation
+
+from tests.exchange.variant import Variant
+
+SHAPE = (3, 16, 17, 21)
+SPACING = np.array([1.5, 1.25, 1.0])
+ORIGIN = np.array([-12.5, 4.0, 30.25])
+DIRECTION = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
+TIMES = np.array([0.0, 0.04, 0.08])
+"""s"""
+RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+AFFINE = np.eye(4)
+"""LPS"""
+AFFINE[:3, :3], AFFINE[:3, 3] = DIRECTION * SPACING, ORIGIN
+
+
+def frames(dtype: str = "uint8") -> np.ndarray:
+    """Voxels ``(T, I, J, K)``, different wherever axes are swapped."""
+    return np.random.default_rng(7).integers(0, 100, SHAPE).astype(dtype)
+
+
+def label_map() -> np.ndarray:
+    """Voxels ``(I, J, K)`` of an anterior (1) and a posterior leaflet (2)."""
+    result = np.zeros(SHAPE[1:], dtype=np.uint8)
+    result[3:8, 4:12, 5:15], result[8:14, 4:12, 5:15] = 1, 2
+    return result
+
+
+def itk(values: np.ndarray, step: float = 0.04) -> SimpleITK.Image:
+    """An image of three or, with time as the last, of four axes."""
+    image = SimpleITK.GetImageFromArray(
+        np.ascontiguousarray(values.transpose(*range(values.ndim - 3), -1, -2, -3)), isVector=False
+    )
+    more, size = values.ndim - 3, values.ndim
+    direction = np.eye(size)
+    direction[:3, :3] = DIRECTION
+    image.SetSpacing([*SPACING, *[step] * more])
+    image.SetOrigin([*ORIGIN, *[0.0] * more])
+    image.SetDirection(direction.ravel().tolist())
+    return image
+
+
+def by_itk(path: Path, what: str, dtype: str, packed: str) -> None:
+    values = frames(dtype)
+    image = itk(values if what == "4D" else values[0])
+    SimpleITK.WriteImage(image, str(path), packed == "compressed")
+
+
+def nifti(path: Path, version: str, dtype: str, more: str = "") -> None:
+    values = frames(dtype)
+    values = values[0] if more == "3D" else np.moveaxis(values, 0, 3)
+    kind = nibabel.Nifti2Image if version == "NIfTI-2" else nibabel.Nifti1Image
+    image = kind(values * 1.0 if more == "scaled" else values, RAS @ AFFINE)
+    if more in ("sform only", "qform only"):
+        image.set_sform(RAS @ AFFINE, code=int(more == "sform only"))
+        image.set_qform(RAS @ AFFINE, code=int(more == "qform only"))
+    image.set_data_dtype(dtype)
+    image.header.set_xyzt_units("mm", "sec" if more == "seconds" else "msec")
+    if more != "3D":
+        image.header["pixdim"][4] = 0.04 if more == "seconds" else 40
+    nibabel.save(image, path)
+
+
+def directions(axis: int | None) -> np.ndarray:
+    """Rows of ``space directions``: none for the axis of frames."""
+    rows = (DIRECTION * SPACING).T
+    return rows if axis is None else np.insert(rows, axis, np.nan, axis=0)
+
+
+def header(axis: int | None, encoding: str = "gzip") -> dict[str, Any]:
+    """As 3D Slicer writes it, with the frames along an axis or without frames."""
+    result: dict[str, Any] = {
+        "space": "left-posterior-superior",
+        "space directions": directions(axis),
+        "kinds": ["domain"] * 3,
+        "space origin": ORIGIN,
+        "encoding": encoding,
+    }
+    if axis is not None:
+        result["kinds"].insert(axis, "list")
+        for name, word in (("labels", "time"), ("units", "s")):
+            result[name] = [word if n == axis else "" for n in range(4)]
+        result[f"axis {axis} index type"] = "numeric"
+        result[f"axis {axis} index values"] = " ".join(map(str, TIMES))
+    return result
+
+
+def by_pynrrd(path: Path, frames_first: str, encoding: str, dtype: str) -> None:
+    axis = 0 if frames_first == "frames first" else 3
+    nrrd.write(str(path), np.moveaxis(frames(dtype), 0, axis), header(axis, encoding))
+
+
+def more_nrrd(path: Path, what: str) -> None:
+    """Conventions of Slicer's versions and of ITK."""
+    fields, values = header(0), frames()
+    if what == "RAS":
+        fields["space"] = "right-anterior-superior"
+        fields["space directions"] = directions(0) * [-1, -1, 1]
+        fields["space origin"] = ORIGIN * [-1, -1, 1]
+    elif what == "milliseconds":
+        fields["units"] = ["ms", "", "", ""]
+        fields["axis 0 index values"] = "0 40 80"
+    elif what == "multivolume":
+        for name in ("labels", "units", "axis 0 index type", "axis 0 index values"):
+            del fields[name]
+        fields["MultiVolume.FrameLabels"] = "0,40,80"
+        fields["MultiVolume.FrameIdentifyingDICOMTagUnits"] = "ms"
+    elif what == "slicerio sequence":
+        one = {"voxels": values[0], "ijkToLPS": AFFINE}
+        made = [one | {"voxels": frame} for frame in values]
+        slicerio.write_volume(str(path), slicerio.create_sequence(made, list(map(str, TIMES))))
+        return
+    elif what == "3D":
+        fields, values = header(None), values[0]
+    nrrd.write(str(path), values, fields)
+
+
+def segments(path: Path, what: str) -> None:
+    """A segmentation by slicerio, as Slicer has it since 4.11, or without its keys as before."""
+    made = slicerio.create_segmentation(SHAPE[1:], AFFINE)
+    for label, name in ((1, "mitral_anterior_leaflet"), (2, "mitral_posterior_leaflet")):
+        mask = label_map() == label
+        if what == "overlapping layers":
+            mask = np.roll(mask, 2 * (label == 1), axis=0)
+        slicerio.add_segment(made, mask, {"id": f"Segment_{label}", "name": name})
+    if what == "an empty layer":
+        made["voxels"] = np.stack([made["voxels"], np.zeros_like(made["voxels"])])
+        made["segments"].append({"id": "Segment_3", "name": "annulus", "labelValue": 1, "layer": 1})
+    slicerio.write_segmentation(str(path), made)
+    if what == "before 4.11":
+        values, fields = nrrd.read(str(path))
+        kept = {k: v for k, v in fields.items() if not k.endswith(("LabelValue", "Layer"))}
+        both = np.stack([values == label for label in (1, 2)]).astype(np.uint8)
+        kept |= {"kinds": ["list", *["domain"] * 3], "space directions": directions(0)}
+        nrrd.write(str(path), both, kept)
+
+
+def map_of_labels(path: Path, what: str) -> None:
+    """Labels 1 and 2 in a plain image."""
+    values = label_map()
+    if what in ("int64", "float32", "int16"):
+        values = values.astype(what)
+    if path.suffix == ".nrrd":
+        SimpleITK.WriteImage(itk(values), str(path))
+    elif what == "4D mostly empty":
+        image = nibabel.Nifti1Image(
+            np.stack([values * 0, values, values * 0], axis=3), RAS @ AFFINE
+        )
+        nibabel.save(image, path)
+    else:
+        nibabel.save(nibabel.Nifti1Image(values, RAS @ AFFINE), path)
+
+
+def volume_variants() -> Iterator[Variant]:
+    """Images, their times in s, in ms or without unit."""
+    for options in product(("NIfTI-1", "NIfTI-2"), ("uint8", "int16", "float32")):
+        for name in ("a.nii", "a.nii.gz"):
+            yield Variant("NIfTI", (*options, name[1:]), name, lambda p, o=options: nifti(p, *o))
+    for what in ("sform only", "qform only", "scaled", "seconds", "3D"):
+        yield Variant(
+            "NIfTI", (what,), "a.nii.gz", lambda p, w=what: nifti(p, "NIfTI-1", "int16", w)
+        )
+    for name, *options in product(
+        ("a.mha", "a.mhd"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
+    ):
+        yield Variant(
+            "MetaImage", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
+            given={"time_unit": "s"} if "4D" in options else {},
+        )  # fmt: skip
+    for name, *options in product(
+        ("a.nrrd", "a.nhdr"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
+    ):
+        yield Variant(
+            "NRRD by ITK", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
+            given={"time_unit": "s"} if "4D" in options else {},
+        )  # fmt: skip
+    for name, *options in product(
+        ("a.seq.nrrd", "a.nhdr"), ("frames first", "frames last"), ("raw", "gzip", "bzip2", "text"),
+        ("uint8", "int16", "float32"),
+    ):  # fmt: skip
+        yield Variant(
+            "NRRD by pynrrd", (name[1:], *options), name, lambda p, o=options: by_pynrrd(p, *o)
+        )
+    for what in ("RAS", "milliseconds", "multivolume", "slicerio sequence", "3D"):
+        yield Variant("NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w))
+
+
+def label_variants() -> Iterator[Variant]:
+    """Label maps of one frame, or of one that is not empty."""
+    for what in ("one layer", "overlapping layers", "an empty layer", "before 4.11"):
+        yield Variant(
+            "Slicer segmentation", (what,), "a.seg.nrrd", lambda p, w=what: segments(p, w)
+        )
+    for what in ("uint8", "int16", "int64", "float32"):
+        yield Variant("NRRD labels", (what,), "a.nrrd", lambda p, w=what: map_of_labels(p, w))
+    for what in ("uint8", "int16", "float32", "4D mostly empty"):
+        yield Variant("NIfTI labels", (what,), "a.nii.gz", lambda p, w=what: map_of_labels(p, w))
