@@ -10,8 +10,11 @@ from typing import Any
 import nibabel
 import nrrd
 import numpy as np
+import pydicom
 import SimpleITK
 import slicerio
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 from scipy.spatial.transform import Rotation
 
 from tests.exchange.variant import Variant
@@ -197,6 +200,42 @@ def volume_variants() -> Iterator[Variant]:
         )
     for what in ("RAS", "milliseconds", "multivolume", "slicerio sequence", "3D"):
         yield Variant("NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w))
+    for options in product(("explicit", "implicit"), ("preamble", "bare")):
+        yield Variant(
+            "Philips Cartesian DICOM", options, "a.dcm", lambda p, o=options: philips(p, *o)
+        )
+
+
+PHILIPS = "1.2.840.113543.6.6.1.3.10002"
+"""Class of Philips Cartesian DICOM: 3D echo over time in private fields, lengths in cm."""
+
+
+def philips(path: Path, syntax: str, start: str) -> None:
+    """As QLAB exports it; voxels of the class have no direction but their own axes."""
+    values = frames()
+    count, i, j, k = values.shape
+    data = Dataset()
+    data.SOPClassUID, data.Modality, data.FrameTime = PHILIPS, "US", "40"
+    data.PhysicalUnitsXDirection = data.PhysicalUnitsYDirection = 3
+    data.PhysicalDeltaX, data.PhysicalDeltaY, _ = SPACING / 10
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.NumberOfFrames, data.Rows, data.Columns = count, j, i
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
+    data.add_new((0x3001, 0x0010), "LO", "Philips3D")
+    for element, kind, value in ((1, "UL", k), (2, "US", 3), (3, "FD", SPACING[2] / 10)):
+        data.add_new((0x3001, 0x1000 + element), kind, value)
+    voxels = values.transpose(0, 3, 2, 1).tobytes()
+    data.add_new((0x7FE0, 0x0010), "OB", voxels + b"\0" * (len(voxels) % 2))
+    if start == "bare":
+        pydicom.dcmwrite(path, data, implicit_vr=syntax == "implicit", little_endian=True)
+        return
+    data.file_meta = FileMetaDataset()
+    data.file_meta.MediaStorageSOPClassUID = PHILIPS
+    data.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
+    data.file_meta.TransferSyntaxUID = (
+        ImplicitVRLittleEndian if syntax == "implicit" else ExplicitVRLittleEndian
+    )
+    pydicom.dcmwrite(path, data, enforce_file_format=True)
 
 
 def label_variants() -> Iterator[Variant]:
