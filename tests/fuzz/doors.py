@@ -22,7 +22,7 @@ from mvest.exchange.external.contract import (
 )
 from mvest.exchange.febio.positions import read_positions
 from mvest.exchange.markups import read_fcsv, read_markups
-from mvest.exchange.surfaces import read_regions
+from mvest.exchange.regions import read_regions
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
@@ -160,7 +160,7 @@ def one_region(path: Path) -> object:
 def volume(path: Path) -> object:
     """Times that a format states without a unit are seconds."""
     unit = {"time_unit": "s"} if path.suffix in (".mha", ".mhd") else {}
-    return read_volume(path, modality=Modality.MR, **unit)
+    return read_volume(path, modality=Modality.ULTRASOUND, **unit)
 
 
 DOORS: dict[str, Door] = {
@@ -175,7 +175,7 @@ DOORS: dict[str, Door] = {
     )),
     "surface.vtu": Door(leaflets, of(
         "VTU: text, plain, UInt32, LittleEndian, Int64",
-        "VTU: appended, LZ4, UInt64, LittleEndian, Int32",
+        "VTU: appended, zlib, UInt64, LittleEndian, Int32",
     )),
     "surface.vtk": Door(leaflets, of(
         "VTK: 4.2, text, int32, scalars", "VTK: 4.2, binary, uint8, a field",
