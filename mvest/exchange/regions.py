@@ -20,8 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.surfaces import read_surface
-from mvest.exchange.vtk_xml import SurfaceFile
+from mvest.exchange.surfaces import SurfaceFile, read_surface
 from mvest.reading.bounded import refusing
 from mvest.reading.text import MAX_NUMBER, one_line
 from mvest.typing import FloatArray, IntArray

@@ -1,4 +1,4 @@
-"""Reading and writing surfaces: VTK, STL, OBJ, PLY, GLB, time series for ParaView.
+"""Surfaces and meshes of others: VTK, STL, OBJ, PLY, GLB; time series for ParaView.
 
 Coordinates are mm. A file appears under its name only once it is complete.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.polygon_files import read_glb, read_obj, read_ply, read_stl
-from mvest.exchange.vtk_legacy import read_vtk
-from mvest.exchange.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
+from mvest.exchange.child import in_child
+from mvest.exchange.mesh_files import polydata, read_cells, vtk_module
 from mvest.files import write_atomically
-from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
 
 Data = Mapping[str, NDArray[np.generic]]
@@ -29,39 +28,73 @@ Data = Mapping[str, NDArray[np.generic]]
 WRITTEN_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
 SURFACE_SUFFIXES = (*WRITTEN_SUFFIXES, ".vtk", ".glb")
 """That are read."""
-
-
-_READERS = {
-    ".vtu": lambda path: _triangles(read_vtu(path)),
-    ".vtp": read_vtp,
-    ".vtk": read_vtk,
-    ".stl": read_stl,
-    ".obj": read_obj,
-    ".ply": read_ply,
-    ".glb": read_glb,
-}
 _WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
 """Formats that are written without data."""
 REGION_PREFIX = "region."
 
 
-def _input_path(path: Path | str, suffixes: tuple[str, ...]) -> Path:
-    result = Path(path)
-    _check_suffix(result, suffixes)
-    if not result.is_file():
-        raise InputError(f"{result}: no such file")
-    return result
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFile:
+    """A triangulated surface as it stands in a file.
+
+    Attributes
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)``.
+    point_data, cell_data
+        Named arrays with n or m rows; empty for STL and OBJ.
+    groups
+        Name of the group of each triangle, or of its object (OBJ, GLB); empty without any.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    point_data: Data = field(default_factory=dict)
+    cell_data: Data = field(default_factory=dict)
+    groups: tuple[str, ...] = ()
 
 
-def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Everything that a file of a surface or a mesh holds.
+
+    Attributes
+    ----------
+    points
+        ``(n, 3)`` in the unit of the file, all of them in their order; finite.
+    triangles
+        ``(m, 3)``, also those of strips and of polygons, which VTK cuts into triangles.
+    lines
+        Points ``(k,)`` of each line.
+    others
+        How many cells there are of each other type, by its name in VTK ("tetra", "wedge");
+        vertices by themselves are left out.
+    point_data, cell_data
+        Named arrays with a row for each point, or for each triangle.
+    field_data
+        Arrays, and texts of one word, that belong to the file as a whole.
+    space
+        "LPS" or "RAS", as 3D Slicer names the axes in a title, a comment or the field data; None
+        where nothing names them.
+    groups
+        As in `SurfaceFile`.
+    """
+
+    points: FloatArray
+    triangles: IntArray
+    lines: tuple[IntArray, ...]
+    others: Mapping[str, int]
+    point_data: Data
+    cell_data: Data
+    field_data: Mapping[str, Any]
+    space: str | None
+    groups: tuple[str, ...]
 
 
-def read_surface(path: Path | str) -> SurfaceFile:
-    """Read a triangulated surface with its data.
-
-    Whether it is closed or manifold is not checked here; see `mvest.valve.geometry.surface_checks`.
+def read_mesh(path: Path | str) -> Mesh:
+    """Read the points, triangles and lines of a file, in the child.
 
     Raises
     ------
@@ -69,39 +102,44 @@ def read_surface(path: Path | str) -> SurfaceFile:
         Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.vtk`` (legacy),
         ``.stl``, ``.obj``, ``.ply``, ``.glb``.
     GeometryError
-        No triangles, other cells, or points that are not finite.
+        Points that are not finite, or cells that name points that do not exist.
     """
-    source = _input_path(path, SURFACE_SUFFIXES)
-    with refusing(source, "surface"):
-        surface = _READERS[source.suffix.lower()](source)
-        check_finite(surface.vertices)
-        if len(surface.triangles) == 0:
-            raise GeometryError("no triangles; expected a triangulated surface")
-        if surface.triangles.min() < 0 or surface.triangles.max() >= len(surface.vertices):
-            raise GeometryError("triangles name points that do not exist")
-        for data, rows in (
-            (surface.cell_data, len(surface.triangles)),
-            (surface.point_data, len(surface.vertices)),
-        ):
-            for name, values in data.items():
-                if len(values) != rows:
-                    raise InputError(f"data {name!r} has {len(values)} rows, expected {rows}")
-        return surface
-
-
-def _triangles(file: CellFile) -> SurfaceFile:
-    others = sorted({name for name, _, _ in file.blocks} - {"triangle"})
-    if others:
-        raise GeometryError(f"holds cells of type {', '.join(others)}; expected triangles only")
-    blocks = [block for _, _, block in file.blocks] or [np.zeros((0, 3), dtype=np.int64)]
-    return SurfaceFile(file.points, np.concatenate(blocks), file.point_data, file.cell_data)
-
-
-def check_finite(points: FloatArray) -> None:
-    """Refuse points ``(n, 3)`` that are no numbers."""
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    source = Path(path)
+    _check_suffix(source, SURFACE_SUFFIXES)
+    found = in_child(read_cells, source, source.suffix.lower())
+    bad = np.flatnonzero(~np.isfinite(found["points"]).all(axis=1))
     if len(bad):
-        raise GeometryError(f"points {bad[:5].tolist()} are not finite numbers")
+        raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
+    group, names = found.pop("group"), found.pop("names")
+    groups = () if group is None else tuple(names[k] for k in group.tolist())
+    line_points, sizes = found.pop("line_points"), found.pop("line_sizes")
+    lines = tuple(np.split(line_points, np.cumsum(sizes)[:-1])) if len(sizes) else ()
+    return Mesh(**found, lines=lines, groups=groups)
+
+
+def read_surface(path: Path | str) -> SurfaceFile:
+    """Read a triangulated surface with its data; lines and single vertices beside it are left out.
+
+    Whether it is closed or manifold is not checked here; see `mvest.valve.geometry.surface_checks`.
+
+    Raises
+    ------
+    InputError, GeometryError
+        As `read_mesh`, no triangles, or cells of other types beside them.
+    """
+    mesh = read_mesh(path)
+    if mesh.others:
+        raise GeometryError(
+            f"{path}: holds cells of type {', '.join(mesh.others)}; expected triangles only"
+        )
+    if not len(mesh.triangles):
+        raise GeometryError(f"{path}: no triangles; expected a triangulated surface")
+    return SurfaceFile(mesh.points, mesh.triangles, mesh.point_data, mesh.cell_data, mesh.groups)
+
+
+def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
 
 
 def _checked_data(data: Data | None, rows: int, what: str) -> dict[str, NDArray[np.generic]]:
@@ -152,7 +190,7 @@ def write_surface(
         write_atomically(target, lambda file: _WRITERS[suffix](str(file), mesh))
     elif suffix == ".vtp":
         content = SurfaceFile(points, faces, at_points, at_cells)
-        write_atomically(target, lambda file: write_vtp(file, content))
+        write_atomically(target, lambda file: _write_vtp(file, content))
     else:
         arrays: dict[str, list[Any]] = {name: [values] for name, values in at_cells.items()}
         mesh = meshio.Mesh(points, [("triangle", faces)], point_data=at_points, cell_data=arrays)
@@ -160,6 +198,22 @@ def write_surface(
             target, lambda file: meshio.vtu.write(str(file), mesh, binary=True, compression="zlib")
         )
     return target
+
+
+def _write_vtp(path: Path, data: SurfaceFile, space: str = "") -> None:
+    """Write a ``.vtp`` file; 3D Slicer finds the name ``space`` of the axes in its field data."""
+    faces = (data.triangles.ravel(), np.full(len(data.triangles), 3))
+    surface = polydata(data.vertices, faces, None, data.point_data, data.cell_data)
+    if space:
+        words = vtk_module("vtkCommonCore").vtkStringArray()
+        words.SetName("SPACE")
+        words.InsertNextValue(space)
+        surface.GetFieldData().AddArray(words)
+    writer = vtk_module("vtkIOXML").vtkXMLPolyDataWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(surface)
+    if not writer.Write():
+        raise OSError(f"VTK's error {writer.GetErrorCode()}")
 
 
 def _check_triangles(points: FloatArray, cells: IntArray, name: str) -> None:
@@ -213,7 +267,7 @@ def write_surface_series(
             _checked_data(state.point_data, len(state.vertices), "point"),
             _checked_data(state.cell_data, len(state.triangles), "cell"),
         )
-        write_atomically(target, partial(write_vtp, data=content, space="LPS"))
+        write_atomically(target, partial(_write_vtp, data=content, space="LPS"))
     return _write_index(index, moments, names)
 
 

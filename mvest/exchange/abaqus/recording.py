@@ -34,7 +34,7 @@ from mvest.exchange.abaqus.mesh import (
     trace_cables,
     truss_stiffness,
 )
-from mvest.exchange.vtk_xml import read_vtu
+from mvest.exchange.surfaces import read_mesh
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.proximity import closest_points
@@ -352,11 +352,9 @@ def _read_frames(files: Sequence[Path], deck: Deck) -> FloatArray:
         raise InputError(f"{files[0]}: {len(files)} frames of {len(deck.nodes)} nodes are too many")
     result = np.empty((len(files), *deck.nodes.shape))
     for k, file in enumerate(files):
-        points = read_vtu(file).points
+        points = read_mesh(file).points
         if points.shape != deck.nodes.shape:
             raise InputError(f"{file}: {len(points)} points, the deck has {len(deck.nodes)} nodes")
-        if not np.isfinite(points).all():
-            raise InputError(f"{file}: points that are not finite")
         result[k] = points
     if np.abs(result[0] - deck.nodes).max() > TOLERANCE_MM:
         raise InputError(f"{files[0]}: points are not the nodes of the deck")

@@ -16,8 +16,7 @@ from mvest.cases.schema import CASE_FILE
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
 from mvest.exchange.segmentations import segment_name, voxelise_leaflets, write_segmentation
-from mvest.exchange.surfaces import region_arrays, write_surface_series
-from mvest.exchange.vtk_xml import SurfaceFile
+from mvest.exchange.surfaces import SurfaceFile, region_arrays, write_surface_series
 from mvest.files import write_atomically
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.volume import VolumeSequence

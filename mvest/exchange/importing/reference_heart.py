@@ -18,8 +18,7 @@ from mvest.cases.chord_layout import LeafletBand, assumed_closure, lay_out_chord
 from mvest.cases.frames import MM_PER
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.regions import part_of
-from mvest.exchange.surfaces import read_surface
-from mvest.exchange.vtk_xml import SurfaceFile
+from mvest.exchange.surfaces import SurfaceFile, read_surface
 from mvest.quantities import Length, Share, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout

@@ -208,7 +208,7 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     file = next(iter(folder.glob("*_MD_atrial_mitral_anterior*")))
     content = file.read_bytes()
     file.write_bytes(content[:2000])
-    refused(folder, "anterior_leaflet.vtk: ends within")
+    refused(folder, "anterior_leaflet.vtk: damaged")
     file.write_bytes(content)
     vtk = pytest.importorskip("vtk")
     sphere = vtk.vtkSphereSource()
