@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.exchange._images import fault
 from mvest.exchange.segmentations import checked_path
-from mvest.exchange.volumes.data import fault
 from mvest.files import write_atomically
 from mvest.reading.bounded import refusing
 from mvest.reading.text import MAX_NUMBER, check_words, number, read_bytes, read_text

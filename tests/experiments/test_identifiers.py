@@ -14,7 +14,7 @@ from experiments.common.records.record import stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.case import STUDY, Settings
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
 from tests.exchange.volumes import test_nifti, test_philips

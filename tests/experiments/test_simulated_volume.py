@@ -9,7 +9,7 @@ import pytest
 
 from experiments import cli, simulated_volume
 from mvest.exchange.surfaces import read_surface
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.volumes import read_volume
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import default_model
 from mvest.imaging.simulator.acquisition import Acquisition

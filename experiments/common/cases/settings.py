@@ -24,7 +24,7 @@ def _case(value: str, _beside: Mapping[str, Any]) -> Any:
 
 
 def _volume(value: str, _beside: Mapping[str, Any]) -> Any:
-    from mvest.exchange.volumes.data import files_of_volume
+    from mvest.exchange.volumes import files_of_volume
 
     return contents(files_of_volume(Path(value))) or value
 

@@ -26,7 +26,7 @@ from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.volumes import read_volume
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,

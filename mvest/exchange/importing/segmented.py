@@ -19,9 +19,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
 from mvest.errors import InputError, MvestError
 from mvest.exchange.surfaces import write_surface
-from mvest.exchange.volumes.nrrd_file import segment_names
-from mvest.exchange.volumes.reader import read_volume
-from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.exchange.volumes import LabelMap, read_labels
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import (
@@ -283,7 +281,7 @@ def import_labels(source: Path, options: LabelsOptions) -> ValveCase:
     if options.seam_mm is not None:
         seams = np.array(options.seam_mm, dtype=np.float64)
     for path, frame, role, own in maps:
-        volume = read_volume(path, modality=Modality.CT, labels=True)
+        volume = read_labels(path)
         masks = _masks(path, volume, frame, options, derived)
         try:
             surface, seams = _surface(volume, masks, own, seams, options, derived)
@@ -300,12 +298,12 @@ def import_labels(source: Path, options: LabelsOptions) -> ValveCase:
 
 def _masks(
     path: Path,
-    volume: VolumeSequence,
+    volume: LabelMap,
     frame: int,
     options: LabelsOptions,
     derived: list[str],
 ) -> tuple[BoolArray, BoolArray]:
-    segments = segment_names(path)
+    segments = volume.segments
     masks = []
     for region in REGIONS:
         given = getattr(options, region)
@@ -326,7 +324,8 @@ def _masks(
                     f"{path}: {len(chosen)} segments of the {region} leaflet among {names}; "
                     f"give {region}=NAME or its number"
                 )
-            label, layer = chosen[0].label, chosen[0].layer or frame
+            label = chosen[0].label
+            layer = chosen[0].layer if volume.is_layers else frame
             derived.append(
                 f"{region} leaflet: segment {one_line(chosen[0].name, 80)}, label {label}"
             )
@@ -349,7 +348,7 @@ def _masks(
 
 
 def _surface(
-    volume: VolumeSequence,
+    volume: LabelMap,
     masks: tuple[BoolArray, BoolArray],
     tips: FloatArray,
     seams: FloatArray | None,

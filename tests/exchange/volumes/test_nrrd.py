@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
 from tests.exchange.volumes import volumes as v
 

@@ -8,7 +8,7 @@ from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from mvest.errors import InputError
-from mvest.exchange.volumes.reader import read_volume
+from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange.volumes import volumes as v
 
