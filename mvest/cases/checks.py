@@ -7,9 +7,10 @@ and the field before them.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from unicodedata import normalize
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -48,19 +49,25 @@ def at(file: Path, field: str) -> Iterator[None]:
 
 def check_regions(file: Path, document: CaseFile) -> None:
     """Raise unless the regions have different names."""
-    names = list(document.region_names().values())
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise wrong(file, "regions", f"{twice[0]!r} occurs twice; expected different names")
+    _check_different(file, "regions", list(document.region_names().values()))
+
+
+def _check_different(file: Path, field: str, names: Sequence[str]) -> None:
+    """Raise unless names differ by more than Unicode normal form, case and spaces."""
+    seen: dict[str, str] = {}
+    for name in names:
+        key = " ".join(normalize("NFKC", name).casefold().split())
+        if key in seen:
+            alike = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
+            raise wrong(file, field, f"the name {name!r} {alike}; expected different names")
+        seen[key] = name
 
 
 def check_frames(file: Path, document: CaseFile) -> None:
     """Raise unless the frames' names, times, roles and numbers of tips go together."""
     frames = document.frames
     names = [frame.name for frame in frames]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise wrong(file, "frames", f"the name {twice[0]!r} occurs twice; expected different names")
+    _check_different(file, "frames", names)
     for number, (a, b) in enumerate(itertools.pairwise(frames), start=1):
         if b.time <= a.time:
             unit = document.units.time

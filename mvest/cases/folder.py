@@ -31,7 +31,6 @@ from mvest.cases.schema import (
     ChordaeEntry,
     ObservationEntry,
     PointData,
-    read_case_file,
 )
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
@@ -174,7 +173,7 @@ def read_case(path: Path | str) -> ValveCase:
         raise InputError(f"{folder.root}: no such folder; expected a folder with {CASE_FILE}")
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
-    document = read_case_file(folder.case)
+    document = folder.document()
     check_regions(folder.case, document)
     check_frames(folder.case, document)
     derived = list(document.derived)

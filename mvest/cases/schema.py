@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -28,14 +29,14 @@ MAX_TEXT, MAX_NAME = 10_000, 200
 
 
 def _kind(value: Any) -> str:
-    """Which alternative of a field a value belongs to; the angle brackets keep it out of names."""
+    """Which alternative of a field a value belongs to; no key of a file holds the character NUL."""
     if isinstance(value, dict):
-        return "<point data>" if "point_data" in value else "<mapping>"
+        return "\0point data" if "point_data" in value else "\0mapping"
     if isinstance(value, BaseModel):
-        return "<point data>" if isinstance(value, PointData) else "<mapping>"
+        return "\0point data" if isinstance(value, PointData) else "\0mapping"
     if isinstance(value, list):
-        return "<list>"
-    return "<text>" if isinstance(value, str) else "<number>"
+        return "\0list"
+    return "\0text" if isinstance(value, str) else "\0number"
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER, le=MAX_NUMBER)]
@@ -45,19 +46,19 @@ Name = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]
 Index = Annotated[int, Field(strict=True, ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Regions = Annotated[
-    Annotated[list[Name], Field(min_length=1), Tag("<list>")]
+    Annotated[list[Name], Field(min_length=1), Tag("\0list")]
     | Annotated[
-        dict[Annotated[int, Field(strict=True)], Name], Field(min_length=1), Tag("<mapping>")
+        dict[Annotated[int, Field(strict=True)], Name], Field(min_length=1), Tag("\0mapping")
     ],
     Discriminator(_kind),
 ]
 SurfaceFiles = Annotated[
-    Annotated[Name, Tag("<text>")]
-    | Annotated[dict[Name, Name], Field(min_length=1), Tag("<mapping>")],
+    Annotated[Name, Tag("\0text")]
+    | Annotated[dict[Name, Name], Field(min_length=1), Tag("\0mapping")],
     Discriminator(_kind),
 ]
 Curve = Annotated[
-    Annotated[Name, Tag("<text>")] | Annotated[list[Index], Field(min_length=3), Tag("<list>")],
+    Annotated[Name, Tag("\0text")] | Annotated[list[Index], Field(min_length=3), Tag("\0list")],
     Discriminator(_kind),
 ]
 
@@ -131,7 +132,7 @@ class ObservationEntry(_Model):
     """How well the vertices of a frame are seen."""
 
     std_mm: Annotated[
-        Annotated[Number, Field(gt=0), Tag("<number>")] | Annotated[PointData, Tag("<point data>")],
+        Annotated[Number, Field(gt=0), Tag("\0number")] | Annotated[PointData, Tag("\0point data")],
         Discriminator(_kind),
     ] = Field(
         description="standard deviation of a coordinate in mm, > 0: a number, or "
@@ -162,9 +163,9 @@ class CaseFile(_Model):
     )
     thickness: (
         Annotated[
-            Annotated[Number, Tag("<number>")]
-            | Annotated[PointData, Tag("<point data>")]
-            | Annotated[dict[Name, Number], Tag("<mapping>")],
+            Annotated[Number, Tag("\0number")]
+            | Annotated[PointData, Tag("\0point data")]
+            | Annotated[dict[Name, Number], Tag("\0mapping")],
             Discriminator(_kind),
         ]
         | None
@@ -180,7 +181,7 @@ class CaseFile(_Model):
     )
     chordae: (
         Annotated[
-            Annotated[Name, Tag("<text>")] | Annotated[ChordaeEntry, Tag("<mapping>")],
+            Annotated[Name, Tag("\0text")] | Annotated[ChordaeEntry, Tag("\0mapping")],
             Discriminator(_kind),
         ]
         | None
@@ -199,6 +200,20 @@ class CaseFile(_Model):
     def region_names(self) -> dict[int, str]:
         """Name of every label, in order."""
         return dict(enumerate(self.regions)) if isinstance(self.regions, list) else self.regions
+
+    def files(self) -> list[tuple[str, str]]:
+        """Field and name of every file that the case names."""
+        named: list[tuple[str, object]] = [
+            ("pressure_curve", self.pressure_curve),
+            ("chordae", getattr(self.chordae, "file", self.chordae)),
+            ("observation", getattr(self.observation, "error_samples", None)),
+        ]
+        for number, frame in enumerate(self.frames):
+            surface = frame.surface
+            surfaces = list(surface.values()) if isinstance(surface, dict) else [surface]
+            for name in (*surfaces, frame.annulus, frame.free_edge):
+                named.append((f"frames.{number}", name))
+        return [(where, name) for where, name in named if isinstance(name, str)]
 
 
 def case_schema() -> dict[str, Any]:
@@ -236,7 +251,7 @@ def read_case_file(file: Path) -> CaseFile:
 
 def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
     """Dotted field and a sentence for one of pydantic's errors."""
-    path = [part for part in loc if not (isinstance(part, str) and part.startswith("<"))]
+    path = [part for part in loc if not (isinstance(part, str) and part.startswith("\0"))]
     field = ".".join(str(part) for part in path)
     if kind == "extra_forbidden":
         model, _ = _place(path[:-1])
@@ -298,6 +313,10 @@ class CaseFolder:
         """The file with the fields, which every error names first."""
         return self.root / CASE_FILE
 
+    def document(self) -> CaseFile:
+        """The fields of the case; see `read_case_file`."""
+        return read_case_file(self.file(CASE_FILE, "link"))
+
     def file(self, name: str, where: str) -> Path:
         """The path of a file that a field names; it must lie in the folder."""
         given = Path(name)
@@ -320,7 +339,7 @@ class CaseFolder:
     def sha256(self) -> str:
         """Over names and contents of all used files, in the order of the names."""
         digest = hashlib.sha256()
-        for name, path in sorted({CASE_FILE: self.case, **self.used}.items()):
+        for name, path in sorted(self.used.items()):
             content = path.read_bytes()
             digest.update(f"{len(name.encode())} {name} {len(content)} ".encode())
             digest.update(content)
@@ -328,26 +347,9 @@ class CaseFolder:
 
 
 def files_of_case(root: Path) -> dict[str, Path]:
-    """Name -> file of all that reading a case folder can open, as far as it is there.
-
-    These are the file with the fields and whatever a text in it names, whichever field it is in.
-    """
-    files = {CASE_FILE: root / CASE_FILE}
-    try:
-        files |= {text: root / text for text in _texts(read_yaml(root / CASE_FILE))}
-        return {name: file for name, file in files.items() if file.is_file()}
-    except (InputError, OSError):
-        # It is refused when it is read.
-        return files
-
-
-def _texts(data: Any) -> Iterator[str]:
-    if isinstance(data, dict | list):
-        for item in data.values() if isinstance(data, dict) else data:
-            yield from _texts(item)
-    elif isinstance(data, str) and len(data) < MAX_FILE_NAME and not Path(data).is_absolute():
-        yield data
-
-
-MAX_FILE_NAME = 1024
-"""Characters; longer texts are descriptions."""
+    """Name -> file of all that reading a case folder opens, up to the first that is missing."""
+    folder = CaseFolder(root)
+    with suppress(InputError):  # it is refused when it is read
+        for where, name in folder.document().files():
+            folder.file(name, where)
+    return folder.used

@@ -211,6 +211,8 @@ class _Document:
                 if not _INTEGER.fullmatch(text):
                     raise InputError(f"{one_line(repr(text), 40)}, expected a decimal number")
                 return int(number(text))
+            if tag == "merge":
+                raise InputError("a merge key; write its fields out")
             if tag == "timestamp":
                 raise InputError(f"{text!r} is a date; put text in quotes")
             return number(text) if tag == "float" else check_words(text)

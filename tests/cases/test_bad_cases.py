@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.folder import read_case
+from mvest.cases.schema import files_of_case
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.surfaces import read_surface
 from tests.cases.folders import plain_folder, save, save_surface
@@ -452,6 +453,17 @@ CASES = {
     ),
     "two closed frames": (frame(2, "closed", 0.5), I, "frames", r"2 frames have the role closed"),
     "same name": (put("frames", 1, "name", "open"), I, "frames", "'open' occurs twice"),
+    **{
+        f"names that look the same: {what}": (
+            both(put("frames", 0, "name", "syst\u00f6le"), put("frames", 1, "name", name)),
+            I, "frames", "look the same; expected different names",
+        )
+        for what, name in (
+            ("normal form", "systo\u0308le"),
+            ("case", "SYST\u00d6LE"),
+            ("spaces", " syst\u00f6le "),
+        )
+    },
     "unknown role": (put("frames", 1, "role", "shut"), I, "frames.1.role", "found 'shut'"),
     "no frame": (put("frames", []), I, "frames", "a list of frames"),
     "a closed frame alone": (drop("frames", 0), I, "frames", r"0 frames .* reference \(none\)"),
@@ -557,6 +569,9 @@ CASES = {
     "no name of a frame": (drop("frames", 0, "name"), I, "frames.0.name", "is missing"),
     "a list of regions with a number": (put("regions", ["a", 1]), I, "regions.1", "found 1"),
     "regions of one name": (put("regions", ["a", "b", "a"]), I, "regions", "'a' occurs twice"),
+    "a merge key": (put("text", "version: 1\n<<: {name: x}\n"), I, "<<", "a merge key; write its"),
+    "a merge key in quotes": (put("<<", {"name": "x"}), I, "<<", "unknown key; expected one of"),
+    "a key like a kind": (put("<text>", 1), I, "<text>", "unknown key; expected one of"),
     "regions as text": (put("regions", "anterior"), I, "regions", "found 'anterior'; expected a"),
     "standard deviation 0": (
         put("observation", {"std_mm": 0, "correlation_length_mm": 1}),
@@ -601,3 +616,29 @@ def test_no_case_at_all(tmp_path, name):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"no such folder|no case\.yaml in this folder"):
         read_case(tmp_path / name)
+
+
+def test_a_case_that_is_a_link_out_of_its_folder(bad):
+    folder, document = bad
+    save(folder, document)
+    (folder / "case.yaml").rename(folder.parent / "elsewhere.yaml")
+    (folder / "case.yaml").symlink_to(folder.parent / "elsewhere.yaml")
+    with pytest.raises(InputError, match=r"case\.yaml: link: 'case\.yaml' leads out of the folder"):
+        read_case(folder)
+    assert files_of_case(folder) == {}
+
+
+def test_texts_are_no_files(bad):
+    folder, document = bad
+    (folder.parent / "secret.txt").write_text("secret")
+    (folder / "note.txt").write_text("note")
+    save(folder, document | {"description": "../secret.txt", "source": "note.txt"})
+    assert set(files_of_case(folder)) == {"case.yaml", "open.vtp", "closed.vtp", "chordae.csv"}
+    read_case(folder)
+
+
+def test_no_file_outside_the_folder_is_hashed(bad):
+    folder, document = bad
+    shutil.copy(folder / "closed.vtp", folder.parent)
+    put("frames", 1, "surface", "../closed.vtp")(folder, document)
+    assert "../closed.vtp" not in files_of_case(save(folder, document))

@@ -1,3 +1,5 @@
+"""Markups as Slicer and slicerio write them; what Slicer reads is read, the rest is refused."""
+
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -5,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from slicerio import markups
 
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, read_markups, write_markups
+from tests.places import field_input
 
 TIPS = PointList(("anterolateral", "posteromedial"), np.array([[1.5, -2, 3], [4, 5, -6.25]]))
 ANNULUS = PointList.numbered("annulus", np.arange(12.0).reshape(4, 3), "ClosedCurve")
@@ -19,123 +23,128 @@ def written(folder: Path) -> Path:
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     found = read_markups(written(tmp_path))
-    assert list(found) == ["tips", "annulus"]
-    for name, expected in (("tips", TIPS), ("annulus", ANNULUS)):
+    theirs = json.loads(written(tmp_path).read_text())["markups"]
+    assert list(found) == ["tips", "annulus"] == [item["name"] for item in theirs]
+    for item, (name, expected) in zip(theirs, (("tips", TIPS), ("annulus", ANNULUS)), strict=True):
         assert found[name].labels == expected.labels
-        assert found[name].kind == expected.kind
+        assert found[name].kind == expected.kind == item["type"]
         np.testing.assert_array_equal(found[name].points, expected.points)
-    np.testing.assert_array_equal(found["tips"].point("posteromedial"), [4, 5, -6.25])
+        assert (item["coordinateSystem"], item["coordinateUnits"]) == ("LPS", "mm")
+        for point, label, place in zip(
+            item["controlPoints"], expected.labels, expected.points, strict=True
+        ):
+            assert (point["label"], point["position"]) == (label, place.tolist())
+            assert point["positionStatus"] == "defined"
 
 
-def test_the_members_that_slicer_reads(tmp_path: Path) -> None:
-    content = json.loads(written(tmp_path).read_text())
-    assert content["@schema"].endswith("/Markups/Resources/Schema/markups-schema-v1.0.3.json#")
-    first = content["markups"][0]
-    assert (first["type"], first["name"]) == ("Fiducial", "tips")
-    assert (first["coordinateSystem"], first["coordinateUnits"]) == ("LPS", "mm")
-    point = first["controlPoints"][1]
-    assert point["label"] == "posteromedial"
-    assert point["position"] == [4, 5, -6.25]
-    assert point["positionStatus"] == "defined"
-    assert content["markups"][1]["type"] == "ClosedCurve"
-    assert content["markups"][1]["controlPoints"][0]["label"] == "annulus-1"
+def changed(path: Path, change: Callable[[Any], object]) -> Path:
+    content = json.loads(path.read_text())
+    change(content["markups"][0])
+    path.write_text(json.dumps(content))
+    return path
 
 
-def test_what_slicer_writes_in_ras(tmp_path: Path) -> None:
-    """As Slicer's documentation shows it: no units, no name, no more than positions and labels."""
-    path = tmp_path / "a.mrk.json"
-    path.write_text(
-        '{"@schema": "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/'
-        'Markups/Resources/Schema/markups-schema-v1.0.0.json#", "markups": [{"type": "Fiducial", '
-        '"coordinateSystem": "RAS", "controlPoints": [{"label": "F-1", "position": [1, 2, 3.5]}]}]}'
-    )
-    (found,) = read_markups(path).values()
-    np.testing.assert_array_equal(found.point("F-1"), [-1, -2, 3.5])
+def first(item: Any) -> Any:
+    return item["controlPoints"][0]
 
 
-def point(content: Any) -> Any:
-    return content["markups"][0]["controlPoints"][1]
-
-
-Change = Callable[[Any], object]
-BAD: dict[str, tuple[Change, str, str]] = {
-    "no schema": (lambda c: c.pop("@schema"), "@schema", "text"),
-    "another schema": (lambda c: c.update({"@schema": "x"}), "@schema", "markups-schema-v1"),
-    "no lists": (lambda c: c.update(markups=[]), "markups", "at least one list"),
-    "lists are none": (lambda c: c.update(markups={}), "markups", "a list"),
-    "a list is none": (lambda c: c.update(markups=[3]), "markups[0]", "an object"),
-    "a plane": (lambda c: c["markups"][0].update(type="Plane"), "markups[0].type", "Fiducial"),
-    "no system": (
-        lambda c: c["markups"][0].pop("coordinateSystem"),
-        "markups[0].coordinateSystem",
-        "LPS or RAS",
+READ: dict[str, tuple[Callable[[Any], object], list[list[float]], tuple[str, ...]]] = {
+    "no system is LPS": (lambda c: c.pop("coordinateSystem"), TIPS.points.tolist(), ()),
+    "RAS": (lambda c: c.update(coordinateSystem="RAS"), [[-1.5, 2, 3], [-4, -5, -6.25]], ()),
+    "no unit is mm": (lambda c: c.pop("coordinateUnits"), TIPS.points.tolist(), ()),
+    "a coded unit": (
+        lambda c: c.update(coordinateUnits=["cm", "UCUM", "centimeter"]),
+        (10 * TIPS.points).tolist(),
+        (),
     ),
-    "another system": (
-        lambda c: c["markups"][1].update(coordinateSystem="IJK"),
-        "markups[1].coordinateSystem",
-        "LPS or RAS",
-    ),
-    "micrometres": (
-        lambda c: c["markups"][0].update(coordinateUnits="um"),
-        "markups[0].coordinateUnits",
-        "mm",
-    ),
-    "the same name twice": (
-        lambda c: c["markups"][1].update(name="tips"),
-        "markups[1].name",
-        "another name",
-    ),
-    "no points": (
-        lambda c: c["markups"][0].update(controlPoints=[]),
-        "markups[0].controlPoints",
-        "at least one point",
-    ),
-    "no label": (
-        lambda c: point(c).pop("label"),
-        "markups[0].controlPoints[1].label",
-        "text",
-    ),
-    "the same label twice": (
-        lambda c: point(c).update(label="anterolateral"),
-        "markups[0].controlPoints[1].label",
-        "a label that no other point has",
-    ),
-    "two numbers": (
-        lambda c: point(c).update(position=[1, 2]),
-        "markups[0].controlPoints[1].position",
-        "three numbers",
-    ),
-    "no number": (
-        lambda c: point(c).update(position=[1, 2, True]),
-        "markups[0].controlPoints[1].position",
-        "three numbers",
-    ),
-    "not a number": (
-        lambda c: point(c).update(position=[1, 2, float("nan")]),
-        "markups[0].controlPoints[1].position",
-        "three numbers",
-    ),
+    "micrometres": (lambda c: c.update(coordinateUnits="um"), (TIPS.points / 1000).tolist(), ()),
+    # As Slicer writes a point that was listed and never placed.
     "not placed": (
-        lambda c: point(c).update(positionStatus="undefined"),
-        "markups[0].controlPoints[1].positionStatus",
-        "a point that was placed",
+        lambda c: first(c).update(position="", positionStatus="undefined"),
+        [[4, 5, -6.25]],
+        ("anterolateral",),
+    ),
+    "only shown": (
+        lambda c: first(c).update(positionStatus="preview"),
+        [[4, 5, -6.25]],
+        ("anterolateral",),
+    ),
+    "no position": (lambda c: first(c).pop("position"), [[4, 5, -6.25]], ("anterolateral",)),
+    "no point": (lambda c: c.update(controlPoints=[]), [], ()),
+    "no list of points": (lambda c: c.pop("controlPoints"), [], ()),
+    "one label twice": (lambda c: first(c).update(label="posteromedial"), TIPS.points.tolist(), ()),
+    "no label": (lambda c: first(c).pop("label"), TIPS.points.tolist(), ()),
+    "a line": (lambda c: c.update(type="Line"), TIPS.points.tolist(), ()),
+    "the name of another list": (lambda c: c.update(name="annulus"), TIPS.points.tolist(), ()),
+    "no number in a measurement": (
+        lambda c: c.update(measurements=[{"name": "length", "value": float("nan")}]),
+        TIPS.points.tolist(),
+        (),
     ),
 }
 
 
+@pytest.mark.parametrize("what", READ)
+def test_what_slicer_reads_is_read(tmp_path: Path, what: str) -> None:
+    change, expected, unplaced = READ[what]
+    found = list(read_markups(changed(written(tmp_path), change)).values())
+    assert len(found) == 2
+    np.testing.assert_allclose(found[0].points, np.reshape(expected, (-1, 3)))
+    assert found[0].unplaced == unplaced
+    np.testing.assert_array_equal(found[1].points, ANNULUS.points)
+
+
+@pytest.mark.parametrize("name", ["line_and_points.mrk.json", "no_system.mrk.json"])
+def test_field_inputs_are_read_as_slicer_reads_them(name: str) -> None:
+    path = field_input(name)
+    lists = list(read_markups(path).values())
+    theirs = json.loads(path.read_text())["markups"]
+    assert [item.kind for item in lists] == [item["type"] for item in theirs]
+    for item, expected in zip(lists, theirs, strict=True):
+        # LPS, as stated or by the schema's default.
+        assert expected.get("coordinateSystem", "LPS") == "LPS"
+        assert item.labels == tuple(point["label"] for point in expected["controlPoints"])
+        for point, place in zip(expected["controlPoints"], item.points, strict=True):
+            assert point["position"] == place.tolist()
+    assert next(iter(read_markups(path))) == name.removesuffix(".mrk.json")
+
+
+BAD: dict[str, tuple[Callable[[Any], object], str]] = {
+    "another system": (lambda c: c.update(coordinateSystem="IJK"), "markups.0.coordinateSystem"),
+    "another unit": (lambda c: c.update(coordinateUnits="inch"), "markups.0.coordinateUnits"),
+    "no kind": (lambda c: c.pop("type"), "markups.0.type"),
+    "two numbers": (lambda c: first(c).update(position=[1, 2]), "markups.0.controlPoints.0"),
+    "no number": (lambda c: first(c).update(position=[1, True, 2]), "markups.0.controlPoints.0"),
+    "text": (lambda c: first(c).update(position=[1, "2", 2]), "markups.0.controlPoints.0"),
+    "nan": (lambda c: first(c).update(position=[1, float("nan"), 2]), "markups.0.controlPoints.0"),
+    "far": (lambda c: first(c).update(position=[1, 10**400, 2]), "markups.0.controlPoints.0"),
+    "another status": (lambda c: first(c).update(positionStatus="x"), "markups.0.controlPoints.0"),
+    "no object": (lambda c: c.update(controlPoints=[3]), "markups.0.controlPoints.0"),
+}
+
+
 @pytest.mark.parametrize("what", BAD)
-def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
-    change, field, words = BAD[what]
-    path = written(tmp_path)
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+def test_a_bad_list_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
+    change, field = BAD[what]
+    path = changed(written(tmp_path), change)
     with pytest.raises(InputError) as caught:
         read_markups(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: {field}: ")
-    assert words in message.partition(", expected ")[2]
-    assert "\n" not in message
+    assert str(caught.value).startswith(f"{path}: {field}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}", "[]", "3", "[" * 10**5, '{"@schema": "markups-schema-v1.0.0.json#", "markups": []}',
+        '{"@schema": "x", "markups": [{"type": "Line"}]}', '{"markups": [{"type": "Line"}]}',
+    ],
+)  # fmt: skip
+def test_what_is_no_file_of_markups_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.mrk.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"a\.mrk\.json: "):
+        read_markups(path)
 
 
 def test_a_file_cut_anywhere_is_refused(tmp_path: Path) -> None:
@@ -143,8 +152,55 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for end in (len(whole) * n // 10 for n in range(10)):
         path.write_bytes(whole[:end])
-        with pytest.raises(InputError, match=r"a\.mrk\.json: content: .*, expected JSON"):
+        with pytest.raises(InputError, match=r"a\.mrk\.json: no JSON"):
             read_markups(path)
+
+
+HEAD = "# Markups fiducial file version = {}\n# CoordinateSystem = {}\n"
+COLUMNS = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+ROWS = 'F-1,1.5,-2,3,0,0,0,1,1,1,0,"A, P",,\n\nF-2,4,5,-6.25,0,0,0,1,1,1,0,AL,,vtkMRMLScalar\n'
+FCSV = {
+    "4.6": (HEAD.format("4.6", "0") + COLUMNS + ROWS, -1),
+    "4.10": (HEAD.format("4.10", "1") + COLUMNS + ROWS, 1),
+    "4.11": (HEAD.format("4.11", "RAS") + COLUMNS + ROWS, -1),
+    "5.6": (HEAD.format("5.6", "LPS") + COLUMNS + ROWS.replace("\n", "\r\n"), 1),
+    "no header": (ROWS, -1),
+    "3": ('# columns = label,x,y,z,sel,vis\n"A, P",1.5,-2,3,1,1\nAL,4,5,-6.25,1,1\n', -1),
+}
+
+
+@pytest.mark.parametrize("version", FCSV)
+def test_fcsv_of_every_version_is_read(tmp_path: Path, version: str) -> None:
+    text, sign = FCSV[version]
+    (tmp_path / "F.fcsv").write_bytes(text.encode())
+    found = read_markups(tmp_path / "F.fcsv")["F"]
+    assert found.labels == ("A, P", "AL")
+    np.testing.assert_array_equal(found.points, TIPS.points * [sign, sign, 1])
+
+
+@pytest.mark.parametrize("version", [name for name in FCSV if name[0] in "45"])
+def test_fcsv_and_json_of_slicerio_hold_the_same(tmp_path: Path, version: str) -> None:
+    source, target = tmp_path / "F.fcsv", tmp_path / "F.mrk.json"
+    source.write_text(FCSV[version][0].replace('"A, P"', "AP"))
+    markups.fcsv_to_markups_json(str(source), str(target))
+    (fcsv,), (converted,) = (read_markups(file).values() for file in (source, target))
+    assert fcsv.labels == converted.labels
+    np.testing.assert_array_equal(fcsv.points, converted.points)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("= LPS", "= IJK", "CoordinateSystem"),
+        ("4,5,", "4,x,", "position of point 2"),
+        (',3,0,0,0,1,1,1,0,"A, P",,', "", "position of point 1"),
+        ("x,y,z", "r,a,s", "position of point 1"),
+    ],
+)
+def test_a_bad_fcsv_is_refused_in_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+    (tmp_path / "F.fcsv").write_text((HEAD.format("5", "LPS") + COLUMNS + ROWS).replace(old, new))
+    with pytest.raises(InputError, match=rf"F\.fcsv: {words}"):
+        read_markups(tmp_path / "F.fcsv")
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
@@ -152,15 +208,8 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
         write_markups(tmp_path / "a.json", {"tips": TIPS})
     with pytest.raises(InputError, match="at least one"):
         write_markups(tmp_path / "a.mrk.json", {})
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="missing"):
         read_markups(tmp_path / "a.mrk.json")
-    for labels, points in (
-        (("a", "a"), np.zeros((2, 3))),
-        (("a", ""), np.zeros((2, 3))),
-        (("a",), np.zeros((2, 3))),
-        (("a",), np.full((1, 3), np.nan)),
-    ):
+    for points in (np.zeros((2, 3)), np.full((1, 3), np.nan)):
         with pytest.raises(InputError, match="expected"):
-            PointList(labels, points)
-    with pytest.raises(InputError, match="no point 'x', found anterolateral"):
-        TIPS.point("x")
+            PointList(("a",), points)

@@ -161,7 +161,8 @@ def detect_in_volume(
     """
     settings = settings or ImagedSettings()
     # What is asked for, before anything that takes long.
-    by_hand = _landmarks(settings)
+    said: list[str] = []
+    by_hand = _landmarks(settings, said)
     curve = _pressure_curve(settings)
     if estimate and not settings.states_pressure:
         raise InputError(
@@ -207,7 +208,7 @@ def detect_in_volume(
         valve,
         rows,
         frames,
-        replace(case, derived=(*case.derived, less)),
+        replace(case, derived=(*case.derived, less, *said)),
         settings,
         model.sha256,
         model.trained_on,
@@ -337,23 +338,33 @@ def _pressure_curve(settings: ImagedSettings) -> PressureCurve | None:
     return PressureCurve(table[:, 0], table[:, 1])
 
 
-def _landmarks(settings: ImagedSettings) -> dict[int, dict[str, FloatArray]] | None:
+def _landmarks(
+    settings: ImagedSettings, derived: list[str]
+) -> dict[int, dict[str, FloatArray]] | None:
     """Frame -> name -> position (mm), of the files that settings name."""
     landmarks: dict[int, dict[str, FloatArray]] = {}
     for frame, file in settings.landmarks:
-        points = {
-            label: item.points[k]
-            for name, item in read_markups(Path(file)).items()
+        lists = read_markups(Path(file))
+        mine = [
+            item
+            for name, item in lists.items()
             if item.kind == "Fiducial" and name != ANNULUS_LABELS
-            for k, label in enumerate(item.labels)
+        ]
+        points = {
+            label: point
+            for item in mine
+            for label, point in zip(item.labels, item.points, strict=True)
         }
         strange = sorted(set(points) - set(LANDMARKS))
-        if strange or not points:
+        if strange or not points or len(points) < sum(len(item.labels) for item in mine):
             raise InputError(
                 f"{file}: points {', '.join(strange) or 'none'}, expected some of "
-                f"{', '.join(LANDMARKS)}"
+                f"{', '.join(LANDMARKS)}, each once (lists {', '.join(lists)})"
             )
         landmarks[frame] = points
+        unplaced = [label for item in mine for label in item.unplaced]
+        if unplaced:
+            derived.append(f"landmarks of frame {frame}: {', '.join(unplaced)} not placed")
     return landmarks or None
 
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.parts import chord_lines
-from mvest.exchange.markups import TO_LPS, read_fcsv, read_markups
-from mvest.exchange.surfaces import Mesh, read_mesh
+from mvest.exchange.markups import TO_LPS, read_markups
+from mvest.exchange.surfaces import check_finite
+from mvest.exchange.vtk_legacy import PolyDataFile, read_polydata
 from mvest.reading.bounded import refusing
 from mvest.reading.text import numbers, read_columns
 from mvest.typing import FloatArray, IntArray
@@ -59,6 +60,7 @@ _TABLES = {
         *_LANDMARK,
     ),
 }
+_SPACE = re.compile(r"\bSPACE=(LPS|RAS)\b")
 _MUSCLES = (r"antero.?lateral|\bAL\b", r"postero.?medial|\bPM\b")
 """Of the two papillary muscles, in the order of a case's tips."""
 MAX_FILES = 2000
@@ -189,12 +191,14 @@ def _leaflets(
     return (chosen[0], chosen[1]), notes
 
 
-def _model(file: Path, notes: list[str]) -> Mesh:
+def _model(file: Path, notes: list[str]) -> PolyDataFile:
     """A model with its points in LPS."""
-    model = read_mesh(file)
-    if model.space is None:
+    model = read_polydata(file)
+    space = _SPACE.search(model.title)
+    if space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return replace(model, points=model.points * TO_LPS[model.space or "RAS"])
+    check_finite(model.points)
+    return replace(model, points=model.points * TO_LPS[space[1] if space else "RAS"])
 
 
 def _rows(folder: Path, beside: Path, name: str) -> tuple[Path, dict[str, list[str]]] | None:

@@ -41,8 +41,9 @@ def test_landmarks_are_read_back_in_place(tmp_path):
     named = lists["landmarks"]
     assert named.labels == LANDMARKS
     middle = valve.vertices[1, SMALL.vertex(90, -1)]
-    np.testing.assert_allclose(named.point("free_edge_anterior"), middle)
-    np.testing.assert_allclose(named.point("tip_180"), valve.tips[1, 1])
+    points = dict(zip(named.labels, named.points, strict=True))
+    np.testing.assert_allclose(points["free_edge_anterior"], middle)
+    np.testing.assert_allclose(points["tip_180"], valve.tips[1, 1])
     assert lists["annulus"].kind == "ClosedCurve"
     np.testing.assert_allclose(lists["annulus"].points, valve.annulus[1])
     np.testing.assert_allclose(lists["free edge"].points, valve.free_edge[1])

@@ -83,7 +83,9 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
     file = folder / "a.npz"
     file.write_text("1")
     if name == "case":
-        (folder / "case.yaml").write_text("frames: [{surface: {file: a.npz}}]")
+        frame = "{name: a, time: 0, role: reference, surface: a.npz, papillary_tips: [[0, 0, 0]]}"
+        text = f"version: 1\nname: a\nunits: {{length: mm}}\nregions: [a]\nframes: [{frame}]\n"
+        (folder / "case.yaml").write_text(text)
         return str(folder), file
     if name == "donor.recording":
         # Without the name of a case it is the folder itself.
@@ -113,9 +115,9 @@ def test_what_lies_there_is_in_the_hash(given, study, name):
     assert hash_of(configuration(study, name, value)) not in (first, changed)
     # A link that leads elsewhere now.
     for content in "12":
-        (given.parent / content).write_text(content)
+        (given / content).write_text(content)
         file.unlink(missing_ok=True)
-        file.symlink_to(given.parent / content)
+        file.symlink_to(given / content)
         assert hash_of(configuration(study, name, value)) == (first if content == "1" else changed)
 
 
