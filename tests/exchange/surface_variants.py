@@ -108,7 +108,7 @@ def xml(path: Path, mode: str, packed: str, header: str, order: str, ids: str) -
 
 
 def more_xml(path: Path, what: str) -> None:
-    """Other cells beside or in place of the triangles, other types, several pieces."""
+    """Other cells beside or in place of the triangles, other types."""
     writer = vtkXMLPolyDataWriter()
     data = vtk_data(points="float32" if what == "single precision" else "float64")
     if what == "int8 labels":
@@ -124,8 +124,6 @@ def more_xml(path: Path, what: str) -> None:
     elif what == "triangle strips":
         data = vtk_data(cells=TRIANGLES[:1], labels=[1, 2])
         data.SetStrips(vtk_cells([STRIP]))
-    elif what == "two pieces":
-        writer.SetNumberOfPieces(2)
     saved(writer, data, path)
 
 
@@ -271,8 +269,10 @@ OBJ: dict[str, list[str]] = {
 
 
 def obj_of_library(path: Path, what: str) -> None:
-    if what == "VTK":
+    if what.startswith("VTK"):
         saved(vtkOBJWriter(), vtk_data(), path)
+        if what == "VTK with tabs":
+            path.write_text(path.read_text().replace(" ", "\t"))
     elif what == "trimesh":
         trimesh.Trimesh(POINTS, TRIANGLES, process=False).export(path)
     else:
@@ -299,7 +299,7 @@ def surface_variants() -> Iterator[Variant]:
     for kind, (way, ids) in product(("vtp", "vtu"), product(ways, ("Int32", "Int64"))):
         yield Variant(kind.upper(), (*way, ids), f"a.{kind}", lambda p, o=(*way, ids): xml(p, *o))
     for what in ("single precision", "int8 labels", "labels of points", "boundary lines",
-                 "triangle strips", "two pieces", "quads"):  # fmt: skip
+                 "triangle strips", "quads"):  # fmt: skip
         yield Variant("VTP", (what,), "a.vtp", lambda p, w=what: more_xml(p, w))
     kinds = ("int8", "uint8", "int16", "int32", "int64", "vtkIdType", "float32", "float64")
     for options in product(("4.2", "5.1"), ("text", "binary"), kinds, ("scalars", "a field")):
@@ -332,7 +332,7 @@ def surface_variants() -> Iterator[Variant]:
             lambda p, t=text: p.write_bytes(t.encode("latin-1")),
             labels="anterior" in text,
         )
-    for what in ("VTK", "trimesh", "meshio"):
+    for what in ("VTK", "VTK with tabs", "trimesh", "meshio"):
         yield Variant("OBJ", (what,), "a.obj", lambda p, w=what: obj_of_library(p, w), labels=False)
     for what in ("one mesh", "objects", "objects that nodes place"):
         yield Variant("GLB", (what,), "a.glb", lambda p, w=what: glb(p, w), labels="ob" in what)

@@ -84,6 +84,9 @@ def directions(axis: int | None) -> np.ndarray:
     return rows if axis is None else np.insert(rows, axis, np.nan, axis=0)
 
 
+TEXT_INDEX = ("phases as text", "slicerio, phases as text")
+
+
 def header(axis: int | None, encoding: str = "gzip") -> dict[str, Any]:
     """As 3D Slicer writes it, with the frames along an axis or without frames."""
     result: dict[str, Any] = {
@@ -122,10 +125,15 @@ def more_nrrd(path: Path, what: str) -> None:
             del fields[name]
         fields["MultiVolume.FrameLabels"] = "0,40,80"
         fields["MultiVolume.FrameIdentifyingDICOMTagUnits"] = "ms"
-    elif what == "slicerio sequence":
-        one = {"voxels": values[0], "ijkToLPS": AFFINE}
-        made = [one | {"voxels": frame} for frame in values]
-        slicerio.write_volume(str(path), slicerio.create_sequence(made, list(map(str, TIMES))))
+    elif what == "phases as text":
+        del fields["units"]
+        fields |= {"axis 0 index type": "text", "axis 0 index values": "ED mid%20systole ES"}
+    elif what.startswith("slicerio"):
+        made = [{"voxels": frame, "ijkToLPS": AFFINE} for frame in values]
+        times: dict[str, Any] = {"index_values": list(map(str, TIMES))}
+        if what == "slicerio, phases as text":
+            times = {"index_values": ["ED", "mid", "ES"], "index_type": "text", "index_unit": ""}
+        slicerio.write_volume(str(path), slicerio.create_sequence(made, **times))
         return
     elif what == "3D":
         fields, values = header(None), values[0]
@@ -153,57 +161,20 @@ def segments(path: Path, what: str) -> None:
 
 
 def map_of_labels(path: Path, what: str) -> None:
-    """Labels 1 and 2 in a plain image."""
+    """Labels 1 and 2 in a plain image, or among empty frames."""
     values = label_map()
-    if what in ("int64", "float32", "int16"):
+    if what in ("int16", "int64", "float32", "float64"):
         values = values.astype(what)
-    if path.suffix == ".nrrd":
-        SimpleITK.WriteImage(itk(values), str(path))
-    elif what == "4D mostly empty":
-        image = nibabel.Nifti1Image(
-            np.stack([values * 0, values, values * 0], axis=3), RAS @ AFFINE
-        )
+    if what in ("4D in ms", "4D without a unit"):
+        image = nibabel.Nifti1Image(np.stack([values * 0, values, values * 0], 3), RAS @ AFFINE)
+        if what == "4D in ms":
+            image.header.set_xyzt_units("mm", "msec")
+            image.header["pixdim"][4] = 40
         nibabel.save(image, path)
+    elif path.suffix == ".gz":
+        nibabel.save(nibabel.Nifti1Image(values, RAS @ AFFINE, dtype=values.dtype), path)
     else:
-        nibabel.save(nibabel.Nifti1Image(values, RAS @ AFFINE), path)
-
-
-def volume_variants() -> Iterator[Variant]:
-    """Images, their times in s, in ms or without unit."""
-    for options in product(("NIfTI-1", "NIfTI-2"), ("uint8", "int16", "float32")):
-        for name in ("a.nii", "a.nii.gz"):
-            yield Variant("NIfTI", (*options, name[1:]), name, lambda p, o=options: nifti(p, *o))
-    for what in ("sform only", "qform only", "scaled", "seconds", "3D"):
-        yield Variant(
-            "NIfTI", (what,), "a.nii.gz", lambda p, w=what: nifti(p, "NIfTI-1", "int16", w)
-        )
-    for name, *options in product(
-        ("a.mha", "a.mhd"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
-    ):
-        yield Variant(
-            "MetaImage", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
-            given={"time_unit": "s"} if "4D" in options else {},
-        )  # fmt: skip
-    for name, *options in product(
-        ("a.nrrd", "a.nhdr"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
-    ):
-        yield Variant(
-            "NRRD by ITK", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
-            given={"time_unit": "s"} if "4D" in options else {},
-        )  # fmt: skip
-    for name, *options in product(
-        ("a.seq.nrrd", "a.nhdr"), ("frames first", "frames last"), ("raw", "gzip", "bzip2", "text"),
-        ("uint8", "int16", "float32"),
-    ):  # fmt: skip
-        yield Variant(
-            "NRRD by pynrrd", (name[1:], *options), name, lambda p, o=options: by_pynrrd(p, *o)
-        )
-    for what in ("RAS", "milliseconds", "multivolume", "slicerio sequence", "3D"):
-        yield Variant("NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w))
-    for options in product(("explicit", "implicit"), ("preamble", "bare")):
-        yield Variant(
-            "Philips Cartesian DICOM", options, "a.dcm", lambda p, o=options: philips(p, *o)
-        )
+        SimpleITK.WriteImage(itk(values), str(path))
 
 
 PHILIPS = "1.2.840.113543.6.6.1.3.10002"
@@ -238,13 +209,54 @@ def philips(path: Path, syntax: str, start: str) -> None:
     pydicom.dcmwrite(path, data, enforce_file_format=True)
 
 
+def volume_variants() -> Iterator[Variant]:
+    """Images, their times in s, in ms or without unit."""
+    for options in product(("NIfTI-1", "NIfTI-2"), ("uint8", "int16", "float32")):
+        for name in ("a.nii", "a.nii.gz"):
+            yield Variant("NIfTI", (*options, name[1:]), name, lambda p, o=options: nifti(p, *o))
+    for what in ("sform only", "qform only", "scaled", "seconds", "3D"):
+        yield Variant(
+            "NIfTI", (what,), "a.nii.gz", lambda p, w=what: nifti(p, "NIfTI-1", "int16", w)
+        )
+    for name, *options in product(
+        ("a.mha", "a.mhd"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
+    ):
+        yield Variant(
+            "MetaImage", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
+            given={"time_unit": "s"} if "4D" in options else {},
+        )  # fmt: skip
+    for name, *options in product(
+        ("a.nrrd", "a.nhdr"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
+    ):
+        yield Variant(
+            "NRRD by ITK", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
+            given={"time_unit": "s"} if "4D" in options else {},
+        )  # fmt: skip
+    for name, *options in product(
+        ("a.seq.nrrd", "a.nhdr"), ("frames first", "frames last"), ("raw", "gzip", "bzip2", "text"),
+        ("uint8", "int16", "float32"),
+    ):  # fmt: skip
+        yield Variant(
+            "NRRD by pynrrd", (name[1:], *options), name, lambda p, o=options: by_pynrrd(p, *o)
+        )
+    for what in ("RAS", "milliseconds", "multivolume", "3D", "slicerio", *TEXT_INDEX):
+        yield Variant(
+            "NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w),
+            given={"frame_interval_s": 0.04} if what in TEXT_INDEX else {},
+        )  # fmt: skip
+    for options in product(("explicit", "implicit"), ("preamble", "bare")):
+        yield Variant(
+            "Philips Cartesian DICOM", options, "a.dcm", lambda p, o=options: philips(p, *o)
+        )
+
+
 def label_variants() -> Iterator[Variant]:
     """Label maps of one frame, or of one that is not empty."""
     for what in ("one layer", "overlapping layers", "an empty layer", "before 4.11"):
         yield Variant(
             "Slicer segmentation", (what,), "a.seg.nrrd", lambda p, w=what: segments(p, w)
         )
-    for what in ("uint8", "int16", "int64", "float32"):
-        yield Variant("NRRD labels", (what,), "a.nrrd", lambda p, w=what: map_of_labels(p, w))
-    for what in ("uint8", "int16", "float32", "4D mostly empty"):
-        yield Variant("NIfTI labels", (what,), "a.nii.gz", lambda p, w=what: map_of_labels(p, w))
+    kinds = ("uint8", "int16", "int64", "float32", "float64")
+    for form, name in (("NRRD", "a.nrrd"), ("MetaImage", "a.mha"), ("NIfTI", "a.nii.gz")):
+        for what in (*kinds, *(("4D in ms", "4D without a unit") if form == "NIfTI" else ())):
+            yield Variant(f"{form} labels", (what,), name, lambda p, w=what: map_of_labels(p, w))

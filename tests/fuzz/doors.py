@@ -21,7 +21,7 @@ from mvest.exchange.external.contract import (
     write_request,
 )
 from mvest.exchange.febio.positions import read_positions
-from mvest.exchange.markups import read_fcsv, read_markups
+from mvest.exchange.markups import read_markups
 from mvest.exchange.regions import read_regions
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.layout import ValveLayout
@@ -207,7 +207,7 @@ DOORS: dict[str, Door] = {
         "Slicer segmentation: one layer", "NRRD labels: int16", "NIfTI labels: uint8",
     )),
     "markups": Door(read_markups, of("Markups: 1.0.3, LPS", "Markups: ClosedCurve")),
-    "fcsv": Door(read_fcsv, of("fcsv: 4.10, 0", "fcsv: 5.0, LPS")),
+    "fcsv": Door(read_markups, of("fcsv: 4.10, 0", "fcsv: 5.0, LPS")),
     "population": Door(load_population, beside(population, "valves.npz")),
     "fields": Door(read_case_fields, beside(fields, "fields.npz")),
     "record": Door(read_record, beside(record, "result.json")),
