@@ -10,7 +10,7 @@ import yaml
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.reading.documents import parse_json, read_json, read_mapping, read_yaml
+from mvest.reading.documents import parse_json, read_mapping, read_yaml
 from mvest.reading.text import (
     check_words,
     number,
@@ -81,7 +81,6 @@ def test_files_are_read_within_bounds(tmp_path):
     ("text", "words"),
     [
         ("", "not JSON"), ("{", "not JSON"), ("[" * 100_000, "not JSON"),
-        ("[" * 60 + "]" * 60, "deep"), ('{"a": ' * 60 + "1" + "}" * 60, "deep"),
         ("NaN", "NaN"), ("[-Infinity]", "Infinity"), ("[1e999]", "finite"),
         ("9" * 400, "64 bits"), ("18446744073709551616", "64 bits"), ("-" + "1" * 5000, "64 bits"),
         ('{"a": 1, "a": 2}', "'a' occurs twice"), ('"\\ud800"', "surrogate"),
@@ -102,7 +101,6 @@ def test_json_that_is_read(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(data))
     assert read_mapping(tmp_path / "a.json") == data
     (tmp_path / "a.json").write_text("[]")
-    assert read_json(tmp_path / "a.json") == []
     with pytest.raises(InputError, match="holds a list, expected a mapping"):
         read_mapping(tmp_path / "a.json")
 
@@ -139,7 +137,7 @@ def test_plain_values_of_yaml_are_as_another_reader_has_them(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("a: 1\n---\nb: 2\n", "second document"), ("- 1\n", "holds a list"), ("", "holds a NoneType"),
+    [("a: 1\n---\nb: 2\n", "a single document"), ("- 1\n", "holds a list"), ("", "holds a NoneType"),
      ("a: [" + "0," * 60_000 + "0]\n", "more than 50000 values"), ("a: 1\na: 2\n", "occurs twice"),
      ("1: a\n1: b\n", "occurs twice"), ("a: " + "[" * 30, "20 deep"), ("a: &x 1\n", "anchors")],
 )  # fmt: skip
