@@ -143,10 +143,17 @@ TO_LPS = {
     "right-anterior-superior": (-1.0, -1.0, 1.0),
     "left-anterior-superior": (1.0, -1.0, 1.0),
 }
-SHORT = {"".join(word[0] for word in space.split("-")): space for space in TO_LPS}
+SHORT = {
+    "".join(word[0] for word in space.split("-")): space
+    for name in TO_LPS
+    for space in (name, f"{name}-time")
+}
 UNSTATED = ("", "???", "none")
+KINDS_OF_SPACE = ("domain", "space", *UNSTATED)
 KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 IMAGE_NODE = "vtkMRMLScalarVolumeNode"
+FRAME_LABELS = "MultiVolume.FrameLabels"
+FRAME_UNIT = "MultiVolume.FrameIdentifyingDICOMTagUnits"
 
 
 def _nrrd(path: Path, head: bytes) -> Opened:
@@ -190,7 +197,7 @@ def _nrrd(path: Path, head: bytes) -> Opened:
 
     return Stated(
         shape=shape,
-        dtype=dtype.name,
+        dtype=dtype.str,
         steps=steps,
         origin=origin,
         names=("sizes", "space directions", "space origin", "data", field),
@@ -236,9 +243,7 @@ def _nrrd_place(path: Path, fields: dict[str, Any]) -> tuple[int | None, FloatAr
         found = f"{n - other.sum()} of {n} axes in space"
         raise fault(path, "space directions", found, "three, and 'none' for the frames")
     for number, kind in enumerate(kinds):
-        if kind.lower() not in (
-            KINDS_OF_FRAMES if other[number] else ("domain", "space", *UNSTATED)
-        ):
+        if kind.lower() not in (KINDS_OF_FRAMES if other[number] else KINDS_OF_SPACE):
             raise fault(path, "kinds", kind, "one grey value for a voxel, no colour or vector")
         if not other[number] and units_of_axes[number] not in ("mm", *UNSTATED):
             raise fault(path, "units", units_of_axes[number], "mm for an axis of space")
@@ -253,17 +258,17 @@ def _nrrd_times(
     """Where the times of frames stand, or would; the times, if stated; and their unit."""
     unit = _nrrd_words(path, fields, "units")[axis]
     unit = "" if unit in UNSTATED else unit
-    places = [(f"axis {number} index values", " ") for number in (axis, 0, 3)]
-    for field, separator in [*places, ("MultiVolume.FrameLabels", ",")]:
+    for field in (*(f"axis {number} index values" for number in (axis, 0, 3)), FRAME_LABELS):
         kind = field.replace("values", "type")
-        if field in fields and fields.get(kind, "numeric") not in ("numeric", fields[field]):
+        if field not in fields:
+            continue
+        if kind != field and fields.get(kind, "numeric") != "numeric":
             return kind, None, ""
-        if field in fields:
-            try:
-                values = np.array([float(word) for word in fields[field].strip().split(separator)])
-            except ValueError as error:
-                raise fault(path, field, error, "numbers") from error
-            return field, values, fields.get("MultiVolume.FrameIdentifyingDICOMTagUnits", unit)
+        try:
+            values = np.array([float(word) for word in fields[field].replace(",", " ").split()])
+        except ValueError as error:
+            raise fault(path, field, error, "numbers") from error
+        return field, values, fields.get(FRAME_UNIT, unit)
     step = fields.get("spacings", [])
     if len(step) > axis and np.isfinite(step[axis]):
         return "spacings", step[axis] * np.arange(count), unit
@@ -320,8 +325,6 @@ def _nifti(path: Path, begin: bytes) -> Opened:
     scaled = slope is not None and (slope, intercept) != (1.0, 0.0)
     if len(sizes) not in (3, 4):
         raise fault(path, "dim", " ".join(map(str, sizes)), "3 or 4 axes")
-    if dtype.kind not in "iuf":
-        raise fault(path, "datatype", dtype, "one grey value, no colour or complex number")
     if int(header["sform_code"]) <= 0 and int(header["qform_code"]) <= 0:
         raise fault(path, "sform_code", "0, as is qform_code", "a direction of the axes")
     lengths, zooms = np.linalg.norm(affine[:3, :3], axis=0), np.array(header.get_zooms())
@@ -347,7 +350,7 @@ def _nifti(path: Path, begin: bytes) -> Opened:
     place = "sform or qform"
     return Stated(
         shape=((*sizes, 1)[3], *sizes[:3]),
-        dtype="float32" if scaled else dtype.name,
+        dtype="<f4" if scaled else dtype.str,
         steps=affine[:3, :3] * scale[:, np.newaxis],
         origin=affine[:3, 3] * scale,
         names=("dim", place, place, "data", "pixdim[4] with xyzt_units"),
@@ -396,17 +399,17 @@ def _metaimage(path: Path, head: bytes) -> Opened:
         raise fault(path, "TransformMatrix", direction[3], "the fourth axis to be time alone")
     if spacing.min() <= 0:
         raise fault(path, "ElementSpacing", fields["ElementSpacing"], "positive numbers")
-    for name, value, expected in (
-        ("BinaryData", "true", "True: numbers in binary form"),
-        ("HeaderSize", "0", "0"),
-        ("ElementNumberOfChannels", "1", "1: one grey value, no colour or vector"),
-    ):
-        if fields.get(name, value).lower() != value:
-            raise fault(path, name, fields[name], expected)
+    if fields.get("HeaderSize", "0") != "0":
+        raise fault(path, "HeaderSize", fields["HeaderSize"], "0")
     reader = itk.ImageFileReader()
     reader.SetImageIO("MetaImageIO")
     reader.SetFileName(str(path))
-    reader.ReadImageInformation()
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError as error:
+        raise fault(path, "header", "damaged", "fields that SimpleITK reads") from error
+    if reader.GetNumberOfComponents() != 1:
+        raise fault(path, "ElementNumberOfChannels", "not 1", "one grey value, no colour or vector")
     dtype = itk.GetArrayFromImage(itk.Image([1, 1, 1], reader.GetPixelID())).dtype
     if dtype.itemsize > 1:
         _required(path, fields, "BinaryDataByteOrderMSB", "the order of bytes")
@@ -424,7 +427,7 @@ def _metaimage(path: Path, head: bytes) -> Opened:
 
     return Stated(
         shape=(sizes[3], *sizes[:3]),
-        dtype=dtype.name,
+        dtype=dtype.str,
         steps=direction[:3, :3] * spacing[:3],
         origin=origin[:3],
         names=("DimSize", "ElementSpacing", "Offset", "ElementDataFile", "ElementSpacing"),
@@ -447,6 +450,13 @@ PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 PHILIPS_DIRECTION = np.diag([-1.0, -1.0, 1.0])
 """Columns run to the right, rows to the front and slices upwards; the first voxel is at 0."""
 SLICES, SLICE_UNIT, SLICE_SPACING = "(3001,1001)", "(3001,1002)", "(3001,1003)"
+PHILIPS_VALUES = (
+    ("SamplesPerPixel", 1, "one grey value"),
+    ("BitsAllocated", 8, "one grey value of a byte"),
+    ("PhysicalUnitsXDirection", 3, "which is cm"),  # DICOM PS3.3, C.8.5.5.1.15
+    ("PhysicalUnitsYDirection", 3, "which is cm"),
+    (SLICE_UNIT, 3, "which is cm"),
+)
 CONVERT = (
     "Philips Cartesian DICOM; convert other DICOM with 3D Slicer, and save the volume as .nrrd or "
     "the sequence as .seq.nrrd"
@@ -458,36 +468,31 @@ def _philips(path: Path) -> Opened:
 
     data: Any = pydicom.dcmread(path, force=True, defer_size=2**16)
 
-    def number(name: str, code: str = "") -> float:
-        """A number; `code` unpacks it where the file does not state its type."""
+    def number(name: str) -> float:
+        """A number; its bytes count where the file does not state its type."""
         key = (0x3001, int(name[6:10], 16)) if name.startswith("(") else name
         if key not in data:
             raise fault(path, name, "not stated", "a number")
         value = data[key].value
         try:
-            return float(struct.unpack(code, value)[0] if isinstance(value, bytes) else value)
-        except (TypeError, ValueError, struct.error) as error:
+            if isinstance(value, bytes):
+                (value,) = struct.unpack({2: "<H", 4: "<I", 8: "<d"}[len(value)], value)
+            return float(value)
+        except (KeyError, TypeError, ValueError) as error:
             raise fault(path, name, value, "a number") from error
 
     kind = data.get("SOPClassUID", getattr(data, "file_meta", {}).get("MediaStorageSOPClassUID"))
     if kind != PHILIPS and (kind is not None or (0x3001, 0x1001) not in data):
         raise fault(path, "SOPClassUID", kind or "not stated", CONVERT)
-    for name, expected, why in (
-        ("SamplesPerPixel", 1, "one grey value"),
-        ("BitsAllocated", 8, "one grey value of a byte"),
-        ("PhysicalUnitsXDirection", 3, "which is cm"),  # DICOM PS3.3, C.8.5.5.1.15
-        ("PhysicalUnitsYDirection", 3, "which is cm"),
-        *([(SLICE_UNIT, 3, "which is cm")] if (0x3001, 0x1002) in data else []),
-    ):
-        if number(name, "<H") != expected:
-            raise fault(path, name, f"{number(name, '<H'):g}", f"{expected}: {why}")
-    frames, slices = int(number("NumberOfFrames")), int(number(SLICES, "<I"))
-    shape = (frames, int(number("Columns", "<H")), int(number("Rows", "<H")), slices)
+    for name, expected, why in PHILIPS_VALUES:
+        if (name != SLICE_UNIT or (0x3001, 0x1002) in data) and number(name) != expected:
+            raise fault(path, name, f"{number(name):g}", f"{expected}: {why}")
+    shape = tuple(int(number(name)) for name in ("NumberOfFrames", "Columns", "Rows", SLICES))
     place = ("PhysicalDeltaX", "PhysicalDeltaY", SLICE_SPACING)
-    spacing = np.array([number(name, "<d") for name in place])
+    spacing = np.array([number(name) for name in place])
     if not (spacing > 0).all():
         raise fault(path, ", ".join(place), spacing, "positive lengths in cm")
-    interval = number("FrameTime") if frames > 1 else 0.0
+    interval = number("FrameTime") if shape[0] > 1 else 0.0
     if "PixelData" not in data:
         raise fault(path, "PixelData", "not stated", "the voxels")
 
@@ -499,15 +504,15 @@ def _philips(path: Path) -> Opened:
         if element.is_undefined_length or end < size:
             raise fault(path, "PixelData", f"{end} bytes", f"{size} bytes, not compressed")
         values = np.frombuffer(content, np.uint8, count=size, offset=end - size)
-        return values.reshape(frames, slices, *shape[2:0:-1]).transpose(0, 3, 2, 1)
+        return values.reshape(shape[0], *shape[:0:-1]).transpose(0, 3, 2, 1)
 
     return Stated(
         shape=shape,
-        dtype="uint8",
+        dtype="u1",
         steps=PHILIPS_DIRECTION * spacing * MM_PER_UNIT["cm"],
         origin=np.zeros(3),
         names=(f"Columns, Rows, {SLICES}", ", ".join(place), "origin", "PixelData", "FrameTime"),
-        times=interval * np.arange(frames, dtype=np.float64) if frames > 1 else None,
+        times=interval * np.arange(shape[0], dtype=np.float64) if shape[0] > 1 else None,
         unit="ms",
         modality="ultrasound",
     ), load

@@ -144,12 +144,9 @@ def read_volume(
     Raises
     ------
     InputError
-        In one line the file, the field, what was found and what was expected: a file of another
-        kind, truncated or damaged; not three or four axes; colour; no spacing, direction or origin,
-        or such as no heart fits (0.05 to 5 mm, 20 to 500 mm in all, at least 16 voxels along each
-        axis); axes that are not at right angles; a frame without contrast; values that are no
-        numbers; times that do not increase, or by less than 2 ms or 1 s and more; more than
-        `max_bytes`.
+        In one line the file, the field, what was found and what was expected: a file that is
+        damaged or of another kind, something that it does not state or the caller contradicts, or
+        what no image of a heart has (see the bounds above).
     """
     source = Path(path)
     if source.is_dir():
@@ -176,9 +173,7 @@ def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
     Raises
     ------
     InputError
-        In one line the file, the field, what was found and what was expected: as `read_volume`, but
-        of 2 to 500 mm and at least 2 voxels along each axis; an image; no label at all; values that
-        are no whole numbers.
+        As `read_volume`; an image, no label at all, or values that are no whole numbers.
     """
     source = Path(path)
     stated = Stated(**in_child(_images.stated, source))
@@ -267,7 +262,7 @@ def _place(
         raise fault(path, names[0], counted, expected)
     dtype = np.dtype(stated.dtype)
     if dtype.kind not in "iuf":
-        raise fault(path, names[3], f"type {dtype}", "one real number for each voxel")
+        raise fault(path, names[3], f"type {dtype}", "one real number, no colour or vector")
     total = int(np.prod(shape, dtype=object)) * dtype.itemsize
     if total > max_bytes:
         found = f"{counted} of {dtype.itemsize} bytes, together {total / 2**30:.1f} GiB"
@@ -333,17 +328,12 @@ def _times(
         options = "frame_interval_s" if stated.times is None else "time_unit or frame_interval_s"
         expected = f"times in s or ms; else give {options}"
         raise fault(path, field, found, expected)
-    if times.shape != (count,):
-        raise fault(path, field, f"{times.size} times", f"one for each of {count} frames")
-    if not np.isfinite(times).all():
-        raise fault(path, field, _numbers(times), "finite times")
-    steps = np.diff(times)
-    if (steps <= 0).any():
-        raise fault(path, field, f"{_numbers(times)} s", "increasing times")
-    if ((steps < MIN_INTERVAL_S) | (steps >= MAX_INTERVAL_S)).any():
-        found = f"{steps.min():g} to {steps.max():g} s between frames"
-        expected = f"at least {MIN_INTERVAL_S:g} s and less than {MAX_INTERVAL_S:g} s"
-        raise fault(path, field, found, expected)
+    steps, low, high = np.diff(times), MIN_INTERVAL_S, MAX_INTERVAL_S
+    if times.shape != (count,) or not np.isfinite(times).all():
+        raise fault(path, field, _numbers(times), f"a time of each of {count} frames")
+    if not ((steps >= low) & (steps < high)).all():
+        expected = f"increasing times, by at least {low:g} s and less than {high:g} s"
+        raise fault(path, field, f"{_numbers(times)} s", expected)
     return np.asarray(times)
 
 

@@ -67,10 +67,26 @@ def test_a_volume_as_qlab_exports_it(tmp_path: Path, explicit: bool, preamble: b
     np.testing.assert_allclose(found.spacing, [1.5, 1.25, 1.0])
     np.testing.assert_allclose(found.times, [0, 0.04, 0.08])
     assert found.modality is Modality.ULTRASOUND
-    # Columns to the right, rows to the back, slices downwards, around zero; no mirror image.
-    np.testing.assert_array_equal(found.direction, np.diag([-1, 1, -1]))
-    np.testing.assert_allclose(found.world(np.array([9.5, 11.5, 13.5])), 0, atol=1e-12)
-    np.testing.assert_allclose(found.world(np.zeros(3)), [14.25, -14.375, 13.5])
+
+
+def test_the_volume_lies_where_slicerheart_places_it(tmp_path: Path) -> None:
+    """SlicerHeart gives 3D Slicer an image of these spacings without origin and directions.
+
+    Slicer's world is RAS: voxel (i, j, k) is at (1.5 i, 1.25 j, k) there, which in LPS has the
+    first two signs turned. The sequence that Slicer saves of it is read into the same place, so a
+    landmark placed in Slicer marks the same voxel of both files.
+    """
+    recording = read_volume(save(tmp_path / "a.dcm", dataset()))
+    index = np.array([3.0, 5.0, 7.0])
+    np.testing.assert_allclose(recording.world(index), [-4.5, -6.25, 7.0], atol=1e-12)
+    fields = v.nrrd_fields() | {
+        "space": "right-anterior-superior",
+        "space directions": "none (1.5,0,0) (0,1.25,0) (0,0,1)",
+        "space origin": "(0,0,0)",
+        "axis 0 index values=": "0 0.04 0.08",
+    }
+    saved = v.write_nrrd(tmp_path / "a.seq.nrrd", fields)
+    v.assert_same(recording, read_volume(saved, modality=Modality.ULTRASOUND))
 
 
 def test_voxels_are_the_last_bytes(tmp_path: Path) -> None:
@@ -127,7 +143,6 @@ BAD: dict[str, tuple[Callable[[Dataset], None], str, str]] = {
     "mm in place of cm": (setter("PhysicalDeltaX", 1.5), "PhysicalDeltaX", "0.05 to 5 mm"),
     "mirrored spacing": (setter("PhysicalDeltaX", -0.15), "PhysicalDeltaX", "positive lengths"),
     "more frames than bytes": (setter("NumberOfFrames", 4), "PixelData", "53760 bytes"),
-    "too large": (private(0x1001, 4_000_000_000), "Columns, Rows", "at most 4 GiB"),
     "no pixels": (remover("PixelData"), "PixelData", "the voxels"),
 }
 
@@ -145,26 +160,6 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str, explicit: 
     assert message.startswith(f"{path}: {field}")
     assert words in message.partition(", expected ")[2]
     assert "\n" not in message
-
-
-@pytest.mark.parametrize("preamble", [True, False])
-@pytest.mark.parametrize("shape", [v.SHAPE, (4, 32, 32, 32)])
-def test_a_file_cut_anywhere_is_refused(
-    tmp_path: Path, preamble: bool, shape: tuple[int, int, int, int]
-) -> None:
-    path = save(tmp_path / "a.dcm", dataset(shape), preamble=preamble)
-    whole = path.read_bytes()
-    header = len(whole) - int(np.prod(shape))
-    for end in [
-        *(header * n // 10 for n in range(10)),
-        *(len(whole) * n // 10 for n in range(1, 10)),
-        len(whole) - 1,
-    ]:
-        path.write_bytes(whole[:end])
-        with pytest.raises(InputError) as caught:
-            read_volume(path)
-        assert str(path) in str(caught.value)
-        assert "\n" not in str(caught.value)
 
 
 def test_another_modality_contradicts_the_file(tmp_path: Path) -> None:

@@ -1,0 +1,167 @@
+"""Label maps and segmentations, which are judged by other rules than images."""
+
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import nrrd
+import numpy as np
+import pytest
+import SimpleITK
+
+from mvest.errors import InputError
+from mvest.exchange.volumes import LabelMap, Segment, read_labels, read_volume
+from mvest.imaging.volume import Modality
+from tests.exchange.volumes import test_metaimage, test_nifti, test_philips
+from tests.exchange.volumes import volumes as v
+
+PLACE = {
+    "space": "left-posterior-superior",
+    "space directions": (v.MIRRORED * v.SPACING).T,
+    "space origin": v.ORIGIN,
+}
+
+
+def labels(dtype: str = "uint8") -> np.ndarray:
+    """Three frames, the second one empty."""
+    result = np.zeros(v.SHAPE, dtype)
+    result[0, 3:6, 4:9, 20] = 1
+    result[2, 10, 4, 5:9] = 2
+    return result
+
+
+def write_layers(path: Path, voxels: np.ndarray, **keys: str) -> LabelMap:
+    """A segmentation of overlapping segments as 3D Slicer writes it, read."""
+    header: dict[str, Any] = PLACE | {
+        "space directions": np.vstack([np.full(3, np.nan), PLACE["space directions"]]),
+        "kinds": ["list", "domain", "domain", "domain"],
+        "Segmentation_MasterRepresentation": "Binary labelmap",
+        **keys,
+    }
+    nrrd.write(str(path), voxels, header)
+    return read_labels(path)
+
+
+def assert_placed(found: LabelMap, direction: np.ndarray) -> None:
+    np.testing.assert_allclose(found.spacing, v.SPACING, rtol=1e-6)
+    np.testing.assert_allclose(found.direction, direction, atol=1e-6)
+    np.testing.assert_allclose(found.origin, v.ORIGIN, rtol=1e-6)
+
+
+def test_layers_of_a_segmentation(tmp_path: Path) -> None:
+    found = write_layers(
+        tmp_path / "a.seg.nrrd",
+        labels(),
+        Segment0_Name="Anterior Leaflet",
+        Segment0_Tags="TerminologyEntry:x~y",
+        Segment0_LabelValue="1",
+        Segment0_Layer="0",
+        Segment10_ID="Segment_7",
+        Segment10_LabelValue="2",
+        Segment10_Layer="2",
+        Segment2_Name="empty",
+        Segment2_LabelValue="1",
+        Segment2_Layer="1",
+    )
+    np.testing.assert_array_equal(found.frames, labels())
+    assert_placed(found, v.MIRRORED)
+    assert found.is_layers
+    assert found.times is None
+    assert found.segments == (
+        Segment("Anterior Leaflet", "TerminologyEntry:x~y", 1, 0),
+        Segment("empty", "", 1, 1),
+        Segment("Segment_7", "", 2, 2),
+    )
+
+
+def test_layers_of_slicer_before_4_11(tmp_path: Path) -> None:
+    """It wrote neither layer nor label: each segment has a layer of its own, and the label 1."""
+    names = {f"Segment{n}_Name": f"part {n}" for n in range(3)}
+    found = write_layers(tmp_path / "a.seg.nrrd", labels(), **names)
+    assert [(s.label, s.layer) for s in found.segments] == [(1, 0), (1, 1), (1, 2)]
+
+
+def test_segments_of_one_layer(tmp_path: Path) -> None:
+    path = tmp_path / "a.seg.nrrd"
+    header = PLACE | {"Segment0_Name": "a", "Segment1_Name": "b", "Segment1_LabelValue": "5"}
+    nrrd.write(str(path), labels()[0], header)
+    found = read_labels(path)
+    assert not found.is_layers
+    assert [(s.label, s.layer) for s in found.segments] == [(1, 0), (5, 0)]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("Segment0_Layer", "3"), ("Segment0_LabelValue", "1.5")]
+)
+def test_a_segment_that_cannot_be(tmp_path: Path, key: str, value: str) -> None:
+    with pytest.raises(InputError, match=rf"a\.seg\.nrrd: {key}: '{value}', expected a number"):
+        write_layers(tmp_path / "a.seg.nrrd", labels(), **{key: value})
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "int32", "int64", "float32"])
+@pytest.mark.parametrize("kind", ["nrrd", "nii.gz", "mha"])
+def test_labels_of_any_type(tmp_path: Path, kind: str, dtype: str) -> None:
+    path, voxels = tmp_path / f"a.{kind}", labels(dtype)[0]
+    if kind == "nii.gz":
+        made = nibabel.Nifti1Image(voxels, test_nifti.affine(v.MIRRORED), dtype=dtype)
+        nibabel.save(made, path)
+    else:
+        image = SimpleITK.GetImageFromArray(np.ascontiguousarray(voxels.T))
+        image.SetSpacing(v.SPACING.tolist())
+        image.SetDirection(v.MIRRORED.ravel().tolist())
+        image.SetOrigin(v.ORIGIN.tolist())
+        SimpleITK.WriteImage(image, str(path))
+    found = read_labels(path)
+    np.testing.assert_array_equal(found.frames, labels()[:1])
+    assert found.frames.dtype.kind in "iu"
+    assert found.segments == ()
+    assert not found.is_layers
+    assert_placed(found, v.MIRRORED)
+
+
+def test_frames_over_time_may_be_empty_and_without_a_unit(tmp_path: Path) -> None:
+    path = tmp_path / "a.nii.gz"
+    made = test_nifti.image(labels())
+    nibabel.save(made, path)
+    found = read_labels(path)
+    np.testing.assert_array_equal(found.frames, labels())
+    assert found.times is not None
+    np.testing.assert_allclose(found.times, [0, 0.04, 0.08])
+    for unit, step in (("unknown", 1), ("sec", 1)):  # what nibabel and ITK write unasked
+        made.header.set_xyzt_units("mm", unit)
+        made.header["pixdim"][4] = step
+        nibabel.save(made, path)
+        assert read_labels(path).times is None
+
+
+def test_metaimage_without_a_unit_of_time(tmp_path: Path) -> None:
+    test_metaimage.write(tmp_path / "a.mha")
+    np.testing.assert_array_equal(read_labels(tmp_path / "a.mha").frames, v.frames())
+
+
+def test_a_small_box(tmp_path: Path) -> None:
+    path = tmp_path / "a.nrrd"
+    voxels = np.ones((8, 40, 30), np.uint8)
+    header = PLACE | {"space directions": 0.45 * np.eye(3)}
+    nrrd.write(str(path), voxels, header)
+    np.testing.assert_array_equal(read_labels(path).frames[0], voxels)
+    with pytest.raises(InputError, match=r"sizes: 1 x 8 x 40 x 30 .*at least 16"):
+        read_volume(path, modality=Modality.CT)
+
+
+def test_what_is_no_label_map(tmp_path: Path) -> None:
+    path = tmp_path / "a.nrrd"
+    for voxels, words in (
+        (np.zeros(v.SHAPE[1:], np.uint8), "data: all voxels are 0, expected labels"),
+        (np.full(v.SHAPE[1:], 1.5), "expected whole numbers"),
+        (np.full(v.SHAPE[1:], np.nan), "expected whole numbers"),
+    ):
+        nrrd.write(str(path), voxels, PLACE)
+        with pytest.raises(InputError, match=rf"a\.nrrd: .*{words}"):
+            read_labels(path)
+    del (unplaced := dict(PLACE))["space directions"]
+    nrrd.write(str(path), labels()[0], unplaced)
+    with pytest.raises(InputError, match=r"a\.nrrd: space directions: not stated"):
+        read_labels(path)
+    with pytest.raises(InputError, match=r"modality: ultrasound, expected a label map"):
+        read_labels(test_philips.save(tmp_path / "a.dcm", test_philips.dataset()))
