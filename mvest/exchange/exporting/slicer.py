@@ -33,6 +33,7 @@ MARGIN = 3.0
 """mm between the leaflets and the edge of their label map."""
 MAX_VOXELS = 5e7
 MUSCLES = ("antero-lateral", "postero-medial")
+Arrays = dict[str, NDArray[np.generic]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,69 +96,49 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
 
 def _write_case(folder: Path, case: ValveCase, options: SlicerOptions) -> None:
     folder.mkdir()
-    surface = case.surface
-    ring, end = _ring(case.annulus, surface.triangles, surface.region, surface.region_names)
-    order = np.array([np.flatnonzero(case.annulus == vertex)[0] for vertex in ring])
-    thick = [
-        float(surface.thickness[surface.vertex_region == k].mean())
-        for k in range(len(surface.region_names))
-    ]
+    surface, names = case.surface, case.surface.region_names
+    regions = range(len(names))
+    mean = np.array([surface.thickness[surface.vertex_region == k].mean() for k in regions])
+    order = _ring(case.annulus, surface.triangles, surface.region, names)
     states = []
-    rest = case.frame(Role.REFERENCE)
     for frame in case.frames:
-        cells = region_arrays(frame.region, surface.region_names)
-        points: dict[str, NDArray[np.generic]] = {}
+        points, thickness = {}, surface.thickness
         if frame.corresponds:
-            points = _against(rest.vertices, frame.vertices, surface.triangles)
+            points = _against(surface.vertices, frame.vertices, surface.triangles)
+        else:
+            thickness = np.zeros(len(frame.vertices))
+            thickness[frame.triangles.ravel()] = np.repeat(mean[frame.region], 3)
+        cells = region_arrays(frame.region, names)
         states.append(SurfaceFile(frame.vertices, frame.triangles, points, cells))
-        stem = folder / _file_name(frame.name)
-        _write_marks(stem, frame.annulus[order], end, frame.papillary_tips)
-        thickness = surface.thickness if frame.corresponds else _of_vertices(frame, thick)
-        _write_voxels(
-            stem,
-            frame.vertices,
-            frame.triangles,
-            frame.region,
-            thickness,
-            surface.region_names,
-            options.voxel_mm,
-        )
+        _write_frame(folder, frame, thickness, order, names, options.voxel_mm)
     write_surface_series(folder / "frames.pvd", [frame.time for frame in case.frames], states)
-
-
-def _of_vertices(frame: Frame, thickness: Sequence[float]) -> FloatArray:
-    label = np.zeros(len(frame.vertices), dtype=np.int64)
-    label[frame.triangles.ravel()] = np.repeat(frame.region, 3)
-    return np.array(thickness)[label]
 
 
 def _write_run(folder: Path, fields: CaseFields, options: SlicerOptions) -> None:
     folder.mkdir()
     count = int(fields.region.max(initial=0)) + 1
     names = REGIONS if count == 2 else tuple(f"leaflet {k + 1}" for k in range(count))
-    ring, end = _ring(fields.annulus, fields.triangles, fields.region, names)
     cells = region_arrays(fields.region, names)
     for name in ("observed", "generic", "fitted"):
-        shapes = getattr(fields, name)
-        if shapes is None or not np.isfinite(shapes).all():
+        moved = getattr(fields, name)
+        if moved is None or not np.isfinite(moved).all():
             continue
         distance = getattr(fields, f"distance_{name}", None)
         states = []
-        for k, points in enumerate([fields.rest, *shapes]):
+        for k, points in enumerate([fields.rest, *moved]):
             data = _against(fields.rest, points, fields.triangles)
             if distance is not None:
                 # The open valve is not compared with anything, but Slicer wants the same arrays.
                 data["distance_mm"] = distance[k - 1] if k else np.zeros(len(points))
             states.append(SurfaceFile(points, fields.triangles, data, cells))
         write_surface_series(folder / f"{name}.pvd", range(len(states)), states)
+    order = _ring(fields.annulus, fields.triangles, fields.region, names)
     thickness = np.full(len(fields.rest), options.thickness_mm)
     for k, stage in enumerate(("open", *fields.frames)):
-        shape = fields.rest if k == 0 or fields.fitted is None else fields.fitted[k - 1]
-        stem = folder / _file_name(stage)
-        _write_marks(stem, shape[ring], end, fields.tips[k])
-        _write_voxels(
-            stem, shape, fields.triangles, fields.region, thickness, names, options.voxel_mm
-        )
+        x = fields.rest if k == 0 or fields.fitted is None else fields.fitted[k - 1]
+        valve = (x, fields.triangles, fields.region, x[fields.annulus], x[fields.free_edge])
+        frame = Frame(stage, float(k), Role.HELD_OUT, 0.0, *valve, fields.tips[k], True)
+        _write_frame(folder, frame, thickness, order, names, options.voxel_mm)
 
 
 def _write_closing(folder: Path, file: Path) -> None:
@@ -168,20 +149,18 @@ def _write_closing(folder: Path, file: Path) -> None:
         shapes = np.asarray(arrays["frames"], dtype=np.float64)
         triangles = np.asarray(arrays["triangles"], dtype=np.int64)
         region = np.asarray(arrays["region"], dtype=np.int64)
+        cells = region_arrays(region, REGIONS[: int(region.max()) + 1])
         states = []
         for k, points in enumerate(shapes):
-            data = {"displacement_mm": points - shapes[0]}
+            data: Arrays = {"displacement_mm": points - shapes[0]}
             for name in ("stress", "contact_pressure"):
                 if name in arrays:
                     data[f"{name}_MPa"] = np.asarray(arrays[name][k], dtype=np.float64)
-            cells = region_arrays(region, REGIONS[: int(region.max()) + 1])
-            states.append(SurfaceFile(points, triangles, dict(data), cells))
+            states.append(SurfaceFile(points, triangles, data, cells))
         write_surface_series(folder / "closing.pvd", arrays["times"].tolist(), states)
 
 
-def _against(
-    rest: FloatArray, points: FloatArray, triangles: IntArray
-) -> dict[str, NDArray[np.generic]]:
+def _against(rest: FloatArray, points: FloatArray, triangles: IntArray) -> Arrays:
     """What is seen of a deformed midsurface: displacement and stretches at its vertices."""
     first, second = principal_stretches(rest, points, triangles)
     return {
@@ -195,49 +174,43 @@ def _against(
 def _ring(
     annulus: IntArray, triangles: IntArray, region: IntArray, names: Sequence[str]
 ) -> tuple[IntArray, int]:
-    """Annulus from where the anterior leaflet begins, and the position where that ends."""
+    """Order of the annulus from where the anterior leaflet begins, and the place where it ends."""
     loop = directed(annulus, triangles)
     pieces = commissures(loop, triangles, region)
     begin, end = pieces[names.index("anterior") if "anterior" in names else min(pieces)]
-    return np.roll(loop, -begin), (end - begin) % len(loop)
+    place = {int(vertex): k for k, vertex in enumerate(annulus)}
+    order = np.array([place[int(vertex)] for vertex in np.roll(loop, -begin)])
+    return order, (end - begin) % len(loop)
 
 
-def _write_marks(stem: Path, ring: FloatArray, end: int, tips: FloatArray) -> None:
-    lists = {}
-    if len(tips):
-        labels = slicerheart_labels(ring, end, tips.mean(axis=0) - ring.mean(axis=0))
-        lists[ANNULUS_LABELS] = PointList(tuple(labels), np.stack(list(labels.values())))
-        if len(tips) == len(MUSCLES):
-            left = int(np.argmin(np.linalg.norm(tips - labels["ALC"], axis=1)))
-            for muscle, tip in zip(MUSCLES, (tips[left], tips[1 - left]), strict=True):
-                lists[f"PapillaryMarkup-{muscle}"] = PointList(("muscle tip",), tip[None])
-    lists["AnnulusContourMarkup"] = PointList.numbered("annulus", ring, "ClosedCurve")
-    write_markups(stem.with_name(f"{stem.name}.mrk.json"), lists)
-
-
-def _write_voxels(
-    stem: Path,
-    vertices: FloatArray,
-    triangles: IntArray,
-    region: IntArray,
+def _write_frame(
+    folder: Path,
+    frame: Frame,
     thickness: FloatArray,
+    order: tuple[IntArray, int],
     names: Sequence[str],
     voxel_mm: float,
 ) -> None:
-    if not np.isfinite(vertices).all():
+    """Landmarks and a segmentation of a frame, under its name."""
+    name = "".join(c if c.isalnum() or c in "-_" else "_" for c in frame.name)
+    ring, tips, lists = frame.annulus[order[0]], frame.papillary_tips, {}
+    if len(tips):
+        marks = slicerheart_labels(ring, order[1], tips.mean(axis=0) - ring.mean(axis=0))
+        lists[ANNULUS_LABELS] = PointList(tuple(marks), np.stack(list(marks.values())))
+        if len(tips) == len(MUSCLES):
+            left = int(np.argmin(np.linalg.norm(tips - marks["ALC"], axis=1)))
+            for muscle, tip in zip(MUSCLES, (tips[left], tips[1 - left]), strict=True):
+                lists[f"PapillaryMarkup-{muscle}"] = PointList(("muscle tip",), tip[None])
+    lists["AnnulusContourMarkup"] = PointList.numbered("annulus", ring, "ClosedCurve")
+    write_markups(folder / f"{name}.mrk.json", lists)
+    if not np.isfinite(frame.vertices).all():
         return
-    low = np.floor((vertices.min(axis=0) - MARGIN) / voxel_mm) * voxel_mm
-    shape = np.ceil((vertices.max(axis=0) + MARGIN - low) / voxel_mm).astype(int) + 1
-    if shape.prod() > MAX_VOXELS:
-        raise InputError(f"voxel_mm={voxel_mm}: {shape.prod():.1g} voxels; expected larger ones")
-    grid = VolumeSequence(
-        np.zeros((1, *shape), dtype=np.uint8), np.full(3, voxel_mm), np.eye(3), low, np.zeros(1)
-    )
-    labels = voxelise_leaflets(grid, vertices, triangles, region, thickness)
-    called = {1 + k: segment_name(name) for k, name in enumerate(names)}
-    write_segmentation(stem.with_name(f"{stem.name}.seg.nrrd"), grid, labels, called)
-
-
-def _file_name(name: str) -> str:
-    """The name of a frame as part of a file's name."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+    low = np.floor((frame.vertices.min(axis=0) - MARGIN) / voxel_mm) * voxel_mm
+    size = np.ceil((frame.vertices.max(axis=0) + MARGIN - low) / voxel_mm).astype(int) + 1
+    if size.prod() > MAX_VOXELS:
+        raise InputError(f"voxel_mm={voxel_mm}: {size.prod():.1g} voxels; expected larger ones")
+    empty = np.zeros((1, *size), dtype=np.uint8)
+    grid = VolumeSequence(empty, np.full(3, voxel_mm), np.eye(3), low, np.zeros(1))
+    labels = voxelise_leaflets(grid, frame.vertices, frame.triangles, frame.region, thickness)
+    called = {1 + k: segment_name(region) for k, region in enumerate(names)}
+    write_segmentation(folder / f"{name}.seg.nrrd", grid, labels, called)

@@ -8,6 +8,7 @@ the lines of its own coordinates, so that it has triangles of one size whatever 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,9 @@ from mvest.cases.rims import loop_vector_area, two_loops, without_ears
 from mvest.errors import GeometryError
 from mvest.exchange.importing.parts import Leaflet, loop_length
 from mvest.exchange.regions import RegionSurface
-from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import band_grid
+from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 from mvest.valve.geometry.triangles import areas
 
@@ -30,9 +32,9 @@ MAX_GAP = 6.0
 """mm between the leaflets at a commissure, and from a commissure to the leaflets."""
 MAX_MISS = 8.0
 """mm along a leaflet's boundary from where a commissure is marked to where it is."""
-CORNER, SETTLED, DENSE = 3.0, 0.15, 0.2
+CORNER, SETTLED = 3.0, 0.15
 """mm: behind the corner the distance to the other leaflet no longer falls, by that much over that
-way; spacing of the points among which the nearest is taken."""
+way."""
 OPENING = 0.4
 """mm more than at the corner, from which on two boundaries are free edges that part."""
 CURL_AT, CURLED = (0.0, 0.6, 1.5, 2.5), 0.85
@@ -45,47 +47,31 @@ MAX_SEAM = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Commissures:
-    """Where the annulus passes from one leaflet to the other.
+class Joining:
+    """How leaflets are joined and drawn.
 
     Attributes
     ----------
-    points
-        ``(2, 3)`` mm.
-    contour
-        ``(k, 3)`` mm, closed curve along the annulus, or None.
+    max_seam_mm : float
+        Distance up to which boundaries that leave a commissure side by side are joined.
+    edge_mm : float
+        Of the triangles, on average.
+    offset_mm : tuple of float
+        By which the anterior and the posterior leaflet are moved to the ventricle: half a thickness
+        turns an atrial surface into the midsurface.
+    seams : (2, 2) or None
+        Share of each leaflet's free edge (columns) that is joined at each commissure. That of
+        another frame where the valve is closed and the edges lie side by side all along; else it
+        is found.
     """
 
-    points: FloatArray
-    contour: FloatArray | None
+    max_seam_mm: float
+    edge_mm: float
+    offset_mm: tuple[float, float]
+    seams: FloatArray | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JoinedLeaflets:
-    """Both leaflets as one surface, which faces the ventricle.
-
-    Attributes
-    ----------
-    vertices, triangles, region
-        ``(n, 3)`` mm, ``(m, 3)`` and ``(m,)``: 0 anterior, 1 posterior.
-    annulus, free_edge
-        The boundary loops, in the direction of their triangles.
-    seams
-        ``(2, 2)`` share of each leaflet's free edge (columns) that is joined at each commissure.
-    gap
-        mm, largest distance between the leaflets that a strip of triangles spans.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
-    annulus: IntArray
-    free_edge: IntArray
-    seams: FloatArray
-    gap: float
-
-
-def commissures_on(contour: FloatArray, anterior: Leaflet, posterior: Leaflet) -> FloatArray:
+def commissures_on(contour: FloatArray, leaflets: Sequence[Leaflet]) -> FloatArray:
     """The two points ``(2, 3)`` of a contour where the nearer leaflet changes.
 
     Raises
@@ -93,14 +79,11 @@ def commissures_on(contour: FloatArray, anterior: Leaflet, posterior: Leaflet) -
     GeometryError
         It is not near to each of the leaflets once, in one piece.
     """
-    distance = [
-        _nearest(contour, leaflet.vertices[leaflet.loop])[0] for leaflet in (anterior, posterior)
-    ]
+    distance = [_nearest(contour, leaflet.curve)[0] for leaflet in leaflets]
     # Over as many neighbours as make a few mm, so that no single point decides.
     difference = distance[0] - distance[1]
     width = max(1, round(0.02 * len(contour)))
-    smooth = sum(np.roll(difference, k) for k in range(-width, width + 1))
-    nearer = smooth < 0
+    nearer = sum(np.roll(difference, k) for k in range(-width, width + 1)) < 0
     changes = np.flatnonzero(nearer != np.roll(nearer, 1))
     if len(changes) != 2:
         raise GeometryError(
@@ -111,92 +94,105 @@ def commissures_on(contour: FloatArray, anterior: Leaflet, posterior: Leaflet) -
 
 
 def joined(
-    anterior: Leaflet,
-    posterior: Leaflet,
-    where: Commissures,
+    leaflets: Sequence[Leaflet],
+    commissures: FloatArray,
+    contour: FloatArray | None,
     down: FloatArray,
-    max_seam_mm: float,
-    seams: FloatArray | None = None,
-) -> JoinedLeaflets:
-    """Join two leaflets.
+    how: Joining,
+) -> tuple[RegionSurface, FloatArray, float]:
+    """Join the anterior and the posterior leaflet to a band that faces the ventricle.
 
     Parameters
     ----------
-    anterior, posterior
-    where
+    leaflets
+    commissures
+        ``(2, 3)`` mm, where the annulus passes from one leaflet to the other.
+    contour
+        ``(k, 3)`` mm, closed curve along the annulus, or None.
     down
         ``(3,)`` from the annulus to the ventricle.
-    max_seam_mm
-        Distance up to which boundaries that leave a commissure side by side are joined.
-    seams
-        Share of the free edges that is joined instead, `seams` of another frame: where the
-        valve is closed the edges lie side by side all along.
+    how
+
+    Returns
+    -------
+    surface : RegionSurface
+        Regions 0 (anterior) and 1 (posterior).
+    seams : (2, 2)
+        As in `Joining`.
+    gap : float
+        mm, largest distance between the leaflets that a strip of triangles spans.
 
     Raises
     ------
     GeometryError
-        The commissures are not at the leaflets, or what is joined is no leaflets.
+        The commissures are not at the leaflets, what is joined is no leaflets, or the coordinates
+        of the band fold over.
     """
-    leaflets = (anterior, posterior)
     for name, leaflet in zip(REGIONS, leaflets, strict=True):
-        away = float(_nearest(where.points, leaflet.vertices[leaflet.loop])[0].max())
+        away = float(_nearest(commissures, leaflet.curve)[0].max())
         if away > MAX_GAP:
             raise GeometryError(
                 f"the {name} leaflet ends {away:.1f} mm from a commissure, expected at most "
                 f"{MAX_GAP:g} mm: do leaflets and annulus have the same axes and phase?"
             )
-    front, front_annulus, front_edge = _facing_ventricle(
-        anterior, posterior, where, down, max_seam_mm
-    )
-    back, back_annulus, back_edge = _facing_ventricle(posterior, anterior, where, down, max_seam_mm)
-    ends = front.vertices[front_annulus[[0, -1]]]
-    begin = back.vertices[back_annulus[0]]
-    if np.argmin(np.linalg.norm(ends - begin, axis=1)) != 1:
+    place = (commissures, contour, down, how.max_seam_mm)
+    front, *arcs = _facing_ventricle(leaflets[0], leaflets[1], *place)
+    back, *others = _facing_ventricle(leaflets[1], leaflets[0], *place)
+    ends, begins = front.vertices[arcs[0][[-1, 0]]], back.vertices[others[0][[0, -1]]]
+    gap = np.linalg.norm(ends - begins, axis=1)
+    if gap.sum() > np.linalg.norm(ends - begins[::-1], axis=1).sum():
         raise GeometryError("both leaflets lie on the same side of the commissures")
-    gap = max(
-        float(np.linalg.norm(front.vertices[a] - back.vertices[b]))
-        for a, b in ((front_annulus[0], back_annulus[-1]), (front_annulus[-1], back_annulus[0]))
-    )
-    if gap > MAX_GAP:
+    if gap.max() > MAX_GAP:
         raise GeometryError(
-            f"the leaflets are {gap:.1f} mm apart at a commissure, expected at most {MAX_GAP:g} mm"
+            f"the leaflets are {gap.max():.1f} mm apart at a commissure, expected at most "
+            f"{MAX_GAP:g} mm"
         )
     vertices = np.concatenate([front.vertices, back.vertices])
-    offset = len(front.vertices)
-    front_edge, back_edge = front_edge, back_edge + offset
-    triangles = [front.triangles, back.triangles + offset]
-    region = [np.zeros(len(triangles[0]), np.int64), np.ones(len(triangles[1]), np.int64)]
-    same, shares, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
+    faces = [front.triangles, back.triangles + len(front.vertices)]
+    region = [np.full(len(own), k) for k, own in enumerate(faces)]
+    edges = (arcs[1], others[1] + len(front.vertices))
+    same, seams, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
     # A free edge begins where the annulus of its leaflet ends, and there the other one ends.
-    for k, (a, b) in enumerate(((front_edge, back_edge[::-1]), (back_edge, front_edge[::-1]))):
-        given = None if seams is None else (seams[k, k], seams[k, 1 - k])
-        i, j = _seam(vertices[a], vertices[b], max_seam_mm, given)
-        shares[k, k], shares[k, 1 - k] = _shares(vertices[a])[i], _shares(vertices[b])[j]
+    for k in range(2):
+        a, b = edges[k], edges[1 - k][::-1]
+        given = None if how.seams is None else (how.seams[k, k], how.seams[k, 1 - k])
+        i, j = _seam(vertices[a], vertices[b], how.max_seam_mm, given)
+        seams[k, k], seams[k, 1 - k] = _shares(vertices[a])[i], _shares(vertices[b])[j]
         a, b = a[: i + 1], b[: j + 1]
-        strip, of_first, gap = _strip(vertices, a, b)
+        strip, sides, width = _strip(vertices, a, b)
         distance, nearest = _nearest(vertices[b], vertices[a])
         same[b[distance < COINCIDENT]] = a[nearest[distance < COINCIDENT]]
-        triangles.append(strip)
-        region.append(np.where(of_first, k, 1 - k))
-        gaps.append(gap)
-    faces, labels = same[np.concatenate(triangles)], np.concatenate(region)
-    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    used, inverse = np.unique(faces[proper], return_inverse=True)
-    vertices = vertices[used]
-    faces, _ = without_ears(inverse.reshape(-1, 3))
-    middle = np.searchsorted(used, same[front_annulus[len(front_annulus) // 2]])
-    annulus, edge = sorted(two_loops(vertices, faces), key=lambda loop: middle not in loop)
-    return JoinedLeaflets(vertices, faces, labels[proper], annulus, edge, shares, max(gaps))
+        faces.append(strip)
+        region.append(np.where(sides == 0, k, 1 - k))
+        gaps.append(width)
+    corners, labels = same[np.concatenate(faces)], np.concatenate(region)
+    proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    used, inverse = np.unique(corners[proper], return_inverse=True)
+    triangles, _ = without_ears(inverse.reshape(-1, 3))
+    middle = np.searchsorted(used, same[arcs[0][len(arcs[0]) // 2]])
+    loops = sorted(two_loops(vertices[used], triangles), key=lambda loop: middle not in loop)
+    band = LeafletBand.of(vertices[used], triangles, labels[proper], loops[0], loops[1], 0)
+    around = 0.5 * sum(loop_length(vertices[used][loop]) for loop in loops)
+    along = areas(vertices[used], triangles).sum() / around
+    return _drawn(band, around, along, how), seams, max(gaps)
 
 
 def _facing_ventricle(
-    leaflet: Leaflet, other: Leaflet, where: Commissures, down: FloatArray, beside_mm: float
+    leaflet: Leaflet,
+    other: Leaflet,
+    commissures: FloatArray,
+    contour: FloatArray | None,
+    down: FloatArray,
+    beside_mm: float,
 ) -> tuple[Leaflet, IntArray, IntArray]:
     """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
     for candidate in (leaflet, leaflet.turned()):
-        arcs = candidate.arcs(where.points[0], where.points[1])
-        annulus = arcs[_which_is_annulus(candidate, arcs, other, where.contour)]
-        ring = np.vstack([candidate.vertices[annulus], other.vertices[other.loop].mean(0)])
+        arcs = candidate.arcs(commissures[0], commissures[1])
+        to = other.vertices if contour is None else contour
+        away = [float(_nearest(candidate.vertices[arc], to)[0].mean()) for arc in arcs]
+        # The annulus is nearer to the contour, or else farther from the other leaflet.
+        annulus = arcs[int(np.argmax(away) if contour is None else np.argmin(away))]
+        ring = np.vstack([candidate.vertices[annulus], other.curve.mean(0)])
         if loop_vector_area(ring) @ down > 0:
             return candidate, *_cornered(candidate, annulus, other, beside_mm)
     raise GeometryError("a leaflet lies in the axis of the annulus, to neither side of the other")
@@ -210,23 +206,19 @@ def _cornered(
     A commissure is marked to some mm. Along the annulus the other leaflet comes nearer up to the
     corner; behind it the two boundaries lie beside each other.
     """
-    start = rough[len(rough) // 2]
-    loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == start)[0]))
-    to = _dense(other.vertices[other.loop])
-    reach = loop_length(leaflet.vertices[loop])
-    half = _shares(leaflet.vertices[rough])[len(rough) // 2] * _arc(leaflet.vertices[rough])
+    middle = len(rough) // 2
+    loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == rough[middle])[0]))
+    reach = min(MAX_MISS, 0.2 * loop_length(leaflet.curve))
+    rough_way = _along(leaflet.vertices[rough])
     ends = []
     for way, expected in (
-        (loop, _arc(leaflet.vertices[rough]) - half),
-        (loop[[0, *range(len(loop) - 1, 0, -1)]], half),
+        (loop, rough_way[-1] - rough_way[middle]),
+        (np.r_[loop[0], loop[:0:-1]], rough_way[middle]),
     ):
-        along = np.cumsum(
-            np.r_[0.0, np.linalg.norm(np.diff(leaflet.vertices[way], axis=0), axis=1)]
-        )
-        near = np.abs(along - expected) <= min(MAX_MISS, 0.2 * reach)
-        distance = np.where(near, _nearest(leaflet.vertices[way], to)[0], np.inf)
-        beside = distance <= max(beside_mm, float(distance.min()))
-        first = int(np.argmax(beside))
+        along = _along(leaflet.vertices[way])
+        off = np.linalg.norm(closest_on_loop(leaflet.vertices[way], other.curve)[2], axis=1)
+        distance = np.where(np.abs(along - expected) <= reach, off, np.inf)
+        first = int(np.argmax(distance <= max(beside_mm, float(distance.min()))))
         window = (along >= along[first]) & (along <= along[first] + CORNER)
         settled = distance <= distance[window].min() + SETTLED
         ends.append(way[first + int(np.argmax(settled[first:]))])
@@ -236,35 +228,13 @@ def _cornered(
     return np.r_[loop[begin:], loop[: last + 1]], loop[last : begin + 1]
 
 
-def _arc(curve: FloatArray) -> float:
-    return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
-
-
-def _dense(loop: FloatArray) -> FloatArray:
-    """A closed curve with points so near to each other that the nearest is that of the curve."""
-    following = np.roll(loop, -1, axis=0)
-    count = np.maximum(1, np.ceil(np.linalg.norm(following - loop, axis=1) / DENSE).astype(int))
-    share = np.concatenate([np.arange(n) / n for n in count])[:, None]
-    return (
-        np.repeat(loop, count, axis=0) * (1 - share) + np.repeat(following, count, axis=0) * share
-    )
-
-
-def _which_is_annulus(
-    leaflet: Leaflet,
-    arcs: tuple[IntArray, IntArray],
-    other: Leaflet,
-    contour: FloatArray | None,
-) -> int:
-    """The arc that is nearer to the annulus, or else farther from the other leaflet."""
-    to = other.vertices if contour is None else contour
-    distance = [float(_nearest(leaflet.vertices[arc], to)[0].mean()) for arc in arcs]
-    return int(np.argmax(distance) if contour is None else np.argmin(distance))
+def _along(curve: FloatArray) -> FloatArray:
+    """Length (mm) of a curve ``(k, 3)`` up to each of its points."""
+    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
 
 
 def _shares(curve: FloatArray) -> FloatArray:
-    length = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(curve, axis=0), axis=1)])
-    return length / length[-1]
+    return _along(curve) / _along(curve)[-1]
 
 
 def _seam(
@@ -286,26 +256,23 @@ def _seam(
     return i, j
 
 
-def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, BoolArray, float]:
-    """Triangles between two rows of vertices, whether each has two of the first, and their width.
+def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, IntArray, float]:
+    """Triangles between two rows of vertices, the row that has two corners of each, their width.
 
-    The first row runs as the boundary of its leaflet does, the second one against it.
+    The first row runs as the boundary of its leaflet does, the second one against it. Of the two
+    triangles that may come next, the one with the shorter new edge is taken.
     """
+    x, y = vertices[a], vertices[b]
+    across = np.pad(np.linalg.norm(x[:, None] - y, axis=2), (0, 1), constant_values=np.inf)
     i = j = 0
-    triangles, of_first = [], []
-    width = float(np.linalg.norm(vertices[a[0]] - vertices[b[0]]))
-    while i + 1 < len(a) or j + 1 < len(b):
-        ahead_a = ahead_b = np.inf
-        if i + 1 < len(a):
-            ahead_a = float(np.linalg.norm(vertices[a[i + 1]] - vertices[b[j]]))
-        if j + 1 < len(b):
-            ahead_b = float(np.linalg.norm(vertices[b[j + 1]] - vertices[a[i]]))
-        first = ahead_a <= ahead_b
-        triangles.append([a[i + 1], a[i], b[j]] if first else [b[j], b[j + 1], a[i]])
-        of_first.append(first)
-        i, j = (i + 1, j) if first else (i, j + 1)
-        width = max(width, min(ahead_a, ahead_b))
-    return np.array(triangles, dtype=np.int64), np.array(of_first, dtype=np.bool_), width
+    triangles, sides, width = [], [], across[0, 0]
+    while (i, j) != (len(a) - 1, len(b) - 1):
+        side = int(across[i + 1, j] > across[i, j + 1])
+        triangles.append([b[j], b[j + 1], a[i]] if side else [a[i + 1], a[i], b[j]])
+        sides.append(side)
+        i, j = i + 1 - side, j + side
+        width = max(width, across[i, j])
+    return np.array(triangles, dtype=np.int64), np.array(sides, dtype=np.int64), float(width)
 
 
 def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -314,41 +281,19 @@ def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
     return np.atleast_1d(distance), np.atleast_1d(number)
 
 
-def drawn_anew(
-    leaflets: JoinedLeaflets, edge_mm: float, offset_mm: tuple[float, float]
-) -> RegionSurface:
-    """The band with triangles of one size on the lines of its coordinates, moved off its side.
-
-    Parameters
-    ----------
-    leaflets
-    edge_mm
-        Of the triangles, on average.
-    offset_mm
-        By which the anterior and the posterior leaflet are moved to the ventricle: half a thickness
-        turns an atrial surface into the midsurface.
-
-    Raises
-    ------
-    GeometryError
-        Its coordinates fold over.
-    """
-    loops = leaflets.annulus, leaflets.free_edge
-    chart = LeafletBand.of(leaflets.vertices, leaflets.triangles, leaflets.region, *loops, 0)
-    around = 0.5 * sum(loop_length(leaflets.vertices[loop]) for loop in loops)
-    along = areas(leaflets.vertices, leaflets.triangles).sum() / around
-    columns = 4 * max(6, round(around / edge_mm / 4))
-    grid = band_grid(columns, 1 + max(4, round(along / edge_mm)))
+def _drawn(band: LeafletBand, around: float, along: float, how: Joining) -> RegionSurface:
+    """A band of a mean size (mm) on the lines of its coordinates, moved off its side."""
+    columns = 4 * max(6, round(around / how.edge_mm / 4))
+    grid = band_grid(columns, 1 + max(4, round(along / how.edge_mm)))
     # The grid's angle runs against that of the chart; both have the anterior leaflet in 0 to 180.
     phi = np.mod(180.0 - grid.phi, 360.0)
-    drawn = chart.position(phi, grid.s).reshape(-1, columns, 3)
-    drawn = _smooth_rims(_flat_part(drawn, np.where(phi[:columns] < 180, *offset_mm)))
-    vertices: FloatArray = drawn.reshape(-1, 3)
+    rows = band.position(phi, grid.s).reshape(-1, columns, 3)
+    rows = _smooth_rims(_flat_part(rows, np.where(phi[:columns] < 180, *how.offset_mm)))
+    vertices: FloatArray = rows.reshape(-1, 3)
     between = np.mod(grid.phi, 180.0) == 0
-    by = np.where(between, sum(offset_mm) / 2, np.where(grid.phi < 180, *offset_mm))
-    if any(offset_mm):
-        normals = smooth_vertex_normals(vertices, grid.triangles)
-        vertices = vertices + by[:, None] * normals
+    by = np.where(grid.phi < 180, *how.offset_mm)
+    by = np.where(between, sum(how.offset_mm) / 2, by)
+    vertices = vertices + by[:, None] * smooth_vertex_normals(vertices, grid.triangles)
     return RegionSurface(vertices, grid.triangles, grid.region, {})
 
 

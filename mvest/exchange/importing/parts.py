@@ -23,6 +23,10 @@ from mvest.valve.geometry.triangles import areas, surface_edges
 
 MAX_HOLE = 0.2
 """Of a leaflet's boundary: how long that of a hole may be, which is closed."""
+MARGINAL_MM = 4.0
+"""From the free edge, within which a chord inserts as marginal ones do."""
+MAX_AWAY = 3.0
+"""mm from where a chord begins to its papillary tip."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,39 +57,36 @@ class Leaflet:
         GeometryError
             It is closed, no manifold, or has a hole that is a second boundary.
         """
-        whole = merged(
-            RegionSurface(vertices, triangles, np.zeros(len(triangles), dtype=np.int64), {})
-        )
-        faces = whole.triangles
+        nothing = np.zeros(len(triangles), dtype=np.int64)
+        whole = merged(RegionSurface(vertices, triangles, nothing, {}))
+        points, faces = whole.vertices, whole.triangles
         apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        faces = faces[apart & (areas(whole.vertices, faces) > 0)]
-        faces = _largest_piece(whole.vertices, faces)
-        loops = boundary_loops(faces)
+        faces = _largest_piece(points, faces[apart & (areas(points, faces) > 0)])
+        loops = sorted(boundary_loops(faces), key=lambda loop: -loop_length(points[loop]))
         if not loops:
             raise GeometryError(
                 "a closed surface, expected one side of a leaflet: an open surface that ends at "
                 "the annulus and at the free edge"
             )
-        length = [loop_length(whole.vertices[loop]) for loop in loops]
-        outer = int(np.argmax(length))
-        points = [whole.vertices]
-        n = len(whole.vertices)
-        for number, loop in enumerate(loops):
-            if number == outer:
-                continue
-            if length[number] > MAX_HOLE * length[outer]:
+        outer, *holes = loops
+        for hole in holes:
+            around = [loop_length(points[loop]) for loop in (outer, hole)]
+            if around[1] > MAX_HOLE * around[0]:
                 raise GeometryError(
-                    f"boundaries of {length[outer]:.0f} and {length[number]:.0f} mm, expected one: "
-                    "a leaflet that ends at the annulus and at the free edge"
+                    f"boundaries of {around[0]:.0f} and {around[1]:.0f} mm, expected one: a "
+                    "leaflet that ends at the annulus and at the free edge"
                 )
-            points.append(whole.vertices[loop].mean(axis=0, keepdims=True))
-            fan = np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), n)])
-            faces = np.concatenate([faces, fan])
-            n += 1
+            middle = np.full(len(hole), len(points))
+            faces = np.vstack([faces, np.column_stack([np.roll(hole, -1), hole, middle])])
+            points = np.vstack([points, points[hole].mean(axis=0)])
         used, inverse = np.unique(faces, return_inverse=True)
-        faces = inverse.reshape(-1, 3)
-        loop = np.searchsorted(used, loops[outer])
-        return cls(np.concatenate(points)[used], faces, loop, len(loops) - 1)
+        loop = np.searchsorted(used, outer)
+        return cls(points[used], inverse.reshape(-1, 3), loop, len(holes))
+
+    @property
+    def curve(self) -> FloatArray:
+        """``(k, 3)`` mm, the boundary."""
+        return self.vertices[self.loop]
 
     def turned(self) -> Leaflet:
         """The same with its triangles facing the other way."""
@@ -96,7 +97,7 @@ class Leaflet:
 
         Both arcs have both ends.
         """
-        curve = self.vertices[self.loop]
+        curve = self.curve
         start, stop = (
             int(np.argmin(np.linalg.norm(curve - point, axis=1))) for point in (first, second)
         )
@@ -125,12 +126,6 @@ def _largest_piece(vertices: FloatArray, triangles: IntArray) -> IntArray:
     return triangles[of_triangle == np.argmax(area)]
 
 
-MARGINAL_MM = 4.0
-"""From the free edge, within which a chord inserts as marginal ones do."""
-MAX_AWAY = 3.0
-"""mm from where a chord begins to its papillary tip."""
-
-
 def chord_lines(segments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Chords from papillary tip to insertion of segments that may branch.
 
@@ -151,74 +146,48 @@ def chord_lines(segments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     begin, end = number.reshape(-1, 2).T
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     trunk = {int(e): k for k, e in enumerate(end)}
-    chords, lengths, tips = [], [], []
-    for k in range(len(segments)):
-        if end[k] in begin:
-            continue
-        root, total, seen = k, float(length[k]), {k}
-        while (before := trunk.get(int(begin[root]))) is not None and before not in seen:
-            root, total = before, total + float(length[before])
-            seen.add(before)
-        chords.append([segments[root, 0], segments[k, 1]])
-        lengths.append(total)
-        tips.append(int(begin[root]))
-    return (
-        np.array(chords).reshape(-1, 2, 3),
-        np.array(lengths),
-        joints[sorted(set(tips))].reshape(-1, 3),
-    )
+    last = np.flatnonzero(~np.isin(end, begin))
+    first, total = [], []
+    for k in last.tolist():
+        way, root = {k: None}, k
+        while (before := trunk.get(int(begin[root]))) is not None and before not in way:
+            root = before
+            way[root] = None
+        first.append(root)
+        total.append(length[list(way)].sum())
+    chords = np.stack([segments[first, 0], segments[last, 1]], axis=1)
+    return chords, np.array(total), joints[np.unique(begin[first])]
 
 
 def write_chords(
-    folder: Path,
-    chords: FloatArray,
-    lengths: FloatArray,
-    tips: FloatArray,
-    free_edge: FloatArray,
-    derived: list[str],
-) -> dict[str, Any]:
-    """Write the table of a case's chordae; returns its entry in ``case.yaml``.
+    folder: Path, seen: tuple[FloatArray, FloatArray], tips: FloatArray, free_edge: FloatArray
+) -> tuple[dict[str, Any], str]:
+    """Write the table of a case's chordae: chords ``(c, 2, 3)`` and lengths ``(c,)``, mm.
 
-    Parameters
-    ----------
-    folder
-    chords, lengths
-        ``(c, 2, 3)`` from tip to insertion and ``(c,)``, mm.
-    tips, free_edge
-        ``(t, 3)`` and ``(k, 3)`` mm.
-    derived
-        Gets a sentence about families and stiffness, of which such models say nothing.
+    Returns its entry in ``case.yaml`` and a sentence about families and stiffness, of which such
+    models say nothing.
 
     Raises
     ------
     InputError
-        Chords begin elsewhere than at the tips.
+        Chords begin elsewhere than at the tips ``(t, 3)``.
     """
+    chords, lengths = seen
     away = np.linalg.norm(chords[:, 0, None] - tips, axis=2)
     if away.min(axis=1).max() > MAX_AWAY:
         raise InputError("chords begin elsewhere than at the papillary tips; leave out tips=...")
     layout, insertion = ChordLayout(), chords[:, 1]
-    to_edge = np.atleast_1d(cKDTree(free_edge).query(insertion)[0])
-    family = np.where(to_edge > MARGINAL_MM, 1, 0)
+    family = np.where(cKDTree(free_edge).query(insertion)[0] > MARGINAL_MM, 1, 0)
     # As stiff together as the template's, of which there may be fewer.
     marginal = len(layout.marginal_phi) * layout.marginal_stiffness
     basal = len(layout.basal) * layout.basal_stiffness
     count = np.bincount(family, minlength=2)
     each = 2 * np.array([marginal, basal]) / np.maximum(count, 1)
-    write_columns(
-        folder / "chordae.csv",
-        CHORD_COLUMNS,
-        zip(
-            away.argmin(axis=1).tolist(),
-            *insertion.T.tolist(),
-            [FAMILIES[k] for k in family],
-            lengths.tolist(),
-            each[family].tolist(),
-            strict=True,
-        ),
-    )
-    derived.append(
+    names = [FAMILIES[k] for k in family]
+    columns = (away.argmin(axis=1), *insertion.T, names, lengths, each[family])
+    rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+    write_columns(folder / "chordae.csv", CHORD_COLUMNS, rows)
+    return {"chordae": {"file": "chordae.csv", "families": list(FAMILIES)}}, (
         f"chordae: {len(chords)} of the export, as long as there; the {count[0]} within "
         f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
     )
-    return {"chordae": {"file": "chordae.csv", "families": list(FAMILIES)}}

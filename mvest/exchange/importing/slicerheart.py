@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,10 @@ from mvest.cases.rims import two_loops
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
-from mvest.exchange.importing.joining import (
-    REGIONS,
-    Commissures,
-    JoinedLeaflets,
-    commissures_on,
-    drawn_anew,
-    joined,
-)
+from mvest.exchange.importing.joining import REGIONS, Joining, commissures_on, joined
 from mvest.exchange.importing.parts import Leaflet, write_chords
-from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_batch, read_fem
+from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
+from mvest.exchange.markups import TO_LPS
 from mvest.exchange.regions import RegionSurface
 from mvest.exchange.surfaces import write_surface
 from mvest.typing import FloatArray
@@ -53,6 +46,8 @@ class SlicerheartOptions:
     ----------
     scene : str or None
         Whose files are taken where a folder holds those of several.
+    only : str or None
+        What the names of surfaces must hold, where there are several of one leaflet.
     open, closed : str or None
         Phase (MD, ED, MS, ES, ...) of the reference and of the closed frame; MD, ED, CD and MS,
         ES, CS in this order if not given. For folders of ValveFemExport, which name no phase,
@@ -79,6 +74,7 @@ class SlicerheartOptions:
     """
 
     scene: str | None = None
+    only: str | None = None
     open: str | None = None
     closed: str | None = None
     tips: tuple[float, ...] | None = None
@@ -99,6 +95,11 @@ class SlicerheartOptions:
         for name, low, high in (("edge_mm", 0.3, 5.0), ("seam_mm", 0.0, 10.0)):
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"{name}={getattr(self, name)}, expected {low:g} to {high:g} mm")
+
+    @property
+    def thickness(self) -> tuple[float, ...]:
+        """Of the anterior and the posterior leaflet (mm), stated or generic."""
+        return self.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,30 +143,29 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         words = str(fault)
         start = "" if words.startswith(str(source)) else f"{source}: "
         raise type(fault)(f"{start}{words}") from fault
-    return dataclasses.replace(case, sha256="")
+    return replace(case, sha256="")
 
 
 def _chosen(
     source: Path, options: SlicerheartOptions, derived: list[str]
 ) -> list[tuple[SeenPhase, Role]]:
     """The phases that are taken, in the order of time."""
-    if not any(source.rglob("*_atrial_*.vtk")):
-        seen = [(read_fem(source, ""), Role.REFERENCE)]
-        if options.closed is not None:
-            folder = Path(options.closed)
-            if not folder.is_dir():
-                raise InputError(f"closed={options.closed}: no such folder")
-            seen.append((read_fem(folder, ""), Role.CLOSED))
-        return seen
-    by_phase = {seen.phase: seen for seen in read_batch(source, options.scene)}
-    listed = ", ".join(by_phase)
-    for name, phase in (("open", options.open), ("closed", options.closed)):
+    by_phase = {s.phase: s for s in read_folder(source, options.scene, options.only)}
+    closed = options.closed
+    if closed is not None and Path(closed).is_dir():
+        others = read_folder(Path(closed), options.scene, options.only)
+        if len(others) > 1:
+            raise InputError(f"closed={closed}: {len(others)} phases, expected one")
+        closed = others[0].phase or "closed"
+        by_phase[closed] = others[0]
+    listed = ", ".join(by_phase) or "one without a name"
+    for name, phase in (("open", options.open), ("closed", closed)):
         if phase is not None and phase not in by_phase:
             raise InputError(f"{name}={phase}: no such phase, there are {listed}")
-    opened = options.open or next((p for p in OPEN if p in by_phase), None)
+    opened = options.open or next((p for p in (*OPEN, "") if p in by_phase), None)
     if opened is None:
         raise InputError(f"no open phase ({', '.join(OPEN)}) among {listed}; give open=PHASE")
-    closed = options.closed or next((p for p in CLOSED if p in by_phase and p != opened), None)
+    closed = closed or next((p for p in CLOSED if p in by_phase and p != opened), None)
     further = [p for p in CLOSED if p in by_phase and p not in (opened, closed)]
     left = [p for p in by_phase if p not in (opened, closed, *further)]
     if left:
@@ -181,41 +181,35 @@ def _placed(
     chosen: Sequence[tuple[SeenPhase, Role]], options: SlicerheartOptions, derived: list[str]
 ) -> list[_Phase]:
     phases: list[_Phase] = []
-    thickness = _thickness(options, derived)
-    offset = (0.0, 0.0) if options.midsurface else (thickness[0] / 2, thickness[1] / 2)
+    offset = (0.0, 0.0)
+    if options.thickness_mm is None:
+        derived.append(
+            "thickness: {} mm (anterior), {} mm (posterior) assumed; thickness_mm=[...] states it"
+            "".format(*options.thickness)
+        )
     if not options.midsurface:
+        offset = (options.thickness[0] / 2, options.thickness[1] / 2)
         derived.append(
             "midsurface: the atrial surfaces moved to the ventricle by half the thickness "
             f"({offset[0]:g} and {offset[1]:g} mm); edges that curl by over 30 degrees left out"
         )
-    seams = None
+    how = Joining(options.seam_mm, options.edge_mm, offset)
     for seen, role in chosen:
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")
-        name = PHASES.get(seen.phase, label)
+        notes = list(seen.notes)
         try:
-            derived += seen.notes
-            tips = _tips_of(seen, role, options, phases, derived, label)
-            raw = _join(seen, tips, options, seams, derived, label)
-            seams = raw.seams
-            surface = drawn_anew(raw, options.edge_mm, offset)
+            tips = _tips_of(seen, role, options, phases, notes)
+            surface, seams = _join(seen, tips, options, how, notes)
         except MvestError as fault:
             raise type(fault)(f"{label}: {fault}") from fault
-        phases.append(_Phase(seen, role, name, surface, tips))
+        # The closed edges lie side by side all along, and are joined as far as the open ones.
+        how = replace(how, seams=seams)
+        derived += [f"{label}: {note}" for note in notes]
+        phases.append(_Phase(seen, role, PHASES.get(seen.phase, label), surface, tips))
     derived.append(
         f"surfaces drawn anew on the lines of their coordinates, edges about {options.edge_mm:g} mm"
     )
     return phases
-
-
-def _thickness(options: SlicerheartOptions, derived: list[str]) -> tuple[float, float]:
-    if options.thickness_mm is not None:
-        return options.thickness_mm[0], options.thickness_mm[1]
-    assumed = GENERIC_THICKNESS["anterior"], GENERIC_THICKNESS["posterior"]
-    derived.append(
-        f"thickness: {assumed[0]:g} mm (anterior), {assumed[1]:g} mm (posterior) assumed; "
-        "thickness_mm=[...] states it"
-    )
-    return assumed
 
 
 def _tips_of(
@@ -223,8 +217,7 @@ def _tips_of(
     role: Role,
     options: SlicerheartOptions,
     before: Sequence[_Phase],
-    derived: list[str],
-    label: str,
+    notes: list[str],
 ) -> FloatArray:
     given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
     if given is not None:
@@ -232,7 +225,7 @@ def _tips_of(
     if seen.tips is not None:
         return seen.tips
     if before:
-        derived.append(f"papillary tips of {label}: where they are in {before[0].name}")
+        notes.append(f"papillary tips where they are in {before[0].name}")
         return before[0].tips
     raise InputError(
         "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial, "
@@ -244,66 +237,54 @@ def _join(
     seen: SeenPhase,
     tips: FloatArray,
     options: SlicerheartOptions,
-    seams: FloatArray | None,
-    derived: list[str],
-    label: str,
-) -> JoinedLeaflets:
+    how: Joining,
+    notes: list[str],
+) -> tuple[RegionSurface, FloatArray]:
     leaflets = []
-    for name, surface in zip(REGIONS, seen.leaflets, strict=True):
+    for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
         try:
-            leaflets.append(Leaflet.of(*surface))
+            leaflets.append(Leaflet.of(vertices, triangles))
         except GeometryError as fault:
             raise type(fault)(f"{name} leaflet: {fault}") from fault
         if leaflets[-1].holes:
-            derived.append(f"{label}, {name} leaflet: {leaflets[-1].holes} holes closed")
-    anterior, posterior = leaflets
-    edges = np.concatenate([leaf.vertices[leaf.loop] for leaf in leaflets])
+            notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
+    edges = np.concatenate([leaflet.curve for leaflet in leaflets])
     down = tips.mean(axis=0) - edges.mean(axis=0)
-    _check_axes(seen, edges, down, options)
+    _check_axes(seen, edges, down, options.mirrored)
     if {"ALC", "PMC"} <= set(seen.landmarks):
         points = np.stack([seen.landmarks["ALC"], seen.landmarks["PMC"]])
     elif seen.contour is not None:
-        points = commissures_on(seen.contour, anterior, posterior)
-        derived.append(f"{label}: commissures where the leaflet nearer to the annulus changes")
+        points = commissures_on(seen.contour, leaflets)
+        notes.append("commissures where the leaflet nearer to the annulus changes")
     else:
         raise InputError(
             "neither the landmarks ALC and PMC nor the annulus; export ValveLandmarkPoints.csv or "
             "AnnulusContourPoints.csv"
         )
-    band = joined(
-        anterior, posterior, Commissures(points, seen.contour), down, options.seam_mm, seams
+    surface, seams, gap = joined(leaflets, points, seen.contour, down, how)
+    shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
+    notes.append(
+        f"leaflets joined at the commissures over {shares} % of their free edges, across at most "
+        f"{gap:.1f} mm"
     )
-    shares = ", ".join(f"{100 * share:.0f}" for share in band.seams.ravel())
-    derived.append(
-        f"{label}: leaflets joined at the commissures over {shares} % of their free edges, "
-        f"across at most {band.gap:.1f} mm"
-    )
-    return band
+    return surface, seams
 
 
-def _check_axes(
-    seen: SeenPhase, edges: FloatArray, down: FloatArray, options: SlicerheartOptions
-) -> None:
+def _check_axes(seen: SeenPhase, edges: FloatArray, down: FloatArray, mirrored: bool) -> None:
     """Raise where tables and surfaces have other axes, or the valve is its own mirror image."""
-    if seen.contour is not None:
-        turned = seen.contour * (-1.0, -1.0, 1.0)
-        away, other = _rms(seen.contour, edges), _rms(turned, edges)
-        if away > MAX_RMS:
-            hint = (
-                f" (with x and y turned it would be {other:.1f} mm: one of them is in RAS where "
-                "LPS is stated, or the other way round)"
-                if other < MAX_RMS
-                else ""
-            )
-            raise InputError(
-                f"the annulus lies {away:.1f} mm from the leaflets, expected at most "
-                f"{MAX_RMS:g} mm{hint}"
-            )
+    if seen.contour is not None and (away := _rms(seen.contour, edges)) > MAX_RMS:
+        other = _rms(seen.contour * TO_LPS["RAS"], edges)
+        hint = (
+            f" (with x and y turned it would be {other:.1f} mm: one of them is in RAS where LPS is "
+            "stated, or the other way round)"
+        )
+        raise InputError(
+            f"the annulus lies {away:.1f} mm from the leaflets, expected at most {MAX_RMS:g} mm"
+            f"{hint if other < MAX_RMS else ''}"
+        )
     marks = seen.landmarks
-    if options.mirrored or not {"A", "P"} <= set(marks):
-        return
     for left, right in (("ALC", "PMC"), ("AL", "PM")):
-        if {left, right} <= set(marks):
+        if not mirrored and {"A", "P", left, right} <= set(marks):
             sides = np.stack([marks[left] - marks[right], marks["A"] - marks["P"], down])
             # From the atrium the antero-lateral commissure is on the left of the anterior leaflet.
             if np.linalg.det(sides) < 0:
@@ -311,7 +292,6 @@ def _check_axes(
                     f"the landmarks A, P, {left} and {right} lie as in a mirror: from the atrium "
                     f"{left} is on the right; is one axis turned? (mirrored=true takes it so)"
                 )
-            return
 
 
 def _rms(points: FloatArray, edges: FloatArray) -> float:
@@ -340,7 +320,6 @@ def _document(
     options: SlicerheartOptions,
     derived: list[str],
 ) -> dict[str, Any]:
-    thickness = options.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
     if len(phases) > 1:
         derived.append("times: by the order of the phases in a generic cardiac cycle")
@@ -374,7 +353,7 @@ def _document(
         "source": "SlicerHeart",
         "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
         "regions": list(REGIONS),
-        "thickness": dict(zip(REGIONS, map(float, thickness), strict=True)),
+        "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
         "frames": frames,
         **_chordae(folder, phases[0], derived),
         **(
@@ -387,10 +366,11 @@ def _document(
 
 
 def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, Any]:
-    if not len(reference.seen.chords):
+    seen, surface = reference.seen, reference.surface
+    if not len(seen.chords):
         return {}
-    vertices = reference.surface.vertices
-    loops = two_loops(vertices, reference.surface.triangles)
-    edge = min((vertices[loop] for loop in loops), key=lambda curve: _rms(curve, reference.tips))
-    seen = reference.seen
-    return write_chords(folder, seen.chords, seen.chord_lengths, reference.tips, edge, derived)
+    loops = [surface.vertices[k] for k in two_loops(surface.vertices, surface.triangles)]
+    edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
+    entry, said = write_chords(folder, (seen.chords, seen.chord_lengths), reference.tips, edge)
+    derived.append(said)
+    return entry

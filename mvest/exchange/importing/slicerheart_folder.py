@@ -1,27 +1,28 @@
-"""Folders that SlicerHeart's modules ValveBatchExport and ValveFemExport write, as they stand.
+"""Folders of SlicerHeart: what each file is, by the words of its name.
 
-Names and columns are those of its source (``ValveBatchExport/ValveBatchExportRules``,
-``ValveFemExport/ValveFemExport.py``, ``HeartValveLib/Constants.py``). Models are in the axes that
-their header names (``SPACE=LPS``; without it RAS, as before Slicer 4.11), tables in R, A, S of the
-same origin. Everything is LPS in mm here.
+ValveBatchExport begins every name with ``SCENE_VALVE_frame_N_PHASE`` (``ValveBatchExportRules/
+base.py``). What follows changed over the months: leaflet surfaces were ``mitral_anterior_leaflet``
+from April 2026, ``atrial_mitral_anterior_leaflet`` from August 2026, when the former became the
+name of closed surfaces of segments. ValveFemExport, and people who save models one by one, name
+neither scene nor phase. Models are in the axes that they name (``SPACE=LPS``; without it RAS, as
+before Slicer 4.11), tables in R, A, S of the same origin. Everything is LPS in mm here.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.parts import chord_lines
-from mvest.exchange.markups import TO_LPS, read_markups
-from mvest.exchange.surfaces import check_finite
-from mvest.exchange.vtk_legacy import PolyDataFile, read_polydata
-from mvest.reading.bounded import refusing
-from mvest.reading.text import numbers, read_columns
+from mvest.exchange.markups import TO_LPS, PointList, read_markups
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, Mesh, read_mesh
+from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
 PHASES = {
@@ -35,35 +36,53 @@ PHASES = {
     "UN": "unknown",
     **{f"P{k}": f"custom{k}" for k in range(1, 5)},
 }
-"""Names of the phases by what file names and tables call them."""
-_SURFACE = re.compile(
-    rf"(?P<scene>.+?)_(?P<valve>[^_]+)_(?:frame_(?P<frame>\d{{1,6}})_)?(?P<phase>{'|'.join(PHASES)})"
-    r"(?:_(?P<again>\d+))?_atrial_(?P<leaflet>.+)\.vtk"
+"""Names of the phases by what file names and tables call them (``HeartValveLib/Constants.py``)."""
+_NAME = re.compile(
+    r"(?P<scene>.+?)_(?P<valve>mitral|tricuspid|aortic|pulmonary|cavc|lavv|unknown|\S+ \w+ valve)"
+    rf"(?:_frame_(?P<frame>\d{{1,6}}))?_(?P<phase>{'|'.join(PHASES)})(?:_(?P<again>\d+))?"
+    r"(?:_(?P<rest>.+))?"
 )
-_CONTOUR = ("AnnulusContourX", "AnnulusContourY", "AnnulusContourZ")
-_LANDMARK = ("LandmarkR", "LandmarkA", "LandmarkS")
+_PHASE = re.compile(r"(?:.*[^A-Za-z0-9])?(?P<phase>[MEC][DS])(?:[^A-Za-z0-9].*)?")
+"""In names of other kinds, where CT is a modality and P1 a scallop."""
+LEAFLETS = {"anterior": {"anterior", "aml"}, "posterior": {"posterior", "pml"}}
+MUSCLES = (
+    ({"antero", "lateral"}, {"anterolateral"}, {"al"}),
+    ({"postero", "medial"}, {"posteromedial"}, {"pm"}),
+)
+"""Words of the two papillary muscles, in the order of a case's tips."""
+PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
+CHORDS, ANNULUS, MARKS = {"chords", "chordae"}, {"annulus"}, {"landmarks", "labels"}
+NO_LEAFLET = PAPILLARY | CHORDS | ANNULUS | {"ventricular"}
+LANDMARKS = ("A", "P", "AL", "PM", "ALC", "PMC")
+_COMMON = ("Filename", "Phase", "FrameNumber", "Valve")
 _TABLES = {
-    "AnnulusContourPoints.csv": (
-        "Filename",
-        "Phase",
-        "FrameNumber",
-        "Valve",
-        *_CONTOUR,
-        "AnnulusContourLabel",
-    ),
-    "ValveLandmarkPoints.csv": (
-        "Filename",
-        "Phase",
-        "Valve",
-        "FrameNumber",
-        "LandmarkLabel",
-        *_LANDMARK,
-    ),
+    "AnnulusContourPoints.csv": ("AnnulusContourLabel", [f"AnnulusContour{k}" for k in "XYZ"]),
+    "ValveLandmarkPoints.csv": ("LandmarkLabel", [f"Landmark{k}" for k in "RAS"]),
 }
-_SPACE = re.compile(r"\bSPACE=(LPS|RAS)\b")
-_MUSCLES = (r"antero.?lateral|\bAL\b", r"postero.?medial|\bPM\b")
-"""Of the two papillary muscles, in the order of a case's tips."""
-MAX_FILES = 2000
+MIN_CONTOUR = 8
+"""Points of an annulus."""
+MAX_FILES = 20_000
+
+
+def words_of(name: str) -> set[str]:
+    """Words of a name, also of one like ``AnnulusContour``, in lower case."""
+    return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)}
+
+
+class _File:
+    """A file, the words of its name, and what `_NAME` finds in it; empty where it does not."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        stem = path.name.removesuffix(".json").rpartition(".")[0]
+        match = _NAME.fullmatch(stem) or _PHASE.fullmatch(stem)
+        found = {key: value or "" for key, value in match.groupdict().items()} if match else {}
+        self.scene, self.valve, self.frame, self.phase, self.again = (
+            found.get(key, "") for key in ("scene", "valve", "frame", "phase", "again")
+        )
+        self.words = words_of(found.get("rest", stem))
+        named = [name for name, words in LEAFLETS.items() if words & self.words]
+        self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,287 +98,224 @@ class SeenPhase:
     contour
         ``(k, 3)`` mm, closed curve along the annulus, or None.
     landmarks
-        ``(3,)`` mm by label: A, P, AL, PM, ALC, PMC, MC, ...
+        ``(3,)`` mm by label, of `LANDMARKS`.
     tips
         ``(2, 3)`` mm, antero-lateral and postero-medial, or None.
     chords
         ``(c, 2, 3)`` mm from tip to insertion, with their lengths in ``chord_lengths``.
     notes
-        What was assumed in reading.
+        What was assumed in reading, and what was not used.
     """
 
     phase: str
-    leaflets: tuple[tuple[FloatArray, IntArray], tuple[FloatArray, IntArray]]
+    leaflets: tuple[tuple[FloatArray, IntArray], ...]
     contour: FloatArray | None
     landmarks: dict[str, FloatArray]
     tips: FloatArray | None
-    chords: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 3)))
-    chord_lengths: FloatArray = field(default_factory=lambda: np.zeros(0))
-    notes: tuple[str, ...] = ()
+    chords: FloatArray
+    chord_lengths: FloatArray
+    notes: tuple[str, ...]
 
 
-def read_batch(folder: Path, scene: str | None) -> list[SeenPhase]:
-    """Every phase of the mitral valve of one scene that ValveBatchExport wrote.
+def read_folder(folder: Path, scene: str | None = None, only: str | None = None) -> list[SeenPhase]:
+    """Every phase of the mitral valve of one scene; of ValveFemExport the one that it wrote.
+
+    Parameters
+    ----------
+    folder
+    scene
+        Whose files are taken where there are those of several.
+    only
+        What the names of surfaces must hold, where there are several of one leaflet.
 
     Raises
     ------
     InputError, GeometryError
-        No atrial surfaces of a mitral valve, several scenes, a damaged file.
+        No leaflets of a mitral valve, several scenes, several surfaces of a leaflet, a damaged
+        file.
     """
-    files = _named(folder, _SURFACE, "**/*_atrial_*.vtk")
-    scenes = sorted({match["scene"] for match in files.values()})
-    if scene is None and len(scenes) > 1:
+    paths = sorted(islice(folder.rglob("*"), MAX_FILES + 1))
+    if len(paths) > MAX_FILES:
+        raise InputError(f"{folder}: more than {MAX_FILES} files; name one scene's folder")
+    models, lists = (
+        [_File(path) for path in paths if path.name.lower().endswith(ends) and path.is_file()]
+        for ends in (SURFACE_SUFFIXES, (".fcsv", ".mrk.json"))
+    )
+    above = [f for f in models if f.path.parent == folder]
+    models = above if any(f.leaflet for f in above) else models
+    leaflets = [f for f in models if f.leaflet and (only or "").lower() in f.path.name.lower()]
+    scenes = sorted({f.scene for f in leaflets} - {""})
+    chosen = [f for f in leaflets if scene in (None, f.scene) and f.valve.lower() in ("mitral", "")]
+    if not chosen:
+        found = one_line(", ".join(f.path.name for f in leaflets or models) or "no models", 150)
+        raise InputError(
+            f"{folder}: no surfaces of mitral leaflets, named anterior and posterior (or AML, PML)"
+            f"{'' if scene is None else f', of scene {scene!r}'}; found {found}"
+        )
+    if len(scenes) > 1 and scene is None:
         raise InputError(
             f"{folder}: {len(scenes)} scenes ({', '.join(scenes[:5])}); give scene=NAME"
         )
-    chosen = scenes[0] if scene is None and scenes else scene
-    mine = {
-        file: match
-        for file, match in files.items()
-        if match["scene"] == chosen and match["valve"].lower() == "mitral"
-    }
-    if not mine:
-        valves = sorted({match["valve"] for match in files.values()}) or ["none"]
-        raise InputError(
-            f"{folder}: no surfaces SCENE_mitral_frame_N_PHASE_atrial_LEAFLET.vtk"
-            f"{'' if chosen is None else f' of scene {chosen!r}'} (valves: "
-            f"{', '.join(valves[:5])}; scenes: {', '.join(scenes[:5]) or 'none'})"
-        )
-    tables = {
-        name: rows for name in _TABLES if (rows := _rows(folder, next(iter(mine)).parent, name))
-    }
-    seen = []
-    for phase in sorted({match["phase"] for match in mine.values()}, key=list(PHASES).index):
-        of_phase = {f: m for f, m in mine.items() if m["phase"] == phase}
-        frames = sorted({m["frame"] or "" for m in of_phase.values()}, key=lambda n: int(n or -1))
-        notes = []
-        if len(frames) > 1:
-            notes.append(
-                f"{phase}: frame {frames[0]} taken of frames {', '.join(frames)} of this phase"
-            )
-        # A second valve model of the same frame has a number behind its phase.
-        files_now = {
-            f: m for f, m in of_phase.items() if (m["frame"] or "") == frames[0] and not m["again"]
-        }
-        surfaces, spaces = _leaflets({m["leaflet"]: f for f, m in files_now.items()}, folder)
-        notes += spaces
-        this = {"Filename": chosen or "", "Phase": phase, "FrameNumber": frames[0]}
-        contour, labelled = _contour(tables.get("AnnulusContourPoints.csv"), this)
-        landmarks = labelled | _landmarks(tables.get("ValveLandmarkPoints.csv"), this)
-        stem = next(iter(files_now)).name.partition("_atrial_")[0]
-        for file in sorted(next(iter(files_now)).parent.glob(f"{_escaped(stem)}_landmarks.fcsv")):
-            landmarks |= _as_dict(read_fcsv(file))
-        tips = _tips(folder, phase, notes)
-        seen.append(SeenPhase(phase, surfaces, contour, landmarks, tips, notes=tuple(notes)))
-    return seen
+    of_phase = {phase: [f for f in chosen if f.phase == phase] for phase in PHASES}
+    left = [f for f in chosen if not f.phase]
+    seen = [_read_phase(folder, mine, models, lists) for mine in of_phase.values() if mine]
+    if not seen:
+        return [_read_phase(folder, left, models, lists)]
+    notes = seen[0].notes + (("surfaces that name no phase not used",) if left else ())
+    return [replace(seen[0], notes=notes), *seen[1:]]
 
 
-def _named(folder: Path, pattern: re.Pattern[str], glob: str) -> dict[Path, re.Match[str]]:
-    found = {}
-    for number, file in enumerate(sorted(folder.glob(glob))):
-        if number >= MAX_FILES:
-            raise InputError(f"{folder}: more than {MAX_FILES} surfaces; name one scene's folder")
-        match = pattern.fullmatch(file.name)
-        if match:
-            found[file] = match
-    return found
-
-
-def _escaped(name: str) -> str:
-    return re.sub(r"([*?\[])", r"[\1]", name)
-
-
-def _leaflets(
-    files: dict[str, Path], folder: Path
-) -> tuple[tuple[tuple[FloatArray, IntArray], tuple[FloatArray, IntArray]], list[str]]:
-    """Surfaces of the anterior and the posterior leaflet, and what their axes were taken to be."""
+def _read_phase(
+    folder: Path, mine: Sequence[_File], models: Sequence[_File], lists: Sequence[_File]
+) -> SeenPhase:
+    """What there is of the phase that some surfaces of leaflets are of."""
     notes: list[str] = []
-    chosen = []
-    for leaflet in ("anterior", "posterior"):
-        fitting = sorted(name for name in files if leaflet in name.lower())
-        if len(fitting) != 1:
-            raise InputError(
-                f"{folder}: {len(fitting)} surfaces of the {leaflet} leaflet "
-                f"({', '.join(fitting or sorted(files)[:5])}), expected one whose name says so"
-            )
-        file = files[fitting[0]]
-        with refusing(file, "leaflet"):
-            surface = _model(file, notes)
-            if surface.lines or not len(surface.triangles):
-                raise GeometryError("holds lines or no triangles; expected a surface")
-        chosen.append((surface.points, surface.triangles))
-    return (chosen[0], chosen[1]), notes
+    this = min(mine, key=lambda f: int(f.frame or -1))
+    if len(frames := sorted({f.frame for f in mine})) > 1:
+        notes.append(f"frame {this.frame} taken of frames {', '.join(frames)} of this phase")
+    mine = [f for f in mine if f.frame == this.frame]
+    surfaces = tuple(_leaflet(folder, mine, name, notes) for name in LEAFLETS)
+    beside = [f for f in models if f.phase == this.phase and not f.leaflet]
+    landmarks: dict[str, FloatArray] = {}
+    curves = []
+    for name in _TABLES:
+        labels, points = _table(name, (this.path.parent, folder, folder.parent), this)
+        curves += [points] if name.startswith("Annulus") else []
+        landmarks |= zip(labels, points, strict=True)
+    curves += [_middle_of_tube(f, notes) for f in beside if f.words & ANNULUS]
+    tips: dict[int, FloatArray] = {}
+    # Those of this phase last, so that they stand before those that name no phase.
+    for file in sorted(lists, key=lambda f: bool(f.phase)):
+        if any(
+            getattr(file, key) not in ("", getattr(this, key))
+            for key in ("scene", "valve", "frame", "phase")
+        ):
+            continue
+        for name, item in read_markups(file.path).items():
+            words = file.words | words_of(name)
+            found = _tips_in(file.path, words, item) if words & PAPILLARY else {}
+            used = bool(found)
+            tips |= found
+            if found and this.phase and not file.phase:
+                notes.append("papillary tips of a file that names no phase")
+            if item.kind in ("Curve", "ClosedCurve") and words & ANNULUS:
+                curves, used = [*curves, item.points], True
+            if item.kind == "Fiducial" and words & MARKS:
+                landmarks |= zip(item.labels, item.points, strict=True)
+                used = True
+            if not used and item.labels:
+                notes.append(f"{item.kind} of the points {', '.join(item.labels)} not used")
+            if item.unplaced:
+                notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
+    known = {label.strip().upper(): point for label, point in landmarks.items()}
+    if unused := known.keys() - {"", *LANDMARKS}:
+        notes.append(f"landmarks {', '.join(sorted(unused))} not used")
+    chords, lengths, roots = _chords([f for f in beside if f.words & CHORDS], notes)
+    if len(roots) not in (0, 2):
+        raise InputError(
+            f"{folder}: chords begin at {len(roots)} points, expected two papillary tips"
+        )
+    if len(tips) == 2:
+        roots = np.stack([tips[0], tips[1]])
+    return SeenPhase(
+        this.phase,
+        surfaces,
+        next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
+        {label: known[label] for label in LANDMARKS if label in known},
+        roots if len(roots) else None,
+        chords,
+        lengths,
+        tuple(dict.fromkeys(one_line(note) for note in notes)),
+    )
 
 
-def _model(file: Path, notes: list[str]) -> PolyDataFile:
+def _leaflet(
+    folder: Path, files: Sequence[_File], name: str, notes: list[str]
+) -> tuple[FloatArray, IntArray]:
+    """The surface of a leaflet: the atrial side before others, a fitted shell before its model."""
+    fitting = [f for f in files if f.leaflet == name]
+    for better in ("atrial", "fit"):
+        fitting = [f for f in fitting if better in f.words] or fitting
+    # A second valve model of the same frame has a number behind its phase.
+    fitting = [f for f in fitting if not f.again] or fitting
+    if len(fitting) != 1:
+        listed = one_line(", ".join(f.path.name for f in fitting or files), 150)
+        raise InputError(
+            f"{folder}: {len(fitting)} surfaces of the {name} leaflet ({listed}), expected one; "
+            "only=WORD takes those with a word in their names"
+        )
+    surface = _model(fitting[0], notes)
+    if not len(surface.triangles):
+        raise GeometryError(f"{fitting[0].path}: no triangles; expected a surface")
+    return surface.points, surface.triangles
+
+
+def _model(file: _File, notes: list[str]) -> Mesh:
     """A model with its points in LPS."""
-    model = read_polydata(file)
-    space = _SPACE.search(model.title)
-    if space is None:
+    model = read_mesh(file.path)
+    if model.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
     check_finite(model.points)
     return replace(model, points=model.points * TO_LPS[space[1] if space else "RAS"])
 
 
-def _rows(folder: Path, beside: Path, name: str) -> tuple[Path, dict[str, list[str]]] | None:
-    """A table that lies beside the surfaces or above them, as columns."""
-    for place in (beside, folder, folder.parent):
-        file = place / name
-        if file.is_file():
-            return file, read_columns(file, _TABLES[name])
-    return None
-
-
-def _of(
-    table: tuple[Path, dict[str, list[str]]], this: dict[str, str], coordinates: Iterable[str]
-) -> tuple[list[int], FloatArray]:
-    """Numbers of the rows of one frame, and their positions ``(r, 3)`` LPS."""
-    file, columns = table
+def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
+    """Labels and positions ``(r, 3)`` of one frame, of a table in the first place that has it."""
+    label, position = _TABLES[name]
+    file = next((place / name for place in places if (place / name).is_file()), None)
+    if file is None:
+        return [], np.zeros((0, 3))
+    columns = read_columns(file, (*_COMMON, label, *position))
+    wanted = (("Filename", this.scene), ("Phase", this.phase), ("FrameNumber", this.frame))
     rows = [
         k
         for k, valve in enumerate(columns["Valve"])
-        if valve.lower() == "mitral"
-        and all(columns[name][k] == value or not value for name, value in this.items())
+        if valve.lower() == "mitral" and all(columns[key][k] == v for key, v in wanted if v)
     ]
-    cells = [numbers(file, name, [columns[name][k] for k in rows]) for name in coordinates]
-    return rows, np.column_stack(cells).reshape(-1, 3) * TO_LPS["RAS"]
+    cells = [numbers(file, axis, [columns[axis][k] for k in rows]) for axis in position]
+    points = np.column_stack(cells).reshape(-1, 3) * TO_LPS["RAS"]
+    return [columns[label][k] for k in rows], points
 
 
-def _contour(
-    table: tuple[Path, dict[str, list[str]]] | None, this: dict[str, str]
-) -> tuple[FloatArray | None, dict[str, FloatArray]]:
-    """Contour and labelled points of the table of annulus points."""
-    if table is None:
-        return None, {}
-    rows, points = _of(table, this, _CONTOUR)
-    labels = [table[1]["AnnulusContourLabel"][k] for k in rows]
-    if len(points) < 8:
-        return None, {}
-    return points, _as_dict((label, p) for label, p in zip(labels, points, strict=True) if label)
+def _muscle(words: set[str]) -> int | None:
+    """Which papillary muscle some words name, if they name one."""
+    found = [k for k, names in enumerate(MUSCLES) if any(name <= words for name in names)]
+    return found[0] if len(found) == 1 else None
 
 
-def _landmarks(
-    table: tuple[Path, dict[str, list[str]]] | None, this: dict[str, str]
-) -> dict[str, FloatArray]:
-    if table is None:
-        return {}
-    rows, points = _of(table, this, _LANDMARK)
-    return _as_dict((table[1]["LandmarkLabel"][k], p) for k, p in zip(rows, points, strict=True))
+def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArray]:
+    """Tips by muscle: of a list of one muscle, or of points that are labelled with theirs.
 
-
-def _as_dict(points: Iterable[tuple[str, FloatArray]]) -> dict[str, FloatArray]:
-    return {label.strip(): point for label, point in points}
-
-
-def _tips(folder: Path, phase: str, notes: list[str]) -> FloatArray | None:
-    """Tips from lists of points named after the papillary muscles, their second point of three."""
-    files = [
-        file
-        for pattern in ("*.mrk.json", "*.fcsv")
-        for file in sorted(folder.rglob(pattern))
-        if "papillary" in file.name.lower()
-    ]
-    own = [f for f in files if _token(phase, f.name)]
-    files = own or [f for f in files if not any(_token(other, f.name) for other in PHASES)]
-    tips: dict[int, FloatArray] = {}
-    for file in files:
-        for name, points in _point_lists(file).items():
-            for muscle, words in enumerate(_MUSCLES):
-                labelled = [p for label, p in points if re.fullmatch(words[-6:], label, re.I)]
-                if re.search(words, f"{file.name} {name}".replace("_", " "), re.I):
-                    tip = [p for label, p in points if "tip" in label.lower()]
-                    if not tip and len(points) < 2:
-                        raise InputError(
-                            f"{file}: {len(points)} points of a papillary muscle, expected base, "
-                            "tip and insertion"
-                        )
-                    tips[muscle] = tip[0] if tip else points[1][1]
-                elif labelled:
-                    tips[muscle] = labelled[0]
-    if len(tips) < 2:
-        return None
-    if not own:
-        notes.append(f"{phase}: papillary tips of a file that names no phase")
-    return np.stack([tips[0], tips[1]])
-
-
-def _token(phase: str, name: str) -> bool:
-    return bool(phase) and re.search(rf"(?<![A-Za-z0-9]){phase}(?![A-Za-z0-9])", name) is not None
-
-
-def _point_lists(file: Path) -> dict[str, list[tuple[str, FloatArray]]]:
-    if file.suffix == ".fcsv":
-        return {file.name: read_fcsv(file)}
-    return {
-        name: list(zip(item.labels, item.points, strict=True))
-        for name, item in read_markups(file).items()
-    }
-
-
-def read_fem(folder: Path, phase: str) -> SeenPhase:
-    """What ValveFemExport wrote of one valve.
-
-    Leaflets are the models whose names say so, as open surfaces; the annulus is the middle of the
-    tube that stands for it; chords are the line models, from tip to insertion, the branches of one
-    joined to its trunk.
-
-    Raises
-    ------
-    InputError, GeometryError
-        No leaflets, a damaged file.
+    A list of one has base, tip and insertion (``PAPILLARY_MUSCLE_POINT_LABELS``).
     """
-    files = [file for file in sorted(folder.glob("*.vtk"))[:MAX_FILES] if file.is_file()]
-    lines = [f for f in files if f.name.startswith("Chords_mesh")]
-    surfaces = {f.stem: f for f in files if f not in lines and "leaflet" in f.stem.lower()}
-    if not surfaces:
+    muscle = _muscle(words)
+    if muscle is None:
+        which = [(_muscle(words_of(label)), k) for k, label in enumerate(item.labels)]
+        return {m: item.points[k] for m, k in which if m is not None}
+    tip = [k for k, label in enumerate(item.labels) if "tip" in label.lower()]
+    if not tip and len(item.points) < 2:
         raise InputError(
-            f"{folder}: no surfaces *_atrial_*.vtk of ValveBatchExport and no models *leaflet*.vtk "
-            "of ValveFemExport"
+            f"{file}: {len(item.points)} points of a papillary muscle, expected base, tip and "
+            "insertion"
         )
-    # Where a shell was fitted to a leaflet its name goes on, and the leaflet itself may lie beside.
-    fitted = {name: file for name, file in surfaces.items() if name.endswith("-fit")}
-    leaflets, notes = _leaflets(fitted or surfaces, folder)
-    contour = None
+    return {muscle: item.points[tip[0] if tip else 1]}
+
+
+def _chords(files: Sequence[_File], notes: list[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chords ``(c, 2, 3)``, their lengths ``(c,)`` and their tips of models of lines."""
+    segments = []
     for file in files:
-        if re.search(r"annulus", file.stem, re.I) and file not in surfaces.values():
-            with refusing(file, "annulus"):
-                contour = _middle_of_tube(_model(file, notes).points)
-    ends = [_ends(file, notes) for file in lines]
-    segments = np.concatenate(ends) if ends else np.zeros((0, 2, 3))
-    chords, lengths, tips = chord_lines(segments)
-    if len(tips) not in (0, 2):
-        raise InputError(
-            f"{folder}: chords begin at {len(tips)} points, expected two papillary tips"
-        )
-    own = _tips(folder, phase, notes)
-    return SeenPhase(
-        phase,
-        leaflets,
-        contour,
-        {},
-        own if own is not None else (tips if len(tips) else None),
-        chords,
-        lengths,
-        tuple(notes),
-    )
-
-
-def _ends(file: Path, notes: list[str]) -> FloatArray:
-    with refusing(file, "chords"):
         model = _model(file, notes)
         if any(len(line) != 2 for line in model.lines):
-            raise InputError("lines of other than two points, expected one for every chord")
-        return model.points[np.array(model.lines, dtype=np.int64).reshape(-1, 2)]
+            raise InputError(f"{file.path}: lines of other than two points, expected one a chord")
+        ends = np.array(model.lines, dtype=np.int64).reshape(-1, 2)
+        segments.append(model.points[ends])
+    return chord_lines(np.concatenate(segments) if segments else np.zeros((0, 2, 3)))
 
 
-def _middle_of_tube(points: FloatArray) -> FloatArray:
-    """The curve in the middle of a tube whose points are rings one after another.
-
-    Raises
-    ------
-    GeometryError
-        They are no such rings.
-    """
+def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
+    """The curve in the middle of a tube whose points are rings one after another."""
+    points = _model(file, notes).points
     for sides in range(3, 101):
         if len(points) % sides or len(points) // sides < 8:
             continue
@@ -368,4 +324,4 @@ def _middle_of_tube(points: FloatArray) -> FloatArray:
         radius = np.linalg.norm(rings - middle[:, None], axis=2)
         if np.ptp(radius) < 0.05 * radius.mean():
             return middle
-    raise GeometryError(f"{len(points)} points that are no tube; expected that of the annulus")
+    raise GeometryError(f"{file.path}: {len(points)} points, expected the tube of the annulus")

@@ -1,6 +1,8 @@
 """Folders of SlicerHeart, written by VTK and pandas, become cases."""
 
+import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,20 +12,22 @@ from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
+from mvest.exchange.markups import PointList, write_markups
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.mesh.given import GivenValve
 from tests.cases.folders import template_case
-
-pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
 from tests.exchange.importing.slicerheart_exports import (
     atrial_leaflet,
     batch_export,
     fem_export,
     in_lps,
+    vtk,
+    vtk_to_numpy,
     write_model,
 )
+from tests.places import field_input
 
 OPTIONS = SlicerheartOptions(pressure_mmHg=120.0)
 TRUTH = template_case(64, 16)
@@ -38,6 +42,13 @@ def exported(tmp_path_factory):
 def folder(exported, tmp_path):
     """A copy to change."""
     return shutil.copytree(exported, tmp_path / "P001")
+
+
+def sphere():
+    source = vtk.vtkSphereSource()
+    source.SetRadius(10)
+    source.Update()
+    return source.GetOutput()
 
 
 def away(frame, truth):
@@ -151,6 +162,70 @@ def test_models_in_r_a_s_are_the_same_valve(folder, case):
     assert "names no axes in its header, so R, A, S are assumed" in " | ".join(found.derived)
 
 
+NAMES = {
+    "April to August 2026": lambda name: name.replace("_atrial", ""),
+    "by hand": lambda name: re.sub(r".*_(M.)_atrial_mitral_(.).*", r"\2ml-\1.vtk", name).upper(),
+    "in words": lambda name: re.sub(r".*_(M.)_atrial_mitral_(\w+)_leaflet", r"\1 \2 Leaflet", name),
+}
+
+
+@pytest.mark.parametrize("names", NAMES)
+def test_surfaces_of_other_names_are_the_same_valve(folder, case, names):
+    for file in folder.glob("*_atrial_*"):
+        file.rename(file.with_name(NAMES[names](file.name).replace(".VTK", ".vtk")))
+    found = import_slicerheart(folder, OPTIONS)
+    for frame, expected in zip(found.frames, case.frames, strict=True):
+        assert np.array_equal(frame.vertices, expected.vertices)
+
+
+def test_the_atrial_side_is_taken_before_closed_segments(folder, case):
+    for file in folder.glob("*_atrial_*"):
+        write_model(file.with_name(file.name.replace("_atrial", "")), sphere())
+    assert np.array_equal(
+        import_slicerheart(folder, OPTIONS).surface.vertices, case.surface.vertices
+    )
+    for file in folder.glob("*_atrial_*"):
+        file.unlink()
+    refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
+
+
+def test_of_several_surfaces_of_a_leaflet_one_word_chooses(folder, case):
+    for file in folder.glob("*_atrial_*"):
+        shutil.copy(file, file.with_name(file.name.replace("_atrial", "_atrial_smooth")))
+    refused(folder, r"2 surfaces of the anterior leaflet \(P001.*\), expected one; only=WORD takes")
+    found = import_slicerheart(folder, replace(OPTIONS, only="smooth"))
+    assert np.array_equal(found.surface.vertices, case.surface.vertices)
+
+
+def test_points_that_are_not_used_are_said(folder, case):
+    lists = {"mine": PointList(("chord 1",), np.zeros((1, 3)))}
+    write_markups(folder / "MD.mrk.json", lists)
+    text = (folder / "MD.mrk.json").read_text().replace('"Fiducial"', '"Line"', 1)
+    (folder / "unplaced_MS.mrk.json").write_text(text.replace('"defined"', '"undefined"'))
+    with (folder / "ValveLandmarkPoints.csv").open("a") as table:
+        table.write("P001,MS,mitral,12,apex,1,2,3\n")
+    found = import_slicerheart(folder, OPTIONS)
+    assert np.array_equal(found.surface.vertices, case.surface.vertices)
+    assert "MD: Fiducial of the points chord 1 not used" in found.derived
+    assert "MS: points chord 1 not placed, so not used" in found.derived
+    assert "MS: landmarks APEX not used" in found.derived
+
+
+def test_a_folder_of_april_2026_is_read_as_vtk_reads_it():
+    folder = field_input("slicerheart_apr2026")
+    found = import_slicerheart(folder, SlicerheartOptions())
+    assert [frame.name for frame in found.frames] == ["mid-diastole", "mid-systole"]
+    for frame, phase in zip(found.frames, ("MD", "MS"), strict=True):
+        for leaflet, half_thickness in (("anterior", 0.66), ("posterior", 0.63)):
+            (file,) = folder.glob(f"*_{phase}_mitral_{leaflet}_leaflet.vtk")
+            reader = vtk.vtkPolyDataReader()
+            reader.SetFileName(str(file))
+            reader.Update()
+            points = vtk_to_numpy(reader.GetOutput().GetPoints().GetData()).astype(float)
+            off = closest_points(points, frame.vertices, frame.triangles).distance
+            assert np.median(off) == pytest.approx(half_thickness, abs=0.05)
+
+
 def refused(folder, words, kind=InputError, **options):
     with pytest.raises(kind, match=words) as caught:
         import_slicerheart(folder, SlicerheartOptions(**options))
@@ -184,7 +259,7 @@ def test_missing_tips_are_asked_for_by_name(folder):
     refused(folder, r"MD: no papillary tips .*; give tips=\[x,y,z,x,y,z\] in LPS mm")
     given = import_slicerheart(folder, SlicerheartOptions(tips=tuple(tips.ravel())))
     assert given.frame(Role.REFERENCE).papillary_tips == pytest.approx(tips)
-    assert "papillary tips of MS: where they are in mid-diastole" in " | ".join(given.derived)
+    assert "MS: papillary tips where they are in mid-diastole" in " | ".join(given.derived)
 
 
 def test_missing_annulus_is_asked_for_by_name(folder):
@@ -201,7 +276,7 @@ def test_other_valves_scenes_and_phases_are_refused(folder):
     refused(folder, r"2 scenes \(P001, P002\); give scene=NAME")
     for file in folder.glob("*_atrial_*"):
         file.rename(file.with_name(file.name.replace("mitral_frame", "tricuspid_frame")))
-    refused(folder, "no surfaces SCENE_mitral.*valves: tricuspid", scene="P001")
+    refused(folder, "no surfaces of mitral leaflets.*; found P001_tricuspid_frame", scene="P001")
 
 
 def test_damaged_and_closed_surfaces_are_refused(folder):
@@ -210,11 +285,7 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     file.write_bytes(content[:2000])
     refused(folder, "anterior_leaflet.vtk: damaged")
     file.write_bytes(content)
-    vtk = pytest.importorskip("vtk")
-    sphere = vtk.vtkSphereSource()
-    sphere.SetRadius(10)
-    sphere.Update()
-    write_model(file, sphere.GetOutput())
+    write_model(file, sphere())
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
 
 
