@@ -26,9 +26,13 @@ from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, predict
 from mvest.estimation.transform import Transform
-from mvest.exchange.external.contract import read_points, write_points
+from mvest.exchange.external.contract import (
+    Command,
+    files_of_command,
+    read_points,
+    write_points,
+)
 from mvest.exchange.external.model import Differences, ProcessModel
-from mvest.exchange.external.process import Command, files_of_command
 from mvest.problem.estimate import StudyResult
 from mvest.problem.record import EstimateRecord, record_of, spread
 from mvest.reporting.tables import Column, table

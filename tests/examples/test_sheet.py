@@ -8,9 +8,8 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
-from mvest.exchange.external.contract import RunRequest, read_answer, write_request
+from mvest.exchange.external.contract import Command, RunRequest, read_answer, write_request
 from mvest.exchange.external.model import Differences, ProcessModel
-from mvest.exchange.external.process import Command
 from tests.places import ROOT
 
 pytest.importorskip("skfem")

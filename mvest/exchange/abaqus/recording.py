@@ -14,40 +14,31 @@ Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w),
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mvest.errors import InputError, MvestError
-from mvest.exchange.abaqus.deck import TRUSSES, Deck, ElementSection
-from mvest.exchange.abaqus.deck_file import read_deck
-from mvest.exchange.abaqus.mesh import (
-    ChordPaths,
-    LeafletMesh,
-    SetNames,
-    leaflet_mesh,
-    shell_numbers,
-    trace_cables,
-    truss_stiffness,
-)
+from mvest.errors import InputError
+from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
+from mvest.exchange.abaqus.deck import Deck, lookup
+from mvest.exchange.child import in_child
 from mvest.exchange.surfaces import read_mesh
+from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
-from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.surface_coordinates import surface_coordinates
-from mvest.valve.mesh.remesh import Remeshed
+from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
+from mvest.valve.mesh.remesh import Remeshed, remesh
 
 TOLERANCE_MM = 1e-3
 """Frames are stored in single precision, whose rounding at 30 mm is 2e-6 mm."""
 SAME_MM = 1e-6
 """Between anchors at one place."""
 MAX_FRAMES = 500
-MAX_COORDINATES = 2**26
-"""Of all frames together: half a GiB."""
 EXTENT_MM = (5.0, 500.0)
 """Of the leaflets: a valve in cm or m is not taken for one in mm."""
 PRESSURE_MPA = (1e-4, 0.1)
@@ -60,133 +51,51 @@ class Recording:
 
     Attributes
     ----------
-    surface : LeafletSurface
-        Fine midsurface in frame 0, normals to the ventricle, fibres parallel to the annulus.
-    annulus, free_edge : ndarray
-        Vertices of the two edges in loop order.
+    valve : Valve
+        On its fine midsurface in frame 0, normals to the ventricle, fibres parallel to the annulus.
+        Its motion is that which the deck prescribes, at the times of the frames.
     frames : ndarray
-        ``(f, n, 3)`` mm, recorded positions of the vertices of ``surface``.
+        ``(f, n, 3)`` mm, recorded positions of the vertices.
     times : ndarray
         ``(f,)`` s, from 0 to the end of the step.
-    annulus_displacement : ndarray
-        ``(f, n_annulus, 3)`` mm, prescribed for the vertices ``annulus``.
-    papillary_tips : ndarray
-        ``(f, n_tips, 3)`` mm; the anchors grouped by position in frame 0.
-    cables : ChordPaths
-        The chord network as straight cables; ``anchor`` counts papillary tips and ``insertion``
-        vertices of ``surface``.
-    cable_family : ndarray
-        ``(c,)`` number of the section of each cable's end at the leaflet.
-    cable_sections : tuple of ElementSection
-    deck : Deck
     pressure : float
         MPa on the ventricular face at the end.
     pressure_share : ndarray
         ``(f,)`` share of the pressure.
     """
 
-    surface: LeafletSurface
-    annulus: IntArray
-    free_edge: IntArray
+    valve: Valve
     frames: FloatArray
     times: FloatArray
-    annulus_displacement: FloatArray
-    papillary_tips: FloatArray
-    cables: ChordPaths
-    cable_family: IntArray
-    cable_sections: tuple[ElementSection, ...]
-    deck: Deck
     pressure: float
     pressure_share: FloatArray
 
-    @property
-    def phase(self) -> FloatArray:
-        """``(f,)`` smooth step over the recorded time, from 0 to 1, as a closure is paced."""
-        t = self.times / self.times[-1]
-        return np.asarray(t**3 * (10 - 15 * t + 6 * t**2))
-
     def positions(self, triangle: IntArray, weights: FloatArray, frame: int) -> FloatArray:
-        """Recorded positions ``(k, 3)`` mm of material points in one frame.
+        """Recorded positions ``(k, 3)`` mm in one frame of material points of the midsurface.
 
         Parameters
         ----------
         triangle, weights : ndarray
-            ``(k,)`` and ``(k, 3)``: triangles of ``surface`` and barycentric weights, as from
-            :func:`mvest.valve.mesh.remesh.remesh` or :meth:`locate`.
+            ``(k,)`` and ``(k, 3)``: triangles and barycentric weights, as those of
+            :class:`mvest.valve.mesh.remesh.Remeshed`.
         frame : int
             0 is the reference; -1 the last, closed one.
         """
-        corner = self.frames[frame][self.surface.triangles[triangle]]
+        corner = self.frames[frame][self.valve.surface.triangles[triangle]]
         return np.einsum("ij,ijk->ik", weights, corner)
 
-    def locate(self, points: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Triangles and weights of the material points closest to ``points (k, 3)`` at rest."""
-        closest = closest_points(points, self.surface.vertices, self.surface.triangles)
-        return closest.triangle, closest.barycentric
-
-    def valve(
-        self,
-        coarse: Remeshed | None = None,
-        *,
-        linearisation_strain: float = 0.01,
-        toe_strain: float = 0.01,
-    ) -> Valve:
-        """The valve on its fine midsurface or on a remeshed one.
-
-        Parameters
-        ----------
-        coarse : Remeshed, optional
-            ``remesh(recording.surface, recording.annulus, recording.free_edge, n)``.
-        linearisation_strain : float
-            Strain of the secant stiffness of the chordae. At 1 %, chordae act as strings that
-            hardly lengthen; the far higher stiffness of exponential ones at several percent would
-            describe a state that no recorded closure reaches.
-        toe_strain : float
-            Toe of the cable law.
-
-        Raises
-        ------
-        InputError
-            If the deck's chord materials are none that are read.
-        """
-        surface = self.surface if coarse is None else coarse.surface
-        annulus = self.annulus if coarse is None else coarse.annulus
-        free_edge = self.free_edge if coarse is None else coarse.free_edge
-        stiffness = np.array(
-            [
-                truss_stiffness(section, self.deck.materials, linearisation_strain)
-                for section in self.cable_sections
-            ]
-        )
-        chordae = Chordae(
-            tip=self.cables.anchor,
-            insertion=self.surface.vertices[self.cables.insertion],
-            family=self.cable_family,
-            family_names=tuple(section.material.lower() for section in self.cable_sections),
-            rest_length=self.cables.length,
-            axial_stiffness=stiffness[self.cable_family] * self.cables.stiffness_share,
-            toe_strain=toe_strain,
-        )
-        return Valve(
-            surface=surface,
-            annulus=annulus,
-            free_edge=free_edge,
-            papillary_tips=self.papillary_tips[0],
-            chordae=chordae,
-            motion=self._motion(surface.vertices[annulus]),
-        )
-
-    def _motion(self, annulus_points: FloatArray) -> Motion:
-        triangle, weights = self.locate(annulus_points)
-        corners = self.surface.triangles[triangle]
-        displacement = np.zeros((len(self.times), *self.surface.vertices.shape))
-        displacement[:, self.annulus] = self.annulus_displacement
-        step = np.einsum("ij,fijk->fik", weights, displacement[:, corners])
-        return Motion(
-            phase=self.phase,
-            annulus=annulus_points + step,
-            papillary_tips=self.papillary_tips,
-        )
+    def remeshed(self, count: int) -> tuple[Remeshed, Valve]:
+        """The midsurface with so many vertices, and the valve on it."""
+        fine = self.valve
+        coarse = remesh(fine.surface, fine.annulus, fine.free_edge, count)
+        own = coarse.annulus
+        step = np.zeros((len(self.times), *fine.surface.vertices.shape))
+        step[:, fine.annulus] = fine.motion.annulus - fine.surface.vertices[fine.annulus]
+        corners = step[:, fine.surface.triangles[coarse.triangle[own]]]
+        moved = np.einsum("ij,fijk->fik", coarse.weights[own], corners)
+        motion = replace(fine.motion, annulus=coarse.surface.vertices[own] + moved)
+        surface = {name: getattr(coarse, name) for name in ("surface", "annulus", "free_edge")}
+        return coarse, replace(fine, **surface, motion=motion)
 
 
 def recording_files(folder: Path) -> list[Path]:
@@ -210,8 +119,26 @@ def recording_files(folder: Path) -> list[Path]:
     return [deck, *(frames[k] for k in range(len(frames)))]
 
 
-def read_recording(folder: Path, names: SetNames) -> Recording:
+def read_recording(
+    folder: Path,
+    leaflets: Mapping[str, str],
+    annulus: str,
+    free_edge: str,
+    toe_strain: float = 0.01,
+) -> Recording:
     """Read a recorded closure.
+
+    Parameters
+    ----------
+    folder : Path
+    leaflets : mapping
+        Region -> element set. Names of sets are given with or without their instance, in any case.
+    annulus, free_edge : str
+        Node sets.
+    toe_strain : float
+        Of the chordae, at which their secant stiffness is taken. At 1 %, chordae act as strings
+        that hardly lengthen; the far higher stiffness of exponential ones at several percent would
+        describe a state that no recorded closure reaches.
 
     Raises
     ------
@@ -219,75 +146,142 @@ def read_recording(folder: Path, names: SetNames) -> Recording:
         If files are absent or damaged, the deck states what is not read, or frames and deck
         contradict each other.
     """
-    path, *frame_files = recording_files(folder)
-    deck = read_deck(path)
-    times = np.linspace(0.0, deck.period, len(frame_files))
-    try:
-        pressure, share = _pressure(deck, names, times)
-        mesh = leaflet_mesh(deck, names, turned=pressure < 0)
-        _check_extent(mesh)
-        trusses = _Trusses.of(deck)
-        anchors = trusses.anchors(deck, mesh)
-        tips, tip_of_anchor = _group_anchors(deck, anchors, times)
-        cables = trace_cables(deck.nodes, trusses.edges, anchors, mesh.nodes)
-        order = np.argsort(anchors)
-        anchor = order[np.searchsorted(anchors[order], cables.anchor)]
-        family = trusses.section_at(cables.insertion)
-        moved = deck.moved(mesh.nodes[mesh.annulus], times)
-    except MvestError as fault:
-        raise type(fault)(f"{path}: {fault}") from fault
-    positions = _read_frames(frame_files, deck)
-    _check_motion(frame_files, deck, mesh.nodes[mesh.annulus], times, positions)
-    _check_motion(frame_files, deck, anchors, times, positions)
-    coordinates = surface_coordinates(mesh.vertices, mesh.triangles, mesh.annulus, mesh.free_edge)
-    insertion = np.searchsorted(mesh.nodes, cables.insertion)
-    return Recording(
-        surface=LeafletSurface(
-            vertices=mesh.vertices,
-            triangles=mesh.triangles,
-            region=mesh.region,
-            region_names=tuple(names.leaflets),
-            fibre=coordinates.circumferential,
-            thickness=mesh.thickness,
+    path, *files = recording_files(folder)
+    sets = [list(leaflets.values()), annulus, free_edge]
+    found = in_child(recorded, path, *sets, toe_strain, len(files), seconds=600.0)
+    nodes, vertices, held = found["nodes"], found["vertices"], found["held"]
+    frames = []
+    for k, file in enumerate(files):
+        points = read_mesh(file).points
+        if points.shape != nodes.shape:
+            raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
+        if k == 0 and not np.abs(points - nodes).max() <= TOLERANCE_MM:
+            raise InputError(f"{file}: points are not the nodes of the deck")
+        error = np.abs(points[held] - found["held_path"][k]).max()
+        if not error <= TOLERANCE_MM:
+            raise InputError(
+                f"{file}: {error:.2g} mm away from the deck's prescribed motion (tolerance "
+                f"{TOLERANCE_MM} mm)"
+            )
+        frames.append(points[vertices])
+    times = found["times"]
+    t = times / times[-1]
+    phase = t**3 * (10 - 15 * t + 6 * t**2)  # as a closure is paced
+    chordae = {key: value for key, value in found["chordae"].items() if key != "family_names"}
+    valve = Valve(
+        surface=LeafletSurface(nodes[vertices], region_names=tuple(leaflets), **found["surface"]),
+        annulus=found["annulus"],
+        free_edge=found["free_edge"],
+        papillary_tips=found["tips"][0],
+        chordae=Chordae(
+            **chordae, family_names=tuple(found["chordae"]["family_names"]), toe_strain=toe_strain
         ),
-        annulus=mesh.annulus,
-        free_edge=mesh.free_edge,
-        frames=np.ascontiguousarray(positions[:, mesh.nodes]),
-        times=times,
-        annulus_displacement=moved,
-        papillary_tips=tips,
-        cables=replace(cables, anchor=tip_of_anchor[anchor], insertion=insertion),
-        cable_family=family,
-        cable_sections=trusses.sections,
-        deck=deck,
-        pressure=abs(pressure),
-        pressure_share=share,
+        motion=Motion(phase, found["held_path"][:, : len(found["annulus"])], found["tips"]),
     )
+    pressure, share = found["pressure"], found["pressure_share"]
+    return Recording(valve, np.array(frames), times, pressure, share)
 
 
-def _check_extent(mesh: LeafletMesh) -> None:
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
+def deck_sets(path: Path) -> list[str]:
+    """Names of the element and node sets of a deck; called in the child."""
+    sets = Deck(path).sets
+    return [*sets["ELSET"], *sets["NSET"]]
+
+
+def recorded(
+    path: Path,
+    leaflets: Sequence[str],
+    annulus: str,
+    free_edge: str,
+    toe_strain: float,
+    count: int,
+) -> dict[str, Any]:
+    """What a deck says of a recording of so many frames; called in the child.
+
+    Returns
+    -------
+    dict
+        Parts of the valve and of its pressure; ``vertices`` are numbers of ``nodes``. The nodes
+        ``held``, first those of the annulus, take the path ``held_path`` ``(f, h, 3)``.
+    """
+    deck = Deck(path)
+    times = np.linspace(0.0, deck.period, count)
+    groups = _shells(deck, leaflets)
+    pressure, share = _pressure(deck, np.concatenate(groups), times)
+    nodes = np.array(deck.nodes)
+    surface, vertices, rims = _leaflets(deck, groups, annulus, free_edge, turned=pressure < 0)
+    extent = float(np.ptp(nodes[vertices], axis=0).max())
     if not EXTENT_MM[0] <= extent <= EXTENT_MM[1]:
         raise InputError(
             f"the leaflets span {extent:g}, expected {EXTENT_MM[0]:g} to {EXTENT_MM[1]:g}: lengths "
             "must be mm"
         )
+    coordinates = surface_coordinates(nodes[vertices], surface["triangles"], *rims)
+    edges, section = _trusses(deck)
+    anchors = np.intersect1d(np.setdiff1d(edges, vertices), deck.held())
+    if not anchors.size:
+        raise InputError("no node of the chordae is held, so no papillary muscle is known")
+    held = np.concatenate([vertices[rims[0]], anchors])
+    path_of_held = nodes[held] + deck.moved(held, times)
+    tips, tip_of_anchor = _group_anchors(path_of_held[:, len(rims[0]) :])
+    anchor, insertion, length, stiffness_share = trace_cables(nodes, edges, anchors, vertices)
+    # The family of a cable is the section of the first truss in the deck at its insertion.
+    ends, first = np.unique(edges, return_index=True)
+    used, family_of_truss = np.unique(section, return_inverse=True)
+    family = family_of_truss[first // 2][np.searchsorted(ends, insertion)]
+    sections = [deck.sections[k] for k in used]
+    stiffness = [
+        truss_stiffness(name, size, deck.laws.get(name, {}), toe_strain)
+        for _, name, size in sections
+    ]
+    return {
+        "surface": {**surface, "fibre": coordinates.circumferential},
+        "nodes": nodes,
+        "vertices": vertices,
+        "annulus": rims[0],
+        "free_edge": rims[1],
+        "held": held,
+        "held_path": path_of_held,
+        "tips": tips,
+        "chordae": {
+            "tip": tip_of_anchor[np.searchsorted(anchors, anchor)],
+            "insertion": nodes[insertion],
+            "family": family,
+            "family_names": [name.lower() for _, name, _ in sections],
+            "rest_length": length,
+            "axial_stiffness": np.array(stiffness)[family] * stiffness_share,
+        },
+        "times": times,
+        "pressure": abs(pressure),
+        "pressure_share": share,
+    }
 
 
-def _pressure(deck: Deck, names: SetNames, times: FloatArray) -> tuple[float, FloatArray]:
+def _shells(deck: Deck, leaflets: Sequence[str]) -> list[IntArray]:
+    """Numbers of the elements of each leaflet."""
+    groups = [lookup(deck.sets["ELSET"], name, "element set") for name in leaflets]
+    for name, group in zip(leaflets, groups, strict=True):
+        if not len(group) or min(len(deck.cells[k]) for k in group) < 3:
+            raise InputError(f"element set {one_line(name, 60)!r}: expected shells, one or more")
+    if len(np.unique(np.concatenate(groups))) != sum(map(len, groups)):
+        raise InputError("leaflets share elements")
+    return groups
+
+
+def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float, FloatArray]:
     """Pressure (MPa) against the shells' normals at the end, and its share at each time."""
-    leaflets = np.concatenate(shell_numbers(deck, names))
-    loaded = [load for load in deck.pressures if np.isin(load.elements, leaflets).any()]
-    covered = np.concatenate([np.zeros(0, np.int64), *(load.elements for load in loaded)])
-    once = len(np.unique(covered)) == len(covered) and not np.setdiff1d(leaflets, covered).size
-    if not once or len({(load.value, load.amplitude) for load in loaded}) != 1:
+    loaded = [load for load in deck.pressures if np.isin(load[0], leaflets).any()]
+    covered = np.concatenate([np.zeros(0, np.int64), *(members for members, _, _ in loaded)])
+    once = len(np.unique(covered)) == len(covered) and np.isin(leaflets, covered).all()
+    if not once or len({load[1:] for load in loaded}) != 1:
         raise InputError("expected one pressure on all leaflets, once")
-    share = deck.share(loaded[0].amplitude, times)
+    _, value, amplitude = loaded[0]
+    share = deck.share(amplitude, times)
     if share[0] != 0 or share[-1] == 0:
         raise InputError(
             f"the pressure's share runs from {share[0]:g} to {share[-1]:g}, expected from 0"
         )
-    pressure = loaded[0].value * float(share[-1])
+    pressure = value * float(share[-1])
     if not PRESSURE_MPA[0] <= abs(pressure) <= PRESSURE_MPA[1]:
         raise InputError(
             f"pressure {pressure:g}, expected {PRESSURE_MPA[0]:g} to {PRESSURE_MPA[1]:g}: stresses "
@@ -296,80 +290,95 @@ def _pressure(deck: Deck, names: SetNames, times: FloatArray) -> tuple[float, Fl
     return pressure, share / share[-1]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trusses:
-    """The chord network: ``(k, 2)`` nodes, ``(k,)`` number of the section, and the sections."""
+def _leaflets(
+    deck: Deck, groups: Sequence[IntArray], annulus: str, free_edge: str, *, turned: bool
+) -> tuple[dict[str, Any], IntArray, list[IntArray]]:
+    """The leaflets as triangles, whose normals are the shells' or, if ``turned``, against them.
 
-    edges: IntArray
-    section: IntArray
-    sections: tuple[ElementSection, ...]
+    Returns
+    -------
+    surface : dict
+        ``triangles``, ``region`` and ``thickness``.
+    vertices : ndarray
+        Their nodes in the deck, increasing.
+    rims : list of ndarray
+        Vertices of annulus and free edge in loop order.
+    """
+    elements = np.concatenate(groups)
+    region = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    cells = np.array([[*deck.cells[k], -1][:4] for k in elements])
+    vertices, corners = np.unique(cells, return_inverse=True)
+    corners = corners.reshape(cells.shape)
+    if vertices[0] < 0:  # the fourth corner of a triangle
+        vertices, corners = vertices[1:], corners - 1
+    on_rim = np.zeros(len(vertices), dtype=np.int64)
+    wanted = []
+    for number, name in enumerate((annulus, free_edge), 1):
+        nodes = lookup(deck.sets["NSET"], name, "node set")
+        if np.setdiff1d(nodes, vertices).size:
+            raise InputError(f"node set {one_line(name, 60)!r}: a node is on no leaflet")
+        wanted.append(np.searchsorted(vertices, nodes))
+        on_rim[wanted[-1]] = number
+    triangles, element = _split(np.array(deck.nodes)[vertices], corners, on_rim)
+    if turned:
+        triangles = triangles[:, [0, 2, 1]]
+    loops = {frozenset(loop.tolist()): loop for loop in boundary_loops(triangles)}
+    rims = [loops[rim] for rim in map(frozenset, map(np.ndarray.tolist, wanted)) if rim in loops]
+    if len(loops) != 2 or len(rims) != 2:
+        raise InputError(
+            f"sets {one_line(annulus, 60)} and {one_line(free_edge, 60)}: expected the two "
+            f"boundary loops of the leaflets, which have {len(loops)}"
+        )
+    sizes = np.full(len(deck.cells), np.nan)
+    for members, _, size in deck.sections:
+        sizes[members] = size
+    if np.isnan(sizes[elements]).any():
+        raise InputError("shells without a section that states a thickness")
+    # Where leaflets meet, the thicker one counts; the last place is that of the corner -1.
+    thickness = np.zeros(len(vertices) + 1)
+    np.maximum.at(thickness, corners.ravel(), np.repeat(sizes[elements], 4))
+    surface = {"triangles": triangles, "region": region[element], "thickness": thickness[:-1]}
+    return surface, vertices, rims
 
-    @classmethod
-    def of(cls, deck: Deck) -> _Trusses:
-        """All trusses of a deck."""
-        blocks = [block for block in deck.elements if block.kind in TRUSSES]
-        if not blocks:
-            raise InputError(f"no chordae: no elements of type {', '.join(TRUSSES)}")
-        numbers = np.concatenate([block.first + np.arange(len(block.nodes)) for block in blocks])
-        sections = [s for s in deck.sections if np.isin(s.elements, numbers).any()]
-        section = np.full(len(numbers), -1)
-        for k, one in enumerate(sections):
-            section[np.isin(numbers, one.elements)] = k
-        if (section < 0).any():
-            raise InputError("trusses without a section")
-        edges = np.concatenate([block.nodes for block in blocks])
-        return cls(edges, section, tuple(sections))
 
-    def anchors(self, deck: Deck, mesh: LeafletMesh) -> IntArray:
-        """Chord nodes that are held, but not on the leaflets."""
-        nodes = np.setdiff1d(self.edges, mesh.nodes)
-        held = nodes[np.isfinite(deck.displacement[nodes]).all(axis=1)]
-        if not held.size:
-            raise InputError("no node of the chordae is held, so no papillary muscle is known")
-        return held
+def _split(vertices: FloatArray, corners: IntArray, on_rim: IntArray) -> tuple[IntArray, IntArray]:
+    """Two triangles per quad along the shorter diagonal, and the element of each triangle.
 
-    def section_at(self, insertion: IntArray) -> IntArray:
-        """ElementSection ``(c,)`` of the truss, the first in the deck, that ends at each node."""
-        nodes, first = np.unique(self.edges.ravel(), return_index=True)
-        return self.section[first // 2][np.searchsorted(nodes, insertion)]
+    A quad with two sides on one rim is cut from their common corner, so that no triangle has all
+    three corners on that rim. Triangles come last, as they are.
+    """
+    whole, rest = (np.flatnonzero(quad) for quad in (corners[:, 3] >= 0, corners[:, 3] < 0))
+    quads = corners[whole]
+    first, second = (
+        np.linalg.norm(vertices[quads[:, i + 2]] - vertices[quads[:, i]], axis=1) for i in (0, 1)
+    )
+    rim = on_rim[quads]
+    ear = (rim > 0) & (rim == np.roll(rim, 1, axis=1)) & (rim == np.roll(rim, -1, axis=1))
+    by_02 = np.where(ear.any(axis=1), ear[:, 0] | ear[:, 2], first <= second)[:, None]
+    one = np.where(by_02, quads[:, [0, 1, 2]], quads[:, [0, 1, 3]])
+    two = np.where(by_02, quads[:, [0, 2, 3]], quads[:, [1, 2, 3]])
+    triangles = np.vstack([one, two, corners[rest, :3]])
+    return triangles, np.concatenate([whole, whole, rest])
 
 
-def _group_anchors(deck: Deck, anchors: IntArray, times: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Positions ``(f, t, 3)`` of the distinct anchors, and the position number of each anchor."""
-    start = deck.nodes[anchors]
-    near = np.linalg.norm(start[:, None] - start[None], axis=2) < SAME_MM
+def _trusses(deck: Deck) -> tuple[IntArray, IntArray]:
+    """Ends ``(k, 2)`` of the trusses, and the number of the section ``(k,)`` of each."""
+    numbers = np.array([k for k, cell in enumerate(deck.cells) if len(cell) == 2], dtype=np.int64)
+    if not numbers.size:
+        raise InputError("no chordae: no elements of type T3D2, CONN3D2")
+    section = np.full(len(deck.cells), -1)
+    for k, (members, _, _) in enumerate(deck.sections):
+        section[members] = k
+    if section[numbers].min() < 0:
+        raise InputError("trusses without a section")
+    return np.array([deck.cells[k] for k in numbers]), section[numbers]
+
+
+def _group_anchors(path: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Positions ``(f, t, 3)`` of the distinct anchors ``(f, a, 3)``, and the number of each."""
+    near = np.linalg.norm(path[0][:, None] - path[0][None], axis=2) < SAME_MM
     count, group = connected_components(coo_matrix(near), directed=False)
-    path = start + deck.moved(anchors, times)
     tips = np.stack([path[:, group == g].mean(axis=1) for g in range(count)], axis=1)
     if np.abs(tips[:, group] - path).max() > TOLERANCE_MM:
         raise InputError("chord anchors at one place move apart")
     return tips, group.astype(np.int64)
-
-
-def _read_frames(files: Sequence[Path], deck: Deck) -> FloatArray:
-    """Positions ``(f, n, 3)`` mm of all nodes."""
-    if len(files) * deck.nodes.size > MAX_COORDINATES:
-        raise InputError(f"{files[0]}: {len(files)} frames of {len(deck.nodes)} nodes are too many")
-    result = np.empty((len(files), *deck.nodes.shape))
-    for k, file in enumerate(files):
-        points = read_mesh(file).points
-        if points.shape != deck.nodes.shape:
-            raise InputError(f"{file}: {len(points)} points, the deck has {len(deck.nodes)} nodes")
-        result[k] = points
-    if np.abs(result[0] - deck.nodes).max() > TOLERANCE_MM:
-        raise InputError(f"{files[0]}: points are not the nodes of the deck")
-    return result
-
-
-def _check_motion(
-    files: Sequence[Path], deck: Deck, nodes: IntArray, times: FloatArray, positions: FloatArray
-) -> None:
-    """Refuse frames that are not where the deck moves its constrained nodes."""
-    expected = deck.nodes[nodes] + deck.moved(nodes, times)
-    error = np.abs(expected - positions[:, nodes]).max(axis=(1, 2))
-    if error.max() > TOLERANCE_MM:
-        worst = files[int(np.argmax(error))]
-        raise InputError(
-            f"{worst}: {error.max():.2g} mm away from the deck's prescribed motion "
-            f"(tolerance {TOLERANCE_MM} mm)"
-        )

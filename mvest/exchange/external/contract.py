@@ -1,4 +1,4 @@
-"""The files through which a program is asked for a prediction, and answers.
+"""How a program is started and asked for a prediction, and how it answers.
 
 Text only: JSON and comma-separated numbers. One folder is one run::
 
@@ -8,22 +8,27 @@ Text only: JSON and comma-separated numbers. One folder is one run::
     observation.csv   x,y,z mm of every observed point
     jacobian.csv      optional: one row for each coordinate (x, y, z of the first point, then of the
                       next), one column for each parameter, headed by its name
+    stdout.txt, stderr.txt  what the program says
 
 Reading is strict: what is not exactly that is refused with the file and the row.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from mvest.errors import InputError
+from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import Prediction
+from mvest.processes import ending, run
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line, read_numbers, write_columns
@@ -33,10 +38,123 @@ FORMAT, VERSION = "mvest-external", 1
 REQUEST, POINTS = "request.json", "points.csv"
 RESPONSE, OBSERVATION, JACOBIAN = "response.json", "observation.csv", "jacobian.csv"
 ANSWERS = (RESPONSE, OBSERVATION, JACOBIAN)
-
+OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 COORDINATES = ("x", "y", "z")
 MAX_JSON_SIZE = 1_000_000
 """Bytes of a response; more is none."""
+PLACEHOLDER = re.compile(r"\{(request|folder|here)\}")
+CODE = (".jl", ".m", ".py", ".r", ".sh")
+"""Endings of programs that take others from the folder that they lie in."""
+
+
+def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -> dict[str, Path]:
+    """What a command names of the files that are there: these decide what it answers.
+
+    They are the program itself, arguments that are files, what follows a ``=`` in an argument, and
+    beside a script all others of its kind, which it may import. What only the program knows of
+    (its libraries, files named within files, modules by ``python -m``) is not among them.
+
+    Parameters
+    ----------
+    arguments, environment
+        As in `Command`.
+    """
+    path = {**os.environ, **environment}.get("PATH")
+    files = {}
+    for k, text in enumerate(arguments):
+        for name in (text, text.partition("=")[2]):
+            place = Path(name.replace("{here}", str(Path.cwd())))
+            if k == 0:
+                place = Path(shutil.which(place, path=path) or place).absolute()
+            with contextlib.suppress(OSError, ValueError):  # a text that is no name
+                # A run's own files are named by {request} and {folder}, or relative to its folder.
+                if place.is_absolute() and place.is_file():
+                    files[name] = place
+    for script in [file for file in files.values() if file.suffix.lower() in CODE]:
+        files |= {str(other): other for other in script.parent.glob(f"*{script.suffix}")}
+    return {name: file for name, file in files.items() if file.is_file()}
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """How a program is started, and how long it may take.
+
+    Attributes
+    ----------
+    arguments : tuple of str
+        The program and its arguments; no shell reads them. ``{request}`` and ``{folder}`` stand for
+        the request file and the folder of the run, ``{here}`` for the folder in which this process
+        was started; nothing else is replaced. Programs run in the folder of their run.
+    environment : mapping
+        Variables beside those of this process.
+    time_limit_s : float
+        After which the program and all that it has started is stopped.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such program, or an argument, a variable or the limit is inadmissible.
+    """
+
+    arguments: tuple[str, ...]
+    environment: Mapping[str, str] = field(default_factory=dict)
+    time_limit_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        if not self.arguments or not self.arguments[0]:
+            raise ConfigurationError("command is empty, expected a program and its arguments")
+        for text in (*self.arguments, *self.environment, *self.environment.values()):
+            if "\0" in text:
+                raise ConfigurationError(f"command: {text!r} holds a NUL character")
+        wrong = [name for name in self.environment if not name or "=" in name]
+        if wrong:
+            raise ConfigurationError(f"environment: {wrong[0]!r} is no name of a variable")
+        if not self.time_limit_s > 0:
+            raise ConfigurationError(f"time_limit_s = {self.time_limit_s}, expected > 0")
+        program = self._filled(self.arguments[0], Path())
+        if os.sep in program and not Path(program).is_absolute():
+            raise ConfigurationError(
+                f"program {program!r}: a relative path, but programs run in the folder of their "
+                f"run; expected {{here}}{os.sep}{program} or an absolute path"
+            )
+        if shutil.which(program) is None:
+            raise ConfigurationError(f"program {program!r} is not found or not executable")
+
+    def run(self, folder: Path) -> str:
+        """Run the program in ``folder``; why it failed, empty where it did not.
+
+        All that it has started is stopped with it: at the time limit, when it ends, and when this
+        process does.
+        """
+        try:
+            with (folder / OUTPUT).open("wb") as output, (folder / ERRORS).open("wb") as errors:
+                ended = run(
+                    [self._filled(text, folder.resolve()) for text in self.arguments],
+                    timeout=self.time_limit_s,
+                    cwd=folder,
+                    env={**os.environ, **self.environment},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=errors,
+                )
+        except subprocess.TimeoutExpired:
+            reason = f"stopped at the time limit of {self.time_limit_s:g} s"
+        except OSError as error:
+            return f"the program could not be started: {error.strerror or error}"
+        else:
+            if not ended.returncode:
+                return ""
+            reason = ending(ended.returncode)
+        with (folder / ERRORS).open("rb") as stream:
+            stream.seek(max(0, stream.seek(0, os.SEEK_END) - 4096))
+            said = stream.read().decode(errors="replace").splitlines()
+        words = [line[:200] for line in map(one_line, said) if line]
+        return f"{reason}; its last words: {' | '.join(words[-4:])}" if words else reason
+
+    def _filled(self, text: str, folder: Path) -> str:
+        request, here = str(folder / REQUEST), str(Path.cwd())
+        places = {"request": request, "folder": str(folder), "here": here}
+        return PLACEHOLDER.sub(lambda found: places[found[1]], text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,24 +213,6 @@ class RunRequest:
         }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Answer:
-    """What a run answered.
-
-    Attributes
-    ----------
-    reason : str
-        Why there is no observation; empty where there is one.
-    y : (3 n,) mm
-        Coordinates point by point; empty where the program failed.
-    jacobian : (3 n, p) mm per unit of each parameter, or None
-    """
-
-    reason: str
-    y: FloatArray
-    jacobian: FloatArray | None = None
-
-
 def write_request(folder: Path, request: RunRequest, points: FloatArray | None = None) -> None:
     """Write ``request.json`` and, where points ``(n, 3)`` mm are given, ``points.csv``.
 
@@ -168,8 +268,8 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
     write_json(folder / RESPONSE, answer)
 
 
-def read_answer(folder: Path, request: RunRequest) -> Answer:
-    """What a run has answered in its folder.
+def read_answer(folder: Path, request: RunRequest) -> Prediction:
+    """What a run has answered in its folder; undifferentiated without ``jacobian.csv``.
 
     Raises
     ------
@@ -185,11 +285,11 @@ def read_answer(folder: Path, request: RunRequest) -> Answer:
             "with a reason"
         )
     if status == "failed":
-        return Answer(reason.strip() or "the program gives no reason", np.empty(0))
-    y = _read_table(folder / OBSERVATION, COORDINATES, request.count).ravel()
+        return Prediction.failed(reason.strip() or "the program gives no reason")
+    y = read_points(folder / OBSERVATION, request.count).ravel()
     if not (folder / JACOBIAN).exists():
-        return Answer("", y)
-    return Answer("", y, _read_table(folder / JACOBIAN, request.names, y.size))
+        return Prediction.undifferentiated(y)
+    return Prediction(y, _read_table(folder / JACOBIAN, request.names, y.size))
 
 
 def read_points(file: Path, count: int | None = None) -> FloatArray:
@@ -230,6 +330,6 @@ def _read_table(file: Path, header: Sequence[str], count: int | None) -> FloatAr
     return read_numbers(file, header, strict=True, count=count, max_abs=math.inf, where=file.name)
 
 
-def _write_table(file: Path, header: Sequence[str], rows: Iterable[Iterable[float]]) -> None:
+def _write_table(file: Path, header: Sequence[str], rows: FloatArray) -> None:
     """Numbers with all their digits."""
-    write_columns(file, header, ([repr(float(value)) for value in row] for row in rows))
+    write_columns(file, header, ([repr(value) for value in row] for row in rows.tolist()))

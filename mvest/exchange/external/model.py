@@ -5,23 +5,27 @@ Where the program gives no derivatives, they are differences of its predictions.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock
 
-from mvest.errors import ConfigurationError, InputError, cannot_write
+from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import Prediction
-from mvest.exchange.external.contract import ANSWERS, Answer, RunRequest, read_answer, write_request
-from mvest.exchange.external.process import Command, files_of_command
-from mvest.files import sha256_of
-from mvest.provenance import config_hash, write_json
-from mvest.reading.documents import read_mapping
+from mvest.exchange.external.contract import (
+    ANSWERS,
+    Command,
+    RunRequest,
+    files_of_command,
+    read_answer,
+    write_request,
+)
+from mvest.files import require_writable, sha256_of
+from mvest.kept import Entry
+from mvest.processes import side_by_side
+from mvest.provenance import config_hash
 from mvest.typing import FloatArray
 
 SCHEMES = ("central", "forward")
@@ -95,20 +99,7 @@ class Differences:
         return np.asarray((values - y).T / np.diagonal(points - m))
 
 
-FINISHED = "finished.json"
-"""Written after an answer has been read and found in order."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """An answer, and where it is from: neither, where no program could be started for it."""
-
-    answer: Answer
-    started: bool = False
-    reused: bool = False
-    seconds: float = 0.0
-
-
+@dataclass(slots=True, eq=False)
 class ProcessModel:
     """Coordinates ``(3 n,)`` mm that a program predicts for parameters ``(p,)``.
 
@@ -145,8 +136,6 @@ class ProcessModel:
     ----------
     runs, reused : int
         How often a program was started, and how often a finished run served instead.
-    seconds : float
-        Wall time of the started runs, summed over those that ran side by side.
     own_jacobian : bool
         Whether the last prediction's derivatives are the program's own.
 
@@ -156,38 +145,28 @@ class ProcessModel:
         If the folder cannot be made, an input cannot be read or the points have another shape.
     """
 
-    def __init__(
-        self,
-        command: Command,
-        folder: Path,
-        names: Sequence[str],
-        count: int,
-        *,
-        units: Sequence[str] | None = None,
-        points: FloatArray | None = None,
-        settings: Mapping[str, Any] | None = None,
-        differences: Differences | None = Differences(),
-        reuse: bool = True,
-        inputs: Sequence[Path] = (),
-    ) -> None:
-        self.command, self.folder, self.names = command, folder, tuple(names)
-        self.units = ("",) * len(self.names) if units is None else tuple(units)
-        self.count, self.settings = count, dict(settings or {})
-        self.differences, self.reuse = differences, reuse
-        self.runs = self.reused = 0
-        self.seconds = 0.0
-        self.own_jacobian = False
-        self._points = None if points is None else np.asarray(points, dtype=np.float64)
-        if self._points is not None and self._points.shape != (count, 3):
-            raise ConfigurationError(f"points: shape {self._points.shape}, expected ({count}, 3)")
-        self._inputs = tuple(inputs)
-        self._contents()
-        # Units and names are in order, or this says what is not.
-        self._request(np.zeros(len(self.names)), True)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise cannot_write(folder, error) from error
+    command: Command
+    folder: Path
+    names: Sequence[str]
+    count: int
+    _: KW_ONLY
+    units: Sequence[str] | None = None
+    points: FloatArray | None = None
+    settings: Mapping[str, Any] | None = None
+    differences: Differences | None = Differences()
+    reuse: bool = True
+    inputs: Sequence[Path] = ()
+    runs: int = field(default=0, init=False)
+    reused: int = field(default=0, init=False)
+    own_jacobian: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        if self.points is not None and np.shape(self.points) != (self.count, 3):
+            shape = np.shape(self.points)
+            raise ConfigurationError(f"points: shape {shape}, expected ({self.count}, 3)")
+        # Inputs, units and names are in order, or this says what is not.
+        self._place(self._request(np.zeros(len(self.names)), True))
+        require_writable(self.folder)
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Run the program at ``m``, and at its neighbours if it gives no derivatives."""
@@ -196,11 +175,9 @@ class ProcessModel:
         if not np.all(np.isfinite(m)):
             return Prediction.failed(f"the parameters {m} are not finite")
         (first,) = self._all([m], jacobian=True)
-        if first.reason:
-            return Prediction.failed(first.reason)
-        self.own_jacobian = first.jacobian is not None
-        if first.jacobian is not None:
-            return Prediction(first.y, first.jacobian)
+        self.own_jacobian = first.differentiated
+        if not first.converged or first.differentiated:
+            return first
         if self.differences is None:
             return Prediction.failed("the program gives no derivatives: jacobian.csv is missing")
         jacobian = self.by_differences(m, first.y)
@@ -226,99 +203,75 @@ class ProcessModel:
             return str(error)
         answers = self._all(points, jacobian=False)
         for at, answer in zip(points, answers, strict=True):
-            if answer.reason:
+            if not answer.converged:
                 values = ", ".join(f"{n} = {v:g}" for n, v in zip(self.names, at, strict=True))
                 return f"run for a difference at {values}: {answer.reason}"
         return self.differences.jacobian(m, y, [answer.y for answer in answers])
 
     def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
-        values = tuple(float(v) for v in m)
-        return RunRequest(self.names, self.units, values, self.count, jacobian, self.settings)
+        names, values = tuple(self.names), tuple(float(v) for v in m)
+        units = ("",) * len(names) if self.units is None else tuple(self.units)
+        return RunRequest(names, units, values, self.count, jacobian, dict(self.settings or {}))
 
-    def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Answer]:
-        """Answers at all points, several at a time; none goes on where one is interrupted."""
-        requests = [self._request(m, jacobian) for m in points]
-        processes = 1 if self.differences is None else self.differences.processes
-        if processes == 1 or len(requests) == 1:
-            runs = [self._run(request, None) for request in requests]
-        else:
-            stop = threading.Event()
-            with ThreadPoolExecutor(processes) as pool:
-                try:
-                    runs = list(pool.map(lambda request: self._run(request, stop), requests))
-                except BaseException:
-                    stop.set()
-                    pool.shutdown(cancel_futures=True)
-                    raise
-        self.runs += sum(run.started for run in runs)
-        self.reused += sum(run.reused for run in runs)
-        self.seconds += sum(run.seconds for run in runs)
-        return [run.answer for run in runs]
+    def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Prediction]:
+        """Answers at all points, several at a time."""
+        requests = [(self._request(m, jacobian),) for m in points]
+        processes = self.differences.processes if self.differences and len(requests) > 1 else 1
+        answers, how = zip(*side_by_side(self._run, requests, processes), strict=True)
+        self.runs += how.count("run")
+        self.reused += how.count("reused")
+        return list(answers)
 
-    def _run(self, request: RunRequest, stop: threading.Event | None) -> _Run:
-        """One run in its folder, unless it is finished there."""
-        folder = self._place(request)
+    def _run(self, request: RunRequest) -> tuple[Prediction, str]:
+        """An answer, and whether it was ``run`` for, ``reused``, or neither."""
+        folder, how = self._place(request), ""
+        answer = Entry(folder / "answer", lambda path: read_answer(path, request))
         try:
-            folder.mkdir(exist_ok=True)
-            with FileLock(folder / ".lock"):
-                done = self._finished(folder, request) if self.reuse else None
-                if done is not None:
-                    return _Run(done, reused=True)
-                return self._start(folder, request, stop)
+            with answer.alone():
+                found = answer.found() if self.reuse else None
+                if found is not None:
+                    return found, "reused"
+                for name in ANSWERS:
+                    # An old answer is not to be taken for that of a program that writes none.
+                    (folder / name).unlink(missing_ok=True)
+                write_request(folder, request, self.points)
+                reason, how = self.command.run(folder), "run"
+                reason = self._refused(folder, request, reason)
+                if not reason:
+                    return answer.keep(folder, _move_answer), how
         except (OSError, InputError) as error:
-            return _Run(Answer(f"{folder.name}: {error}", np.empty(0)))
+            reason = str(error)
+        return Prediction.failed(f"{folder.name}: {reason}"), how
 
-    def _start(self, folder: Path, request: RunRequest, stop: threading.Event | None) -> _Run:
-        for name in (FINISHED, *ANSWERS):
-            # An old answer is not to be taken for that of a program that writes none.
-            (folder / name).unlink(missing_ok=True)
-        write_request(folder, request, self._points)
-        ending = self.command.run(folder, stop)
+    def _refused(self, folder: Path, request: RunRequest, reason: str) -> str:
+        """Why the answer of a run is not taken, whose program failed for a reason; or empty."""
         try:
             answer = read_answer(folder, request)
         except InputError as error:
-            answer = Answer(str(error), np.empty(0))
-        if ending.reason:
-            said = [] if not answer.reason or "missing" in answer.reason else [answer.reason]
-            answer = Answer("; ".join([ending.reason, *said]), np.empty(0))
-        if not answer.reason and self._place(request) != folder:
-            answer = Answer("a file that it depends on was changed while it ran", np.empty(0))
-        if answer.reason:
-            answer = Answer(f"{folder.name}: {answer.reason}", np.empty(0))
-        else:
-            write_json(folder / FINISHED, {"sha256": _answers(folder), "seconds": ending.seconds})
-        return _Run(answer, started=True, seconds=ending.seconds)
-
-    def _finished(self, folder: Path, request: RunRequest) -> Answer | None:
-        """The answer of a finished run; None if there is none, or its files were changed since."""
-        try:
-            marker = read_mapping(folder / FINISHED)
-            if marker.get("sha256") == _answers(folder):
-                return read_answer(folder, request)
-        except InputError:
-            pass
-        return None
+            answer = Prediction.failed(str(error))
+        if not answer.converged and not (reason and "missing" in answer.reason):
+            reason = "; ".join(filter(None, [reason, answer.reason]))
+        if not reason and self._place(request) != folder:
+            reason = "a file that it depends on was changed while it ran"
+        return reason
 
     def _place(self, request: RunRequest) -> Path:
         """The folder of a run, named by the SHA-256 of all that its answer depends on."""
+        files = files_of_command(self.command.arguments, self.command.environment)
+        files |= {str(path): path for path in self.inputs}
         named = config_hash(
             {
                 "request": request.data(),
                 "command": self.command.arguments,
                 "environment": self.command.environment,
-                "points": self._points,
-                "inputs": self._contents(),
+                "points": self.points,
+                "inputs": {name: sha256_of(path) for name, path in files.items()},
             }
         )
         return self.folder / f"run-{named[:24]}"
 
-    def _contents(self) -> dict[str, str]:
-        """SHA-256 of the files that the command names and of the inputs, as they are now."""
-        named = files_of_command(self.command.arguments, self.command.environment)
-        files = {**named, **{str(path): path for path in self._inputs}}
-        return {name: sha256_of(path) for name, path in files.items()}
 
-
-def _answers(folder: Path) -> dict[str, str]:
-    """SHA-256 of the files of an answer that are there."""
-    return {name: sha256_of(folder / name) for name in ANSWERS if (folder / name).is_file()}
+def _move_answer(target: Path, folder: Path) -> None:
+    target.mkdir()
+    for file in filter(Path.is_file, (folder / name for name in ANSWERS)):
+        file.rename(target / file.name)

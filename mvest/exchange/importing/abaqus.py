@@ -9,9 +9,13 @@ import numpy as np
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.errors import InputError
-from mvest.exchange.abaqus.deck_file import read_deck
-from mvest.exchange.abaqus.mesh import SetNames
-from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
+from mvest.exchange.abaqus.recording import (
+    Recording,
+    deck_sets,
+    read_recording,
+    recording_files,
+)
+from mvest.exchange.child import in_child
 from mvest.reading.text import one_line
 from mvest.units import mpa_to_mmhg
 
@@ -57,8 +61,19 @@ def import_abaqus(source: Path, options: AbaqusOptions) -> ValveCase:
     InputError
         If sets are not named, or as `mvest.exchange.abaqus.recording.read_recording`.
     """
-    recording = read_recording(source, _names(source, options))
-    valve = recording.valve(linearisation_strain=options.toe_strain, toe_strain=options.toe_strain)
+    leaflets = dict(word.split(":", 1) for word in options.leaflets or () if ":" in word)
+    missing = {
+        "leaflets=[REGION:SET,...]": len(leaflets) < len(options.leaflets or "?"),
+        "annulus=SET": not options.annulus,
+        "free_edge=SET": not options.free_edge,
+    }
+    if any(missing.values()):
+        known = one_line(", ".join(in_child(deck_sets, recording_files(source)[0])), 400)
+        asked = ", ".join(option for option, absent in missing.items() if absent)
+        raise InputError(f"{source}: give {asked}; the deck's sets are {known}")
+    sets = leaflets, options.annulus or "", options.free_edge or ""
+    recording = read_recording(source, *sets, options.toe_strain)
+    valve = recording.valve
     derived = [
         "fibres: parallel to the annulus; the deck's own directions are not read",
         f"chordae: {len(valve.chordae)} straight ones as long as their ways through the network, "
@@ -72,9 +87,9 @@ def import_abaqus(source: Path, options: AbaqusOptions) -> ValveCase:
         source="computed with Abaqus",
         licence=options.licence,
         simulated=True,
-        surface=recording.surface,
-        annulus=recording.annulus,
-        free_edge=recording.free_edge,
+        surface=valve.surface,
+        annulus=valve.annulus,
+        free_edge=valve.free_edge,
         frames=(_frame(recording, 0), _frame(recording, -1)),
         chordae=valve.chordae,
         uncertainty=Uncertainty(options.std_mm or STD_MM, CORRELATED_MM),
@@ -82,37 +97,20 @@ def import_abaqus(source: Path, options: AbaqusOptions) -> ValveCase:
     )
 
 
-def _names(source: Path, options: AbaqusOptions) -> SetNames:
-    """Names of the sets, each asked for by its option where it is not given."""
-    pairs = [word.partition(":") for word in options.leaflets or ()]
-    missing = {
-        "leaflets=[REGION:SET,...]": not pairs or not all(part for pair in pairs for part in pair),
-        "annulus=SET": not options.annulus,
-        "free_edge=SET": not options.free_edge,
-    }
-    if any(missing.values()):
-        deck = read_deck(recording_files(source)[0])
-        asked = ", ".join(option for option, absent in missing.items() if absent)
-        sets = one_line(", ".join([*deck.element_sets, *deck.node_sets]), 400)
-        raise InputError(f"{source}: give {asked}; the deck's sets are {sets}")
-    leaflets = {region: name for region, _, name in pairs}
-    return SetNames(leaflets, options.annulus or "", options.free_edge or "")
-
-
 def _frame(recording: Recording, at: int) -> Frame:
-    reference = at == 0
+    valve, reference = recording.valve, at == 0
     # Frames are stored in single precision.
-    vertices = recording.surface.vertices if reference else recording.frames[at]
+    vertices = valve.surface.vertices if reference else recording.frames[at]
     return Frame(
         name="open" if reference else "closed",
         time=float(recording.times[at]),
         role=Role.REFERENCE if reference else Role.CLOSED,
         pressure_mmHg=mpa_to_mmhg(recording.pressure) * float(recording.pressure_share[at]),
         vertices=vertices,
-        triangles=recording.surface.triangles,
-        region=recording.surface.region,
-        annulus=np.asarray(vertices[recording.annulus]),
-        free_edge=np.asarray(vertices[recording.free_edge]),
-        papillary_tips=recording.papillary_tips[at],
+        triangles=valve.surface.triangles,
+        region=valve.surface.region,
+        annulus=np.asarray(vertices[valve.annulus]),
+        free_edge=np.asarray(vertices[valve.free_edge]),
+        papillary_tips=valve.motion.papillary_tips[at],
         corresponds=True,
     )

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mvest.exchange.external.contract import Command
 from mvest.exchange.external.model import ProcessModel
-from mvest.exchange.external.process import Command
 
 SPRINGS = '''
 """Two springs in a row, pulled by 2 N: x1 = 2 / k1, x2 = x1 + 2 / k2 (mm), y and z are constant."""

@@ -7,8 +7,8 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
+from mvest.exchange.external.contract import Command
 from mvest.exchange.external.model import Differences, ProcessModel
-from mvest.exchange.external.process import Command
 from tests.exchange.external.programs import NAMES, SPRINGS, answering, model, springs
 
 M = np.array([0.8, 2.5])
@@ -98,7 +98,7 @@ def test_a_changed_input_makes_finished_runs_worthless(tmp_path):
 def test_a_finished_run_that_was_damaged_is_done_again(tmp_path):
     first = model(tmp_path, "exact")(M)
     (folder,) = (tmp_path / "runs").glob("run-*")
-    table = folder / "observation.csv"
+    table = folder / "answer" / "observation.csv"
     table.write_text(table.read_text().replace("2.5", "2.6"))
     again = model(tmp_path, "exact")
     np.testing.assert_array_equal(again(M).y, first.y)
@@ -110,7 +110,7 @@ def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
     off = f"import os, sys\nif os.path.exists({str(tmp_path / 'off')!r}): sys.exit()\n"
     assert model(tmp_path, "exact", source=off + SPRINGS)(M).converged
     (folder,) = (tmp_path / "runs").glob("run-*")
-    (folder / "finished.json").unlink()
+    (folder / ".answer.sha256").unlink()
     (tmp_path / "off").touch()
     # The same run again: what lies there is another's.
     silent = model(tmp_path, "exact", source=off + SPRINGS)

@@ -14,9 +14,9 @@ from mvest.exchange.importing.abaqus import AbaqusOptions, import_abaqus
 from tests.exchange.surfaces.recorded import CASE, NAMES, skirt, write
 
 SETS = {
-    "leaflets": tuple(f"{region}:{name}" for region, name in NAMES.leaflets.items()),
-    "annulus": NAMES.annulus,
-    "free_edge": NAMES.free_edge,
+    "leaflets": tuple(f"{region}:{name}" for region, name in NAMES["leaflets"].items()),
+    "annulus": NAMES["annulus"],
+    "free_edge": NAMES["free_edge"],
 }
 
 
@@ -34,17 +34,16 @@ def test_a_closure_becomes_a_case(source: Path, tmp_path: Path, capsys) -> None:
     assert import_command(["abaqus", str(source), str(tmp_path / "case"), *words]) == 0
     assert "1 mm assumed; std_mm=... states it" in capsys.readouterr().out
     case = read_case(tmp_path / "case")
-    recording = read_recording(source, NAMES)
+    valve = read_recording(source, **NAMES).valve
     assert case.simulated
     assert case.surface.region_names == ("anterior", "septal", "posterior")
-    assert case.surface.vertices == pytest.approx(recording.surface.vertices, abs=1e-9)
-    assert case.surface.fibre == pytest.approx(recording.surface.fibre, abs=1e-6)
+    assert case.surface.vertices == pytest.approx(valve.surface.vertices, abs=1e-9)
+    assert case.surface.fibre == pytest.approx(valve.surface.fibre, abs=1e-6)
     assert np.all(case.surface.thickness == 0.65)
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
     assert (opened.pressure_mmHg, closed.pressure_mmHg) == (0, pytest.approx(100, rel=1e-4))
     assert closed.papillary_tips[:, 2] == pytest.approx([-24, -24, -24])
     assert closed.annulus == pytest.approx(0.9 * opened.annulus, abs=1e-6)
-    valve = recording.valve()
     assert case.chordae.rest_length == pytest.approx(valve.chordae.rest_length)
     assert case.chordae.axial_stiffness == pytest.approx(valve.chordae.axial_stiffness)
     assert case.chordae.family_names == (

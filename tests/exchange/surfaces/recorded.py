@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.exchange.abaqus.mesh import SetNames
-
 REGIONS = ("anterior", "septal", "posterior")
-NAMES = SetNames({name: f"{name}_Quads" for name in REGIONS}, "Rim", "free_edge")
+NAMES = {
+    "leaflets": {name: f"{name}_Quads" for name in REGIONS},
+    "annulus": "Rim",
+    "free_edge": "free_edge",
+}
 ROUND, DOWN = 48, 6
 CASE = "Skirt"
 

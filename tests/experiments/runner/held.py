@@ -43,7 +43,7 @@ def held_replace(path, target, replaced=Path.replace):
 def run(job):
     match stage():
         case "simulating":
-            from mvest.exchange.external.process import Command
+            from mvest.exchange.external.contract import Command
 
             Command(("/bin/sh", "-c", PROGRAM)).run(job.folder)
         case "estimating":

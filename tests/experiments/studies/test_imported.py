@@ -22,9 +22,9 @@ TRUTH = np.array([2.0, 1.0, 3.0])
 SMALL = [
     "experiment=donor",
     f"donor.case={CASE}",
-    f"donor.annulus={NAMES.annulus}",
-    f"donor.free_edge={NAMES.free_edge}",
-    *(f"donor.leaflets.{region}={name}" for region, name in NAMES.leaflets.items()),
+    f"donor.annulus={NAMES['annulus']}",
+    f"donor.free_edge={NAMES['free_edge']}",
+    *(f"donor.leaflets.{region}={name}" for region, name in NAMES["leaflets"].items()),
     "donor.vertices=70",
     "donor.contact_vertices=336",
     "donor.starts=[[1.5,1.5,1.5],[3,1,2]]",
@@ -63,8 +63,8 @@ def made_up_recording(folder: Path) -> str:
     model = valve.model(tuple(config["parameters"]))
     closed = model.close(TRUTH, sensitivities=False).simulation
     assert closed.converged
-    fine = valve.recording.surface.vertices
-    free = np.setdiff1d(np.arange(len(fine)), valve.recording.annulus)
+    fine = valve.recording.valve.surface.vertices
+    free = np.setdiff1d(np.arange(len(fine)), valve.recording.valve.annulus)
     positions = embed(valve.mesh, fine)(closed.frames[-1])
     data["frames"][-1, free] = positions[free]
     write(folder, data)
