@@ -8,7 +8,7 @@ apart wherever they meet farther from the annulus, or farther in than they are t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,8 +56,8 @@ class LeafletFields:
 
     Attributes
     ----------
-    distance : (2, I, J, K) mm
-        To the anterior and to the posterior leaflet alone.
+    distance : (2, I, J, K) or (1, I, J, K) mm
+        To the anterior and to the posterior leaflet alone, or to both where they are one label.
     union : (I, J, K) mm
         To both together.
     step : float
@@ -126,19 +126,33 @@ class ThickLeaflets:
     grown_mm: float
     pieces: int
 
+    @property
+    def derived(self) -> Iterator[str]:
+        """What was done so that it is one closed surface."""
+        if self.pieces:
+            yield f"{self.pieces} loose pieces of the leaflets left out"
+        if self.grown_mm:
+            yield f"walls drawn {self.grown_mm:.2g} mm farther out, so that no hole is left"
+        if self.contact_mm2:
+            lengths = " and ".join(f"{length:.1f}" for length in self.seams)
+            yield (
+                f"leaflets cut apart where they touch, over {self.contact_mm2:.0f} mm^2, and one "
+                f"piece within {lengths} mm of the annulus at the commissures, as in the open frame"
+            )
+
 
 def fields_of_masks(
-    masks: tuple[BoolArray, BoolArray],
+    masks: Sequence[BoolArray],
     spacing: FloatArray,
     blur: float,
     step_mm: float = STEP_MM,
 ) -> tuple[LeafletFields, FloatArray]:
-    """Signed distances to two sets of voxels.
+    """Signed distances to sets of voxels.
 
     Parameters
     ----------
     masks
-        ``(I, J, K)`` each, the voxels of the anterior and of the posterior leaflet.
+        ``(I, J, K)`` each, the voxels of the anterior and of the posterior leaflet, or of both.
     spacing
         ``(3,)`` mm.
     blur
@@ -158,11 +172,10 @@ def fields_of_masks(
     GeometryError
         A leaflet without voxels, or leaflets too large for the grid.
     """
-    for name, mask in zip(("anterior", "posterior"), masks, strict=True):
-        if not mask.any():
-            raise GeometryError(f"no voxel of the {name} leaflet")
+    if not all(mask.any() for mask in masks):
+        raise GeometryError("no voxel of a leaflet")
     voxel = float(np.prod(spacing) ** (1 / 3))
-    both = masks[0] | masks[1]
+    both = np.any(masks, axis=0)
     box = ndimage.find_objects(both.astype(np.int8))[0]
     pad = np.ceil(MARGIN_MM / spacing).astype(int)
     low = np.array([part.start for part in box]) - pad
@@ -255,17 +268,22 @@ def thick_leaflets(
         ``(2, 3)`` papillary tips, mm from the first point of the grid.
     seams
         ``(2,)`` mm, how far down from the annulus the leaflets are one piece, on the side of each
-        tip, such as `ThickLeaflets.seams` of an open valve. Without it, wherever they meet.
+        tip, such as `ThickLeaflets.seams` of an open valve. Without it, wherever they meet; and so
+        for one label of both leaflets.
 
     Raises
     ------
     GeometryError
         The leaflets do not meet, or have no orifice or more holes, whichever way they are drawn.
     """
-    meet, half = _meet(fields)
-    if not meet.any():
-        raise GeometryError("the leaflets meet nowhere, expected at two commissures")
-    joined, lengths = _joined(fields, meet, tips, seams)
+    if len(fields.distance) == 1:
+        meet, half = np.zeros(fields.union.shape, dtype=np.bool_), fields.union
+        joined, lengths = ~meet, np.zeros(2)
+    else:
+        meet, half = _meet(fields)
+        if not meet.any():
+            raise GeometryError("the leaflets meet nowhere, expected at two commissures")
+        joined, lengths = _joined(fields, meet, tips, seams)
     cut = 0.5 * CUT_STEPS * fields.step
     said = ""
     for level in LEVELS:

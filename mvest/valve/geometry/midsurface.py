@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -73,6 +73,34 @@ class Midsurface:
         """Vertices ``(2, 2)``: of each commissure that on the annulus and that on the free edge."""
         columns = len(self.annulus)
         return np.column_stack([self.annulus, self.free_edge])[[0, columns // 2]]
+
+    @property
+    def heights(self) -> FloatArray:
+        """Largest length ``(2,)`` mm of each leaflet, from annulus to free edge."""
+        grid = self.vertices.reshape(-1, len(self.annulus), 3)
+        return np.asarray(_arc_lengths(grid)[-1].reshape(2, -1).max(axis=1))
+
+    def exchanged(self) -> Midsurface:
+        """The same with the anterior leaflet called posterior, and the other way round."""
+        columns = len(self.annulus)
+
+        def turned(values: FloatArray) -> FloatArray:
+            grid = values.reshape(-1, columns, *values.shape[1:])
+            return np.roll(grid, columns // 2, axis=1).reshape(values.shape)
+
+        return replace(self, vertices=turned(self.vertices), thickness=turned(self.thickness))
+
+    def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
+        """The same averaged round the valve, and by how many mm a vertex moves at most.
+
+        The standard deviation of the weights is `width_mm` along the annulus, and shorter in
+        proportion on shorter lines, such as the free edge.
+        """
+        grid = self.vertices.reshape(-1, len(self.annulus), 3)
+        step = np.linalg.norm(np.roll(grid[0], -1, axis=0) - grid[0], axis=1).mean()
+        smooth = gaussian_filter1d(grid, width_mm / step, axis=1, mode="wrap") if width_mm else grid
+        moved = float(np.linalg.norm(smooth - grid, axis=2).max())
+        return replace(self, vertices=smooth.reshape(-1, 3)), moved
 
 
 def midsurface(
@@ -247,6 +275,10 @@ def _label_seams(
     centre = np.unwrap(np.angle(np.sum(front * np.exp(1j * angle), axis=1)))
     s = np.linspace(0, 1, len(lines))
     known = (share > 0.02) & (share < 0.98)
+    if known.mean() < 0.5:
+        raise GeometryError(
+            "the labels do not part the leaflets at two commissures, from annulus to free edge"
+        )
     ends = []
     for seam in (centre - np.pi * share, centre + np.pi * share):
         slope, start = np.polyfit(s[known], seam[known], 1)
