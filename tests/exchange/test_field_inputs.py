@@ -27,11 +27,8 @@ from mvest.exchange.surfaces import read_surface
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
 from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
-from tests.places import ROOT
+from tests.places import field_input
 
-INPUTS = ROOT.parent / "shared" / "data" / "field_inputs"
-"""Small synthetic files, with a README that says what each stands for."""
-here = pytest.mark.skipif(not INPUTS.is_dir(), reason=f"no {INPUTS}: they lie beside the checkout")
 TIPS = "tips=[-16,-0.24,-25,16,-0.24,-25]"
 
 FURTHER = {
@@ -92,13 +89,12 @@ def reference(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return corners, None if labels is None else vtk_to_numpy(labels)
 
 
-@here
 @pytest.mark.parametrize(
     "name", ["cells_idtype.vtk", "pv_region_uint8_ascii.vtk", "obj_tabs.obj", "ply_ascii_tex.ply"]
 )
 def test_surfaces_are_as_vtk_reads_them(name: str) -> None:
-    corners, labels = reference(INPUTS / name)
-    found = read_surface(INPUTS / name)
+    corners, labels = reference(field_input(name))
+    found = read_surface(field_input(name))
     np.testing.assert_allclose(found.vertices[found.triangles], corners, rtol=0, atol=1e-5)
     assert (labels is None) == ("region" not in found.cell_data)
     if labels is not None:
@@ -111,13 +107,12 @@ def check_place(found: VolumeSequence, spacing, direction, origin) -> None:
     np.testing.assert_allclose(found.origin, origin[:3], rtol=0, atol=1e-6)
 
 
-@here
 @pytest.mark.parametrize("name", ["itk3d.nhdr", "itk4d.nrrd"])
 def test_volumes_are_as_simpleitk_reads_them(name: str) -> None:
-    image = SimpleITK.ReadImage(str(INPUTS / name))
+    image = SimpleITK.ReadImage(str(field_input(name)))
     size, step = image.GetDimension(), image.GetSpacing()
     found = read_volume(
-        INPUTS / name, modality=Modality.ULTRASOUND, time_unit="s" if size == 4 else None
+        field_input(name), modality=Modality.ULTRASOUND, time_unit="s" if size == 4 else None
     )
     values = SimpleITK.GetArrayFromImage(image).reshape(-1, *image.GetSize()[2::-1])
     np.testing.assert_array_equal(found.frames, values.transpose(0, 3, 2, 1))
@@ -126,9 +121,8 @@ def test_volumes_are_as_simpleitk_reads_them(name: str) -> None:
     np.testing.assert_allclose(found.times, step[-1] * np.arange(len(values)) * (size == 4))
 
 
-@here
 def test_phases_by_their_names_are_frames_at_the_interval_that_is_given() -> None:
-    path = INPUTS / "slicer_text_index.seq.nrrd"
+    path = field_input("slicer_text_index.seq.nrrd")
     values, header = nrrd.read(str(path))
     found = read_volume(path, modality=Modality.ULTRASOUND, frame_interval_s=0.03)
     np.testing.assert_array_equal(found.frames, values)
@@ -137,10 +131,9 @@ def test_phases_by_their_names_are_frames_at_the_interval_that_is_given() -> Non
     np.testing.assert_allclose(found.direction * found.spacing, steps, rtol=0, atol=1e-6)
 
 
-@here
 def test_a_recording_lies_where_slicerheart_puts_it() -> None:
-    dicom = read_volume(INPUTS / "rec.dcm")
-    saved = read_volume(INPUTS / "rec.seq.nrrd", modality=Modality.ULTRASOUND)
+    dicom = read_volume(field_input("rec.dcm"))
+    saved = read_volume(field_input("rec.seq.nrrd"), modality=Modality.ULTRASOUND)
     np.testing.assert_allclose(dicom.times, saved.times, atol=1e-9)
     here_and_there = np.array([[0.0, 0, 0], [5, 7, 9], [19, 23, 27]])
     for index in here_and_there:
@@ -155,11 +148,12 @@ def positions(path: Path) -> dict[str, list[list[float]]]:
     return {item["type"]: [point["position"] for point in item["controlPoints"]] for item in lists}
 
 
-@here
 @pytest.mark.parametrize("name", ["no_system.mrk.json", "line_and_points.mrk.json"])
 def test_points_are_read_whatever_lies_beside_them(name: str) -> None:
-    found = {points.kind: points.points.tolist() for points in read_markups(INPUTS / name).values()}
-    wanted = positions(INPUTS / name)
+    found = {
+        points.kind: points.points.tolist() for points in read_markups(field_input(name)).values()
+    }
+    wanted = positions(field_input(name))
     assert found["Fiducial"] == wanted["Fiducial"]
     assert set(found) <= set(wanted)
 
@@ -187,13 +181,12 @@ MAPS = (
 )
 
 
-@here
 @pytest.mark.parametrize("name", MAPS)
 def test_labels_are_as_nibabel_and_pynrrd_read_them(name: str) -> None:
     read: Callable[[Path], tuple[np.ndarray, np.ndarray]]
     read = by_nibabel if name.endswith(".gz") else by_pynrrd
-    values, matrix = read(INPUTS / name)
-    found = read_labels(INPUTS / name)
+    values, matrix = read(field_input(name))
+    found = read_labels(field_input(name))
     np.testing.assert_array_equal(found.frames, values)
     np.testing.assert_allclose(found.direction * found.spacing, matrix[:3, :3], atol=1e-6)
     np.testing.assert_allclose(found.origin, matrix[:3, 3], atol=1e-6)
@@ -201,7 +194,7 @@ def test_labels_are_as_nibabel_and_pynrrd_read_them(name: str) -> None:
 
 def imported(kind: str, name: str, folder: Path, *options: str) -> ValveCase:
     """The case that the command makes of a file."""
-    command = ["import", kind, str(INPUTS / name), str(folder / "case"), *options]
+    command = ["import", kind, str(field_input(name)), str(folder / "case"), *options]
     assert cli.main(command) == 0
     return read_case(folder / "case")
 
@@ -218,7 +211,7 @@ def check_leaflets(case: ValveCase, role: Role, voxels: dict[str, np.ndarray]) -
 
 def drawn(name: str, anterior: int, posterior: int, frames: tuple[int, int] = (0, 0)) -> dict:
     read = by_nibabel if name.endswith(".gz") else by_pynrrd
-    values, matrix = read(INPUTS / name)
+    values, matrix = read(field_input(name))
     places = {}
     for region, label, frame in (
         ("anterior", anterior, frames[0]), ("posterior", posterior, frames[1])
@@ -227,7 +220,6 @@ def drawn(name: str, anterior: int, posterior: int, frames: tuple[int, int] = (0
     return places
 
 
-@here
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "labels", "options"),
@@ -248,26 +240,28 @@ def test_leaflets_are_those_that_were_drawn(
     check_leaflets(case, Role.REFERENCE, drawn(name, *labels))
 
 
-@here
 @pytest.mark.slow
 def test_a_file_for_each_leaflet(tmp_path: Path) -> None:
     scene = "scene_mitral_frame_3_MD_{}_leaflet.nrrd"
     files = {region: scene.format(region) for region in ("anterior", "posterior")}
     case = imported(
-        "leaflets", files["anterior"], tmp_path, TIPS, f"posterior={INPUTS / files['posterior']}"
+        "leaflets",
+        files["anterior"],
+        tmp_path,
+        TIPS,
+        f"posterior={field_input(files['posterior'])}",
     )
     voxels = {region: drawn(name, 1, 1)[region] for region, name in files.items()}
     check_leaflets(case, Role.REFERENCE, voxels)
 
 
-@here
 @pytest.mark.slow
 def test_surfaces_as_slicerheart_named_them_in_2026(tmp_path: Path) -> None:
     case = imported("slicerheart", "slicerheart_apr2026", tmp_path)
     for role, phase in ((Role.REFERENCE, "3_MD"), (Role.CLOSED, "12_MS")):
         name = f"slicerheart_apr2026/P001_mitral_frame_{phase}_mitral_{{}}_leaflet.vtk"
         leaflets = {
-            region: reference(INPUTS / name.format(region))[0].reshape(-1, 3)
+            region: reference(field_input(name.format(region)))[0].reshape(-1, 3)
             for region in ("anterior", "posterior")
         }
         check_leaflets(case, role, leaflets)

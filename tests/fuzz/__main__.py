@@ -26,7 +26,7 @@ def main() -> int:
     end, seed = time.monotonic() + given.seconds, given.seed
     counts: dict[str, Counter[str]] = {name: Counter() for name in given.door or DOORS}
     with tempfile.TemporaryDirectory() as folder:
-        benches = {name: Bench(DOORS[name], Path(folder) / name) for name in counts}
+        benches = {name: Bench(*DOORS[name], Path(folder) / name) for name in counts}
         for name, bench in benches.items():
             if bad := [found for found in bench.whole if found[0] != "read"]:
                 sys.exit(f"{name}: a valid file is not read: {bad[0]}")

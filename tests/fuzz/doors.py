@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from experiments.common.records.record import read_record, write_record
-from experiments.runner.planning.plan import Plan
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import read_case, write_error_samples
 from mvest.estimation.prediction import Prediction
-from mvest.exchange.exporting.febio import read_run
 from mvest.exchange.external.contract import (
     RunRequest,
     read_answer,
@@ -27,45 +26,36 @@ from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.imaging.volume import Modality
-from mvest.problem.fields import read_case_fields
-from mvest.provenance import write_json
 from mvest.simulation.population import Population, load_population, save_population
 from tests.cases import folders
 from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
 from tests.experiments.studies.made_up import made_up, made_up_estimate
-from tests.fuzz.trial import Door
+from tests.fuzz.trial import Enter, Makers
 
 __all__ = ["DOORS"]
 
-Maker = Callable[[Path], Path]
 REQUEST = RunRequest(("E", "nu, local"), ("MPa", ""), (1.5, 0.3), 2)
 
 
-def of(*names: str) -> tuple[Maker, ...]:
+def of(*names: str) -> Makers:
     """Makers of variants by their names."""
     known = {str(variant): variant for variant in (*SURFACES, *VOLUMES, *LABELS, *MARKUPS)}
 
-    def maker(name: str) -> Maker:
-        def write(folder: Path) -> Path:
-            known[name].write(folder / known[name].file)
-            return folder / known[name].file
+    def write(name: str, folder: Path) -> Path:
+        known[name].write(folder / known[name].file)
+        return folder / known[name].file
 
-        return write
-
-    return tuple(map(maker, names))
+    return tuple(partial(write, name) for name in names)
 
 
-def beside(maker: Callable[[Path], object], *names: str) -> tuple[Maker, ...]:
+def beside(maker: Callable[[Path], object], *names: str) -> Makers:
     """Makers of the same folder, of which each file is damaged in turn."""
 
-    def one(name: str) -> Maker:
-        def write(folder: Path) -> Path:
-            maker(folder)
-            return folder / name
+    def write(name: str, folder: Path) -> Path:
+        maker(folder)
+        return folder / name
 
-        return write
-
-    return tuple(map(one, names))
+    return tuple(partial(write, name) for name in names)
 
 
 def case(folder: Path) -> None:
@@ -94,35 +84,8 @@ def population(folder: Path) -> None:
     save_population(folder / "valves.npz", Population((valve,), {"leaks": 3}, "abc"))
 
 
-def fields(folder: Path) -> None:
-    valve = folders.Template().valve(24, 8)
-    surface = valve.surface
-    closed = folders.closing(surface.vertices)[None]
-    np.savez_compressed(
-        folder / "fields.npz", triangles=surface.triangles, region=surface.region,
-        rest=surface.vertices, annulus=valve.annulus, free_edge=valve.free_edge,
-        frames=np.array(["closed"]), seen=np.array([True]), tips=np.array([folders.TIPS] * 2),
-        chord_tip=valve.chordae.tip, chord_insertion=np.zeros(len(valve.chordae), int),
-        observed=closed, fitted=closed, distance_fitted=np.zeros((1, len(surface.vertices))),
-    )  # fmt: skip
-
-
 def record(folder: Path) -> None:
     write_record(folder / "result.json", made_up(estimates=(made_up_estimate(),)))
-
-
-def plan(folder: Path) -> None:
-    job = {
-        "hash": "0" * 16, "folder": "job", "name": "k=1", "overrides": ["k=1"], "factors": {"k": 1},
-        "row": "r", "repeats": 1, "config_hash": "0" * 64, "publish_as": None, "values": {},
-        "without": [],
-    }  # fmt: skip
-    content = {
-        "sweep": "a", "size": None, "sweep_id": "b", "created": "2020-01-01T00:00:00Z",
-        "name": "a", "settings": {}, "publish": None, "directory": folder,
-        "values": {"seed": 1, "force": False}, "jobs": [job],
-    }  # fmt: skip
-    write_json(folder / "plan.json", content)
 
 
 def answer(folder: Path) -> None:
@@ -140,15 +103,6 @@ def positions(folder: Path) -> None:
     (folder / "a.csv").write_text("".join(steps))
 
 
-def estimated(folder: Path) -> None:
-    """A run that estimated a case."""
-    unknown = {"name": "E_f.anterior", "prior_mean": 6.23, "estimate": 7.5}
-    tissue = {"anterior": {"ratio": 2.65, "nu": 0.488, "reading": "A"}}
-    found = {"unknowns": [unknown], "settings": {"mechanics": {"tissue": tissue}}}
-    write_json(folder / "result.json", {"findings": {"case": found}})
-    write_json(folder / "config.json", {"case": "valve"})
-
-
 def leaflets(path: Path) -> object:
     return read_regions(path, {1: "anterior", 2: "posterior"})
 
@@ -163,64 +117,59 @@ def volume(path: Path) -> object:
     return read_volume(path, modality=Modality.ULTRASOUND, **unit)
 
 
-DOORS: dict[str, Door] = {
-    "case": Door(
+DOORS: dict[str, tuple[Enter, Makers]] = {
+    "case": (
         lambda path: read_case(path.parent),
         beside(case, "case.yaml", "chordae.csv", "pressure.csv", "errors.npz", "open.vtp"),
     ),
-    "surface.vtp": Door(leaflets, of(
+    "surface.vtp": (leaflets, of(
         "VTP: text, plain, UInt32, LittleEndian, Int64",
         "VTP: base64, zlib, UInt64, LittleEndian, Int64",
         "VTP: appended, LZMA, UInt32, BigEndian, Int32",
     )),
-    "surface.vtu": Door(leaflets, of(
+    "surface.vtu": (leaflets, of(
         "VTU: text, plain, UInt32, LittleEndian, Int64",
         "VTU: appended, zlib, UInt64, LittleEndian, Int32",
     )),
-    "surface.vtk": Door(leaflets, of(
+    "surface.vtk": (leaflets, of(
         "VTK: 4.2, text, int32, scalars", "VTK: 4.2, binary, uint8, a field",
         "VTK: 5.1, text, float64, a field", "VTK: 5.1, binary, int64, scalars",
         "VTK: triangle strips, 4.2, binary",
     )),
-    "surface.stl": Door(one_region, of("STL: VTK text", "STL: VTK binary")),
-    "surface.ply": Door(leaflets, of(
+    "surface.stl": (one_region, of("STL: VTK text", "STL: VTK binary")),
+    "surface.ply": (leaflets, of(
         "PLY: labels of points, ascii", "PLY: labels of faces, binary little endian"
     )),
-    "surface.obj": Door(leaflets, of("OBJ: groups of an object", "OBJ: lines and comments")),
-    "surface.glb": Door(leaflets, of("GLB: objects that nodes place")),
-    "volume.nrrd": Door(volume, of(
+    "surface.obj": (leaflets, of("OBJ: groups of an object", "OBJ: lines and comments")),
+    "surface.glb": (leaflets, of("GLB: objects that nodes place")),
+    "volume.nrrd": (volume, of(
         "NRRD by pynrrd: .seq.nrrd, frames first, raw, uint8", "NRRD: milliseconds",
         "NRRD by pynrrd: .nhdr, frames last, gzip, int16",
     )),
-    "volume.metaimage": Door(volume, of(
+    "volume.metaimage": (volume, of(
         "MetaImage: .mha, 4D, int16, plain", "MetaImage: .mha, 4D, uint8, compressed",
         "MetaImage: .mhd, 4D, uint8, compressed",
     )),
-    "volume.nifti": Door(volume, of(
+    "volume.nifti": (volume, of(
         "NIfTI: NIfTI-1, int16, .nii", "NIfTI: NIfTI-1, uint8, .nii.gz",
         "NIfTI: NIfTI-2, float32, .nii",
     )),
-    "volume.philips": Door(volume, of(
+    "volume.philips": (volume, of(
         "Philips Cartesian DICOM: explicit, preamble", "Philips Cartesian DICOM: implicit, bare"
     )),
-    "labels": Door(read_labels, of(
+    "labels": (read_labels, of(
         "Slicer segmentation: one layer", "NRRD labels: int16", "NIfTI labels: uint8",
     )),
-    "markups": Door(read_markups, of("Markups: 1.0.3, LPS", "Markups: ClosedCurve")),
-    "fcsv": Door(read_markups, of("fcsv: 4.10, 0", "fcsv: 5.0, LPS")),
-    "population": Door(load_population, beside(population, "valves.npz")),
-    "fields": Door(read_case_fields, beside(fields, "fields.npz")),
-    "record": Door(read_record, beside(record, "result.json")),
-    "plan": Door(lambda path: Plan.read(path.parent), beside(plan, "plan.json")),
-    "answer": Door(
+    "markups": (read_markups, of("Markups: 1.0.3, LPS", "Markups: ClosedCurve")),
+    "fcsv": (read_markups, of("fcsv: 4.10, 0", "fcsv: 5.0, LPS")),
+    "population": (load_population, beside(population, "valves.npz")),
+    "record": (read_record, beside(record, "result.json")),
+    "answer": (
         lambda path: read_answer(path.parent, REQUEST),
         beside(answer, "response.json", "observation.csv", "jacobian.csv"),
     ),
-    "request": Door(
+    "request": (
         read_request, beside(lambda folder: write_request(folder, REQUEST), "request.json")
     ),
-    "febio": Door(lambda path: read_positions(path, 3), beside(positions, "a.csv")),
-    "estimates": Door(
-        lambda path: read_run(path.parent), beside(estimated, "result.json", "config.json")
-    ),
+    "febio": (lambda path: read_positions(path, 3), beside(positions, "a.csv")),
 }  # fmt: skip

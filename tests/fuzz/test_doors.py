@@ -19,7 +19,7 @@ INPUTS = 50
 
 @pytest.mark.parametrize("name", DOORS)
 def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    bench = Bench(DOORS[name], tmp_path)
+    bench = Bench(*DOORS[name], tmp_path)
     assert bench.whole == [("read", "")] * len(bench.paths)
     found: Counter[str] = Counter()
     for seed in range(INPUTS):
@@ -32,7 +32,7 @@ def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted({path.parent.name for path in STORED.glob("*/*")}))
 def test_what_once_failed_is_read_or_refused(name: str, tmp_path: Path) -> None:
-    bench = Bench(DOORS[name], tmp_path)
+    bench = Bench(*DOORS[name], tmp_path)
     for stored in sorted((STORED / name).iterdir()):
         kinds = ["".join(path.suffixes) for path in bench.paths]
         kind, words = bench.tried(stored.read_bytes(), kinds.index("".join(stored.suffixes)))

@@ -8,14 +8,13 @@ import resource
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
 from mvest.errors import MvestError
 from tests.fuzz.mutation import changed
 
-__all__ = ["ENDS", "FAULTS", "Bench", "Door"]
+__all__ = ["ENDS", "FAULTS", "Bench", "Enter", "Makers"]
 
 MAX_SECONDS, MAX_BYTES, MAX_LETTERS = 5, 2**30, 300
 """Of computing in this process; of memory beside what it has; of a message, its folder aside."""
@@ -23,20 +22,10 @@ FAULTS = ("outside", "message", "memory", "slow")
 ENDS = ("read", "refused", "stopped", *FAULTS)
 
 
-@dataclass(frozen=True)
-class Door:
-    """A public way for a file into the package.
-
-    Attributes
-    ----------
-    enter
-        Takes a file, or the folder that it is in; what it returns does not matter.
-    makers
-        Write valid files into an empty folder; each returns the one that is damaged.
-    """
-
-    enter: Callable[[Path], object]
-    makers: tuple[Callable[[Path], Path], ...]
+Enter = Callable[[Path], object]
+"""Takes a file, or the folder that it is in; what it returns does not matter."""
+Makers = tuple[Callable[[Path], Path], ...]
+"""Each writes valid files into an empty folder, and returns the one that is damaged."""
 
 
 class Late(BaseException):
@@ -46,10 +35,9 @@ class Late(BaseException):
 class Bench:
     """The valid files of a door in a folder, each written over by what is made of it."""
 
-    def __init__(self, door: Door, folder: Path) -> None:
-        self.enter = door.enter
-        self.paths = []
-        for number, maker in enumerate(door.makers):
+    def __init__(self, enter: Enter, makers: Makers, folder: Path) -> None:
+        self.enter, self.paths = enter, list[Path]()
+        for number, maker in enumerate(makers):
             (folder / str(number)).mkdir(parents=True)
             self.paths.append(maker(folder / str(number)))
         self.contents = [path.read_bytes() for path in self.paths]
@@ -75,7 +63,7 @@ class Bench:
         return found
 
 
-def outcome(enter: Callable[[Path], object], path: Path) -> tuple[str, str]:
+def outcome(enter: Enter, path: Path) -> tuple[str, str]:
     """One of `ENDS`, and the message."""
     try:
         enter(path)
