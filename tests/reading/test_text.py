@@ -4,14 +4,16 @@ import json
 import math
 import os
 import time
+from pathlib import Path
 
 import pytest
 import yaml
 
-from mvest.errors import InputError
+from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.reading.documents import parse_json, read_mapping, read_yaml
 from mvest.reading.text import (
+    MAX_LINE,
     check_words,
     number,
     one_line,
@@ -19,6 +21,7 @@ from mvest.reading.text import (
     read_columns,
     read_numbers,
     read_text,
+    refusing,
 )
 
 ODD = (
@@ -160,7 +163,7 @@ def test_long_documents_end_soon(tmp_path, piece):
 # --- tables -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cell", [cell for cell in ODD if "\n" not in cell and "," not in cell])
+@pytest.mark.parametrize("cell", [cell for cell in ODD if not set("\n,\0") & set(cell)])
 def test_a_cell_that_is_no_number_is_named(tmp_path, cell):
     (tmp_path / "a.csv").write_text(f"x,y\n1,2\n3,{cell}\n")
     with pytest.raises(InputError, match=r"a\.csv: y of row 1"):
@@ -171,13 +174,14 @@ def test_tables(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(' y , x \n\n 1,"2"\n3,4.5\n')
     assert read_numbers(path, ("x", "y")).tolist() == [[2, 1], [4.5, 3]]
-    with pytest.raises(InputError, match="columns"):
-        read_columns(path, ("x", "y"), strict=True)
-    with pytest.raises(InputError, match="more than the 1 rows"):
-        read_columns(path, ("x", "y"), count=1)
-    path.write_text("x\na\x1bb\n")
-    with pytest.raises(InputError, match=r"x of row 0: the character U\+001B"):
-        read_columns(path, ["x"])
+    for text, words in (
+        ("x,y,z\n1,2,3\n", "columns x,y,z, expected x,y"), ("x,y\n", "no rows"), ("", "none"),
+        ("x,y\n1,2,3\n", "row 0 has 3 cells"), ('x,y\n"1,2\n', "no comma-separated text"),
+        ("x,y\na\x1bb,1\n", r"the character U\+001B"),
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_columns(path, ("x", "y"))
 
 
 def test_long_tables_end_soon(tmp_path):
@@ -185,6 +189,35 @@ def test_long_tables_end_soon(tmp_path):
     start = time.process_time()
     assert len(read_numbers(tmp_path / "a.csv", ["x"])) == 500_000
     assert time.process_time() - start < 5
+
+
+# --- whatever is raised -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "words"),
+    [
+        (GeometryError("open"), GeometryError, "a.stl: open"),
+        (RuntimeError("a\n\x1b[31m b"), InputError, "a.stl: damaged or no STL file: a �[31m b"),
+        (RecursionError(), InputError, "a.stl: damaged or no STL file: RecursionError"),
+        (MemoryError(), InputError, "a.stl: damaged or no STL file: MemoryError"),
+        (GeometryError("x" * 1000), GeometryError, "a.stl: x"),
+        (GeometryError("/nowhere/a.stl: open"), GeometryError, "a.stl: open"),
+    ],
+)
+def test_everything_becomes_one_line(error: Exception, kind: type, words: str) -> None:
+    path = Path("/nowhere/a.stl")
+    with pytest.raises(kind) as caught, refusing(path, "STL file"):
+        raise error
+    message = str(caught.value)
+    assert message.startswith(f"/nowhere/{words}")
+    assert message.count("nowhere") == 1
+    assert len(message.removeprefix("/nowhere/")) <= MAX_LINE
+
+
+def test_an_interruption_is_let_through() -> None:
+    with pytest.raises(KeyboardInterrupt), refusing(Path("a.stl"), "STL file"):
+        raise KeyboardInterrupt
 
 
 # --- what is written ----------------------------------------------------------------------------

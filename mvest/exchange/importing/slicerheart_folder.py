@@ -255,8 +255,7 @@ def _model(file: _File, notes: list[str]) -> Mesh:
     model = read_mesh(file.path)
     if model.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    check_finite(model.points)
-    return replace(model, points=model.points * TO_LPS[space[1] if space else "RAS"])
+    return replace(model, points=model.points * TO_LPS[model.space or "RAS"])
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
