@@ -94,8 +94,8 @@ def in_child(
             code: int = program.process.returncode
             how = f"more than {seconds:g} s" if late else ending(code)
             raise InputError(
-                f"{path}: damaged, or too large: reading it took {how} (limits {memory_gb:g} GiB, "
-                f"{seconds:g} s)"
+                f"{path}: damaged, or too large: its reader stopped: {how} (limits "
+                f"{memory_gb:g} GiB, {seconds:g} s)"
             ) from error
         finally:
             timer.cancel()
@@ -165,6 +165,7 @@ def main() -> None:
     """Answer calls until the input is closed."""
     requests: BinaryIO = os.fdopen(os.dup(0), "rb")
     answers: BinaryIO = os.fdopen(os.dup(1), "wb")
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):  # libraries print what they think of a file
         os.dup2(nothing, stream)

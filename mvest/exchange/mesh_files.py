@@ -1,20 +1,20 @@
-"""Meshes from the files of others; these functions run in the child (`mvest.exchange.child`).
+"""Meshes in the files of others, for the child (`mvest.exchange.child`): all end as VTK's objects.
 
-VTK reads its own formats and STL, trimesh reads GLB. OBJ and PLY are read here: VTK drops the
-groups of the one and the properties of the other, and trimesh reads no binary PLY file that mixes
-triangles and quadrilaterals.
+VTK reads its own formats, trimesh GLB. STL, OBJ and PLY are read here: VTK takes binary STL files
+that are cut off, and drops the groups of OBJ files and the properties of PLY files; trimesh reads
+no binary PLY files that mix triangles and quadrilaterals.
 """
 
 from __future__ import annotations
 
 import importlib
 import io
+import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,143 +22,88 @@ from numpy.typing import NDArray
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
-Arrays = dict[str, NDArray[np.generic]]
-
-POINTS, LINES, STRIPS, FACES, OTHERS = range(5)
-"""Kinds of cells: vertices by themselves, lines, strips of triangles, polygons, all others."""
-_KIND = {1: POINTS, 2: POINTS, 3: LINES, 4: LINES, 5: FACES, 6: STRIPS, 7: FACES, 9: FACES}
-"""By VTK's number of a type of cell."""
-
-
-@dataclass(slots=True, eq=False)
-class _Cells:
-    """What a file holds.
-
-    Attributes
-    ----------
-    points
-        ``(n, 3)``.
-    corners, sizes
-        Points of all cells one after another, and how many each of the c cells has ``(c,)``.
-    types
-        ``(c,)`` VTK's numbers of the types of the cells; None: all are polygons.
-    group, names
-        ``(c,)`` index of the name of each cell's group or object; None where there are no groups.
-    """
-
-    points: FloatArray
-    corners: IntArray
-    sizes: IntArray
-    types: IntArray | None = None
-    point_data: Arrays = field(default_factory=dict)
-    cell_data: Arrays = field(default_factory=dict)
-    field_data: dict[str, Any] = field(default_factory=dict)
-    group: IntArray | None = None
-    names: list[str] = field(default_factory=list)
+Arrays = Mapping[str, NDArray[np.generic]]
+FLAT_CELLS = range(10)
+"""VTK's numbers of vertices, lines, triangles, strips, polygons and quadrilaterals."""
 
 
 def read_cells(path: Path, suffix: str) -> dict[str, Any]:
-    """The fields of `mvest.exchange.surfaces.Mesh` for a file of a kind.
+    """The fields of `mvest.exchange.surfaces.Mesh` for a file of this kind.
 
     Raises
     ------
     InputError, GeometryError
         A damaged file, no points, or cells that name points that do not exist.
     """
-    found = _READERS[suffix](path)
-    n = len(found.points)
+    data, groups = _READERS[suffix](path)
+    n, cells = data.GetNumberOfPoints(), data.GetNumberOfCells()
     if not n:
-        raise InputError("damaged or empty: no points")
-    corners, sizes = found.corners, found.sizes
-    if (sizes < 0).any() or sizes.sum() != len(corners):
-        raise InputError("damaged: cells with other numbers of points than they say")
-    if len(corners) and not 0 <= corners.min() <= corners.max() < n:
-        raise GeometryError("cells name points that do not exist")
-    types = np.full(len(sizes), 7) if found.types is None else found.types
-    kinds = np.array([_KIND.get(number, OTHERS) for number in range(256)])[types]
-    triangles, rows = _triangles(found, kinds)
-    lines = kinds == LINES
-    others, counts = np.unique(types[kinds == OTHERS], return_counts=True)
+        raise InputError("damaged or empty: no points, expected a surface")
+    flat = data.IsA("vtkPolyData")
+    kinds = ("Verts", "Lines", "Polys", "Strips") if flat else ("Cells",)
+    for part in [getattr(data, f"Get{kind}")() for kind in kinds]:
+        corners = _numpy(part.GetConnectivityArray())
+        if not part.IsValid() or (len(corners) and not 0 <= corners.min() <= corners.max() < n):
+            raise GeometryError("cells name points that do not exist")
+    point_data, cell_data = _arrays(data.GetPointData()), _arrays(data.GetCellData())
+    for kind, rows, arrays in (("points", n, point_data), ("cells", cells, cell_data)):
+        for name, values in arrays.items():
+            if len(values) != rows:
+                raise InputError(f"data {name!r} has {len(values)} rows, expected {rows} {kind}")
+    field_data = _arrays(data.GetFieldData())
+    name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
+    types = np.zeros(0, dtype=np.int64)
+    if cells and not flat:
+        types = np.bincount(_numpy(data.GetCellTypesArray()))
+    others = {
+        name_of(number).removeprefix("vtk").lower(): int(count)
+        for number, count in enumerate(types)
+        if count and number not in FLAT_CELLS
+    }
+    none = np.zeros(0, dtype=np.int64)
+    triangles, lines, rows = (none.reshape(0, 3), [], none) if others else _triangulated(data)
+    with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
+        words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
     return {
-        "points": found.points,
+        "points": _numpy(data.GetPoints().GetData()).astype(np.float64),
         "triangles": triangles,
-        "line_points": corners[np.repeat(lines, sizes)],
-        "line_sizes": sizes[lines],
-        "others": {_type_name(k): m for k, m in zip(others.tolist(), counts.tolist(), strict=True)},
-        "point_data": _whole(found.point_data, n, "points"),
-        "cell_data": {k: v[rows] for k, v in _whole(found.cell_data, len(sizes), "cells").items()},
-        "field_data": found.field_data,
-        "space": _space(path, found),
-        "group": None if found.group is None else found.group[rows],
-        "names": found.names,
+        "lines": lines,
+        "others": others,
+        "point_data": point_data,
+        "cell_data": {name: values[rows] for name, values in cell_data.items()},
+        "field_data": field_data,
+        "space": words[1].decode() if words else field_data.get("SPACE"),
+        "groups": [groups[row] for row in rows.tolist()] if groups else [],
     }
 
 
-def _whole(data: Arrays, rows: int, what: str) -> Arrays:
-    for name, values in data.items():
-        if len(values) != rows:
-            raise InputError(f"data {name!r} has {len(values)} rows, expected {rows} {what}")
-    return data
-
-
-def _space(path: Path, found: _Cells) -> str | None:
-    """Name of the axes as 3D Slicer writes it: in a title or comment, or among the field data."""
-    with path.open("rb") as stream:
-        words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
-    return words[1].decode() if words else found.field_data.get("SPACE")
-
-
-def _type_name(number: int) -> str:
-    names = vtk_module("vtkCommonDataModel").vtkCellTypes
-    return str(names.GetClassNameFromTypeId(number)).removeprefix("vtk").lower()
-
-
-def _triangles(found: _Cells, kinds: IntArray) -> tuple[IntArray, IntArray]:
-    """Triangles ``(m, 3)`` of polygons and strips, and the row ``(m,)`` of each one's cell."""
-    plain = (kinds == FACES) & (found.sizes >= 3)
-    strips = (kinds == STRIPS) & (found.sizes >= 3)
-    rows = np.flatnonzero(plain | strips)
-    if not strips.any() and (found.sizes[plain] == 3).all():
-        return found.corners[np.repeat(plain, found.sizes)].reshape(-1, 3), rows
-
-    def cells(own: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
-        return found.corners[np.repeat(own, found.sizes)], found.sizes[own]
-
-    row = np.concatenate([np.flatnonzero(plain), np.flatnonzero(strips)])
+def _triangulated(data: Any) -> tuple[IntArray, list[IntArray], IntArray]:
+    """Triangles ``(m, 3)`` of polygons and strips, lines, and each triangle's cell ``(m,)``."""
+    _add(data.GetPointData(), {"number of mvest": np.arange(data.GetNumberOfPoints())})
+    _add(data.GetCellData(), {"number of mvest": np.arange(data.GetNumberOfCells())})
+    if not data.IsA("vtkPolyData"):
+        # Leaves out points without cells, and may number the others anew.
+        data = _output(vtk_module("vtkFiltersGeometry").vtkGeometryFilter(), data)
     cutter = vtk_module("vtkFiltersCore").vtkTriangleFilter()
-    cutter.SetInputData(polydata(found.points, cells(plain), cells(strips), cell_data={"row": row}))
-    cutter.Update()
-    result = cutter.GetOutput()
-    rows = _numpy(result.GetCellData().GetArray("row")).astype(np.int64)
-    corners = _numpy(result.GetPolys().GetConnectivityArray()).astype(np.int64)
+    cutter.PassLinesOff()
+    cutter.PassVertsOff()
+    cut = _output(cutter, data)
+    point = _numpy(data.GetPointData().GetArray("number of mvest"))
+    sizes = np.diff(_numpy(cut.GetPolys().GetOffsetsArray()))
+    corners = _numpy(cut.GetPolys().GetConnectivityArray())[np.repeat(sizes == 3, sizes)]
+    rows = _numpy(cut.GetCellData().GetArray("number of mvest"))[sizes == 3]
     order = np.argsort(rows, kind="stable")
-    return corners.reshape(-1, 3)[order], rows[order]
+    triangles = point[corners.reshape(-1, 3)[order]]
+    lines = data.GetLines()
+    ends = _numpy(lines.GetOffsetsArray())[1:-1].astype(np.int64)
+    parts = np.split(point[_numpy(lines.GetConnectivityArray())], ends)
+    return triangles, [part for part in parts if len(part)], rows[order]
 
 
-def polydata(
-    points: FloatArray,
-    faces: tuple[IntArray, IntArray],
-    strips: tuple[IntArray, IntArray] | None = None,
-    point_data: Mapping[str, NDArray[np.generic]] | None = None,
-    cell_data: Mapping[str, NDArray[np.generic]] | None = None,
-) -> Any:
-    """VTK's object of polygons and strips, each given as (points of all, number of each)."""
-    convert, model = vtk_module("util.numpy_support"), vtk_module("vtkCommonDataModel")
-    result, places = model.vtkPolyData(), vtk_module("vtkCommonCore").vtkPoints()
-    places.SetData(convert.numpy_to_vtk(points, deep=1))
-    result.SetPoints(places)
-    for cells, put in ((faces, result.SetPolys), (strips, result.SetStrips)):
-        if cells is not None:
-            corners, sizes = cells
-            array, ends = model.vtkCellArray(), np.concatenate([[0], np.cumsum(sizes)])
-            array.SetData(*(convert.numpy_to_vtkIdTypeArray(k, deep=1) for k in (ends, corners)))
-            put(array)
-    for data, into in ((point_data, result.GetPointData()), (cell_data, result.GetCellData())):
-        for name, values in (data or {}).items():
-            column = convert.numpy_to_vtk(values, deep=1)
-            column.SetName(name)
-            into.AddArray(column)
-    return result
+def _output(step: Any, data: Any) -> Any:
+    step.SetInputData(data)
+    step.Update()
+    return step.GetOutput()
 
 
 def vtk_module(name: str) -> Any:
@@ -171,67 +116,32 @@ def _numpy(array: Any) -> NDArray[Any]:
     return result
 
 
-def _vtk(path: Path, module: str, name: str) -> _Cells:
-    """What one of VTK's readers reads."""
-    reader = getattr(vtk_module(module), name)()
-    if module == "vtkIOLegacy":
-        _prepare_legacy(reader, path.read_bytes())
-    reader.SetFileName(str(path))
-    _update(reader)
-    data = reader.GetOutput()
-    if data is None or not (data.IsA("vtkPolyData") or data.IsA("vtkUnstructuredGrid")):
-        kind = data.GetClassName().removeprefix("vtk") if data else "nothing"
-        raise InputError(f"holds {kind}, expected PolyData or an UnstructuredGrid")
-    if data.IsA("vtkPolyData"):
-        parts = [data.GetVerts(), data.GetLines(), data.GetPolys(), data.GetStrips()]
-        types = np.repeat([2, 4, 7, 6], [part.GetNumberOfCells() for part in parts])
-    else:
-        parts = [data.GetCells()]
-        types = np.zeros(0, dtype=np.int64)
-        if data.GetNumberOfCells():
-            types = _numpy(data.GetCellTypesArray()).astype(np.int64)
-    points = data.GetPoints()
-    return _Cells(
-        np.zeros((0, 3)) if points is None else _numpy(points.GetData()).astype(np.float64),
-        np.concatenate([_numpy(c.GetConnectivityArray()) for c in parts]).astype(np.int64),
-        np.concatenate([np.diff(_numpy(c.GetOffsetsArray())) for c in parts]).astype(np.int64),
-        types,
-        _arrays(data.GetPointData()),
-        _arrays(data.GetCellData()),
-        _arrays(data.GetFieldData()),
-    )
+def _add(into: Any, arrays: Arrays) -> None:
+    for name, values in arrays.items():
+        column = vtk_module("util.numpy_support").numpy_to_vtk(values, deep=1)
+        column.SetName(name)
+        into.AddArray(column)
 
 
-def _prepare_legacy(reader: Any, content: bytes) -> None:
-    """Have all arrays read, and numbers that are missing at the end of a text noticed.
-
-    VTK 9.7 makes numbers up where a text ends too early, but not where it meets a word instead. So
-    a field without arrays follows.
-    """
-    for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
-        getattr(reader, f"ReadAll{what}On")()
-    if b"ASCII" in b"".join(content[:1024].upper().splitlines()[2:3]):
-        reader.ReadFromInputStringOn()
-        reader.SetInputString(content.decode("latin-1") + "\nFIELD end 0\n")
-
-
-def _update(reader: Any) -> None:
-    """Let a reader read; raise what VTK says of errors, some of which it calls warnings."""
-    said: list[str] = []
-
-    def heard(_window: object, event: str, text: str) -> None:
-        if event == "ErrorEvent" or "Error reading" in text:
-            said.append(text)
-
-    heard.CallDataType = "string0"  # type: ignore[attr-defined]
-    window = vtk_module("vtkCommonCore").vtkOutputWindow.GetInstance()
-    tags = [window.AddObserver(event, heard) for event in ("ErrorEvent", "WarningEvent")]
-    reader.Update()
-    for tag in tags:
-        window.RemoveObserver(tag)
-    if said:
-        words = re.sub(r"^.*?, line [0-9]+\s", "", said[0], flags=re.S)
-        raise InputError(f"damaged: {re.sub(r'^vtk[^:]*0x[0-9a-f]+.: ', '', words)}")
+def polydata(
+    points: FloatArray,
+    corners: IntArray,
+    sizes: IntArray,
+    point_data: Arrays | None = None,
+    cell_data: Arrays | None = None,
+) -> Any:
+    """VTK's object of polygons: their corners one after another, and how many each has."""
+    convert, model = vtk_module("util.numpy_support"), vtk_module("vtkCommonDataModel")
+    result, cells = model.vtkPolyData(), model.vtkCellArray()
+    places = vtk_module("vtkCommonCore").vtkPoints()
+    places.SetData(convert.numpy_to_vtk(points, deep=1))
+    ends = np.concatenate([[0], np.cumsum(sizes)])
+    cells.SetData(*(convert.numpy_to_vtkIdTypeArray(k, deep=1) for k in (ends, corners)))
+    result.SetPoints(places)
+    result.SetPolys(cells)
+    _add(result.GetPointData(), point_data or {})
+    _add(result.GetCellData(), cell_data or {})
+    return result
 
 
 def _arrays(data: Any) -> dict[str, Any]:
@@ -247,171 +157,226 @@ def _arrays(data: Any) -> dict[str, Any]:
     return result
 
 
-def _obj(path: Path) -> _Cells:
-    """An OBJ file with the names of groups, or of objects where there are no groups."""
-    points: list[list[str]] = []
+def _vtk(path: Path, module: str, name: str) -> tuple[Any, list[str]]:
+    """What one of VTK's readers reads; what it says of errors, some as warnings, is raised."""
+    said: list[str] = []
+
+    def heard(_window: object, event: str, text: str) -> None:
+        # Warnings are of damage too; ranges that VTK notes beside an array may be infinite.
+        if ("Error reading" in text or event == "ErrorEvent") and "InformationKey" not in text:
+            said.append(text)
+
+    heard.CallDataType = "string0"  # type: ignore[attr-defined]
+    window = vtk_module("vtkCommonCore").vtkOutputWindow.GetInstance()
+    tags = [window.AddObserver(event, heard) for event in ("ErrorEvent", "WarningEvent")]
+    reader = getattr(vtk_module(module), name)()
+    reader.SetFileName(str(path))
+    if module == "vtkIOLegacy":
+        _prepare_legacy(reader, path.read_bytes())
+    reader.Update()
+    for tag in tags:
+        window.RemoveObserver(tag)
+    if said:
+        words = re.sub(r"^.*?, line [0-9]+\s", "", said[0], flags=re.S)
+        raise InputError(f"damaged: {re.sub(r'^vtk[^:]*0x[0-9a-f]+.: ', '', words)}")
+    data = reader.GetOutput()
+    if data is None or not (data.IsA("vtkPolyData") or data.IsA("vtkUnstructuredGrid")):
+        kind = data.GetClassName().removeprefix("vtk") if data else "nothing"
+        raise InputError(f"holds {kind}, expected PolyData or an UnstructuredGrid")
+    return data, []
+
+
+def _prepare_legacy(reader: Any, content: bytes) -> None:
+    """Have all arrays read, and numbers that are missing at the end of a text noticed.
+
+    VTK 9.7 makes numbers up where a text ends too early, but not where it meets a word instead. So
+    a field without arrays follows.
+    """
+    for what in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
+        getattr(reader, f"ReadAll{what}On")()
+    if b"ASCII" in b"".join(content[:1024].upper().splitlines()[2:3]):
+        reader.ReadFromInputStringOn()
+        reader.SetInputString(content.decode("latin-1") + "\nFIELD end 0\n")
+
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_HEADER = 84
+
+
+def _stl(path: Path) -> tuple[Any, list[str]]:
+    """An STL file, its triangles sharing the corners that are equal to the last digit."""
+    content = path.read_bytes()
+    count = int.from_bytes(content[80:_STL_HEADER], "little")
+    whole = _STL_HEADER + count * _FACET.itemsize
+    if len(content) == whole or (len(content) > whole and b"\0" in content[:_STL_HEADER]):
+        corners = np.frombuffer(content, _FACET, count, _STL_HEADER)["corners"].astype(np.float64)
+    elif content.lstrip()[:5].lower() == b"solid":
+        words = content.lower().split()
+        at = [k for k, word in enumerate(words) if word == b"vertex"]
+        if words.count(b"endloop") * 3 != len(at) or b"endsolid" not in words:
+            raise InputError(f"{len(at)} corners, expected three of each facet and endsolid")
+        corners = np.array([float(word) for k in at for word in words[k + 1 : k + 4]])
+    else:
+        raise InputError(f"{len(content)} bytes, expected {whole} for {count} triangles")
+    points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return polydata(points, numbers.ravel(), np.full(numbers.size // 3, 3)), []
+
+
+def _obj(path: Path) -> tuple[Any, list[str]]:
+    """An OBJ file with the names of its groups, or of its objects where there are no groups."""
+    points: list[tuple[float, float, float]] = []
     corners: list[int] = []
     sizes: list[int] = []
-    of_faces: dict[str, list[str]] = {"g": [], "o": []}
+    groups: dict[str, list[str]] = {"g": [], "o": []}
     now = {"g": "", "o": ""}
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for line in text.splitlines():
-        word, *rest = line.split() or [""]
+        word, *rest = line.partition("#")[0].split() or [""]
         if word == "v":
-            points.append(rest[:3])
+            x, y, z, *_ = rest
+            points.append((float(x), float(y), float(z)))
         elif word == "f":
             face = [int(corner.split("/")[0]) for corner in rest]
-            if 0 in face:
-                raise GeometryError("cells name points that do not exist: they count from 1")
-            # A negative number counts from the last vertex so far.
-            corners += [k - 1 if k > 0 else len(points) + k for k in face]
+            # A negative number counts from the last vertex so far; none is 0.
+            corners += [k - 1 if k >= 0 else len(points) + k for k in face]
             sizes.append(len(face))
             for kind, name in now.items():
-                of_faces[kind].append(name)
+                groups[kind].append(name)
         elif word in now:
             now[word] = " ".join(rest)
-    groups = of_faces["g"] if any(of_faces["g"]) else of_faces["o"]
-    names, group = np.unique(groups, return_inverse=True)
-    return _Cells(
-        np.array(points, dtype=np.float64).reshape(-1, 3),
+    named = groups["g"] if any(groups["g"]) else groups["o"]
+    surface = polydata(
+        np.array(points).reshape(-1, 3),
         np.array(corners, dtype=np.int64),
         np.array(sizes, dtype=np.int64),
-        group=group if any(groups) else None,
-        names=names.tolist(),
     )
+    return surface, named if any(named) else []
 
 
-_PLY_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+_PLY_TYPES = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
+"""That NumPy does not know, or takes for larger ones."""
+_PLY_ORDER: dict[str, Literal["=", "<", ">"]] = {
+    "ascii": "=",
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
 }
-_PLY_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def _ply(path: Path) -> _Cells:
+def _ply(path: Path) -> tuple[Any, list[str]]:
     """A PLY file with the properties of its vertices and faces."""
     head, mark, body = path.read_bytes().partition(b"end_header")
     lines = [line.split() for line in head.decode("latin-1").splitlines()]
     if not mark or lines[:1] != [["ply"]]:
         raise InputError("damaged or no PLY file: no header from 'ply' to 'end_header'")
-    body = body[body.index(b"\n") + 1 :]
+    body = body.partition(b"\n")[2]
     form = next(words[1] for words in lines if words[:1] == ["format"])
-    if form == "ascii":  # every number becomes one of eight bytes
-        body = np.array(body.split(), dtype="<f8").tobytes()
-    elements: dict[str, tuple[int, list[tuple[str, list[str]]]]] = {}
+    if form == "ascii":  # every number takes eight bytes then
+        body = np.array(body.split(), dtype="f8").tobytes()
+    elements: dict[str, tuple[int, list[tuple[str, list[np.dtype[Any]]]]]] = {}
     for words in lines:
         if words[:1] == ["element"]:
             elements[words[1]] = (int(words[2]), [])
         elif words[:1] == ["property"]:
-            kinds = [
-                "<f8" if form == "ascii" else _PLY_ORDER[form] + _PLY_TYPES[kind]
-                for kind in words[1:-1]
-                if kind != "list"
-            ]
-            list(elements.values())[-1][1].append((words[-1], kinds))
-    tables: dict[str, Arrays] = {}
+            kinds = [_PLY_TYPES.get(word, word) for word in words[1:-1] if word != "list"]
+            kinds = ["f8"] * len(kinds) if form == "ascii" else kinds
+            types = [np.dtype(kind).newbyteorder(_PLY_ORDER[form]) for kind in kinds]
+            list(elements.values())[-1][1].append((words[-1], types))
+    tables: dict[str, dict[str, NDArray[Any]]] = {}
     at = 0
     for name, (count, properties) in elements.items():
-        tables[name], at = _ply_element(body, at, count, properties)
-    return _ply_cells(tables.get("vertex", {}), tables.get("face", {}))
+        tables[name], at = _ply_columns(body, at, count, properties)
+    if form == "ascii" and at < len(body):
+        raise InputError(f"holds {(len(body) - at) // 8} numbers more than its header says")
+    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    if not {"x", "y", "z"} <= set(vertex):
+        raise InputError("no element vertex with x, y and z")
+    name = "vertex_index" if "vertex_index" in face else "vertex_indices"
+    none = np.zeros(0, dtype=np.int64)
+    single = [
+        {key: v for key, v in table.items() if f"{key} size" not in table and key[-5:] != " size"}
+        for table in (vertex, face)
+    ]
+    return polydata(
+        np.column_stack([single[0].pop(axis).astype(np.float64) for axis in "xyz"]),
+        face.get(name, none).astype(np.int64),
+        face.get(f"{name} size", none).astype(np.int64),
+        *single,
+    ), []
 
 
-def _ply_element(
-    body: bytes, at: int, count: int, properties: list[tuple[str, list[str]]]
-) -> tuple[Arrays, int]:
+def _ply_columns(
+    body: bytes, at: int, count: int, properties: list[tuple[str, list[np.dtype[Any]]]]
+) -> tuple[dict[str, NDArray[Any]], int]:
     """Columns of an element, and where the next one begins.
 
     Of a list there are two: its lengths, and under its name all its numbers one after another.
+    Rows whose lists are as long as those of the first are read at once.
     """
-    first: list[tuple[str, str, tuple[int, ...]]] = []
-    width = 0
-    for name, kinds in properties:
-        if len(kinds) == 1:
-            first.append((name, kinds[0], ()))
-        else:
-            size = int(np.frombuffer(body, kinds[0], 1, at + width)[0]) if count else 0
-            first += [(f"{name} size", kinds[0], ()), (name, kinds[1], (size,))]
-        width = np.dtype(first).itemsize
-    row = np.dtype(first)
-    sizes = [name for name, _, _ in first if name.endswith(" size")]
-    if at + count * width <= len(body):
-        table = np.frombuffer(body, row, count, at)
-        if all((table[name] == table[name][:1]).all() for name in sizes):
-            return {name: table[name].ravel() for name in row.names or ()}, at + count * width
-    # Lists of several lengths: one by one.
-    columns: dict[str, list[NDArray[Any]]] = {name: [] for name in row.names or ()}
-    for _ in range(count):
-        for name, kinds in properties:
-            length = 1
-            for kind, column in zip(
-                kinds, ([f"{name} size"] if kinds[1:] else []) + [name], strict=True
-            ):
-                values = np.frombuffer(body, kind, length, at)
-                columns[column].append(values)
-                at += values.nbytes
-                length = int(values[0]) if len(values) else 0
-    return {name: np.concatenate(parts) for name, parts in columns.items()}, at
+    runs: list[NDArray[Any]] = []
+    ahead = 16
+    while count:
+        fields: list[tuple[str, np.dtype[Any], tuple[int, ...]]] = []
+        for name, types in properties:
+            shape: tuple[int, ...] = ()
+            if len(types) == 2:
+                size = np.frombuffer(body, types[0], 1, at + np.dtype(fields).itemsize)[0]
+                fields.append((f"{name} size", types[0], ()))
+                shape = (int(size),)
+            fields.append((name, types[-1], shape))
+        row = np.dtype(fields)
+        rows = min(count, ahead, (len(body) - at) // row.itemsize)
+        if not rows:
+            raise InputError(f"ends {count} rows too early")
+        table = np.frombuffer(body, row, rows, at)
+        sizes = [table[name] == table[name][0] for name, _, _ in fields if name[-5:] == " size"]
+        alike = np.all(sizes, axis=0) if sizes else np.ones(rows, dtype=np.bool_)
+        run = rows if alike.all() else int(np.argmin(alike))
+        ahead = 2 * ahead if run == rows else 16
+        runs.append(table[:run])
+        at, count = at + run * row.itemsize, count - run
+    names = (runs[0].dtype.names or ()) if runs else ()
+    columns = {name: np.concatenate([run[name].ravel() for run in runs]) for name in names}
+    return {k: v.astype(v.dtype.newbyteorder("=")) for k, v in columns.items()}, at
 
 
-def _ply_cells(vertex: Arrays, face: Arrays) -> _Cells:
-    if not {"x", "y", "z"} <= set(vertex):
-        raise InputError("no element vertex with x, y and z")
-    name = next((name for name in ("vertex_indices", "vertex_index") if name in face), "")
-    no_cells = np.zeros(0, dtype=np.int64)
-
-    def others(table: Arrays, *without: str) -> Arrays:
-        return {
-            key: values.astype(values.dtype.newbyteorder("="))
-            for key, values in table.items()
-            if key not in without and f"{key} size" not in table and not key.endswith(" size")
-        }
-
-    return _Cells(
-        np.column_stack([vertex[axis].astype(np.float64) for axis in "xyz"]),
-        face.get(name, no_cells).astype(np.int64),
-        face.get(f"{name} size", no_cells).astype(np.int64),
-        point_data=others(vertex, "x", "y", "z"),
-        cell_data=others(face),
-    )
-
-
-def _glb(path: Path) -> _Cells:
+def _glb(path: Path) -> tuple[Any, list[str]]:
     """All objects of a scene where its nodes place them, by the names of the nodes or meshes."""
     import trimesh
 
+    content = path.read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    needed = list(map(str, document.get("extensionsRequired", [])))
+    if any("sparse" in array or "bufferView" not in array for array in document["accessors"]):
+        needed.append("sparse or compressed arrays")  # which trimesh reads as zeros
+    if needed:
+        words = ", ".join(needed)
+        raise InputError(f"needs {words} of glTF; save it without compression or extensions")
     # A stream without a name: arrays in other files are not followed.
     scene = trimesh.load_scene(
-        io.BytesIO(path.read_bytes()), file_type="glb", skip_materials=True, process=False
+        io.BytesIO(content), file_type="glb", skip_materials=True, process=False
     )
     points: list[FloatArray] = [np.zeros((0, 3))]
     faces: list[IntArray] = [np.zeros((0, 3), dtype=np.int64)]
     names: list[str] = []
-    for node in map(str, scene.graph.nodes_geometry):
+    for node in map(str, reversed(list(scene.graph.nodes_geometry))):
         transform, geometry = scene.graph[node]
         part = scene.geometry[geometry].copy()
         if isinstance(part, trimesh.Trimesh):
             part.apply_transform(transform)
             faces.append(sum(map(len, points)) + np.asarray(part.faces))
-            points.append(np.asarray(part.vertices))
+            points.append(np.asarray(part.vertices, dtype=np.float64))
             if part.metadata["from_gltf_primitive"]:  # one of several of its node
                 node = str(scene.graph.transforms.parents[node])
-            names.append(str(geometry) if node.isdecimal() else node)
-    corners = np.concatenate(faces)
-    return _Cells(
-        np.concatenate(points).astype(np.float64),
-        corners.ravel().astype(np.int64),
-        np.full(len(corners), 3),
-        group=np.repeat(np.arange(len(names)), [len(part) for part in faces[1:]]),
-        names=names,
-    )
+            names += [str(geometry) if node.isdecimal() else node] * len(part.faces)
+    corners = np.concatenate(faces).ravel()
+    return polydata(np.concatenate(points), corners, np.full(len(names), 3)), names
 
 
-_READERS: dict[str, Callable[[Path], _Cells]] = {
+_READERS: dict[str, Callable[[Path], tuple[Any, list[str]]]] = {
     ".vtk": partial(_vtk, module="vtkIOLegacy", name="vtkGenericDataObjectReader"),
     ".vtp": partial(_vtk, module="vtkIOXML", name="vtkXMLPolyDataReader"),
     ".vtu": partial(_vtk, module="vtkIOXML", name="vtkXMLUnstructuredGridReader"),
-    ".stl": partial(_vtk, module="vtkIOGeometry", name="vtkSTLReader"),
+    ".stl": _stl,
     ".obj": _obj,
     ".ply": _ply,
     ".glb": _glb,

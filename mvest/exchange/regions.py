@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +22,14 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.surfaces import SurfaceFile, read_surface
-from mvest.reading.text import MAX_NUMBER, one_line, refusing
+from mvest.reading.bounded import refusing
+from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 
 MERGE_TOLERANCE = 1e-5
 """Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
-
-MAX_TRIANGLES = 50_000
-"""Of a surface: leaflets of 2000 mm^2 with edges of 0.3 mm."""
+MAX_TRIANGLES = 500_000
+"""Of a surface."""
 MAX_NEIGHBOURS = 100
 """Vertices that are one, on average; where triangles share none there are about six."""
 
@@ -81,28 +82,22 @@ def read_regions(
     InputError, GeometryError
         A missing, damaged or empty file, unknown or missing labels, a region without triangles.
     """
+    names = list(regions.values())
     if isinstance(files, Path):
         with refusing(files, "surface"):
-            return _checked(_of_one_file(files, regions, part), regions)
-    return _checked(merged(_joined(files, list(regions.values()), part)), regions)
+            whole = _read(files, part)
+            label = _labels(whole, regions)
+            surface = RegionSurface(whole.vertices, whole.triangles, label, whole.point_data)
+            suffix = files.suffix.lower()
+            if suffix in (".stl", ".glb") or (suffix == ".obj" and _apart(surface)):
+                surface = merged(surface)
+            return _checked(surface, names)
+    return _checked(merged(_joined(files, names, part)), names)
 
 
-def _of_one_file(file: Path, regions: Mapping[int, str], part: str | None) -> RegionSurface:
-    whole = _read(file, part)
-    surface = RegionSurface(
-        whole.vertices, whole.triangles, _labels(whole, regions), whole.point_data
-    )
-    suffix = file.suffix.lower()
-    return (
-        merged(surface)
-        if suffix in (".stl", ".glb") or (suffix == ".obj" and _apart(surface))
-        else surface
-    )
-
-
-def _checked(surface: RegionSurface, regions: Mapping[int, str]) -> RegionSurface:
+def _checked(surface: RegionSurface, names: Sequence[str]) -> RegionSurface:
     if surface.region is not None:
-        empty = [n for i, n in enumerate(regions.values()) if not (surface.region == i).any()]
+        empty = [name for k, name in enumerate(names) if not (surface.region == k).any()]
         if empty:
             raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
     return surface
@@ -116,11 +111,6 @@ def _read(file: Path, part: str | None) -> SurfaceFile:
         raise GeometryError(
             f"{file}: {len(surface.triangles)} triangles, expected at most {MAX_TRIANGLES}; make "
             "them larger, or take one of several parts"
-        )
-    far = np.flatnonzero((np.abs(surface.vertices) > MAX_NUMBER).any(axis=1))
-    if len(far):
-        raise GeometryError(
-            f"{file}: points {far[:5].tolist()} have coordinates beyond {MAX_NUMBER:g}"
         )
     return surface
 
@@ -200,13 +190,13 @@ def merged(surface: RegionSurface) -> RegionSurface:
 
 
 def _labels(surface: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
+    """Index ``(m,)`` into the regions of each triangle."""
+    known = {float(label): f"{label} ({name})" for label, name in regions.items()}
     if "region" in surface.cell_data:
-        return _numbered(surface.cell_data["region"], regions, "triangles", "cell data region")
+        return _indices(surface.cell_data["region"], known, "triangles", "cell data region")
     if "region" in surface.point_data:
-        at_corner = _numbered(
-            surface.point_data["region"], regions, "vertices", "point data region"
-        )[surface.triangles]
-        ordered = np.sort(at_corner, axis=1)
+        at_point = _indices(surface.point_data["region"], known, "vertices", "point data region")
+        ordered = np.sort(at_point[surface.triangles], axis=1)
         torn = np.flatnonzero((np.diff(ordered, axis=1) > 0).all(axis=1))
         if len(torn):
             raise InputError(
@@ -215,38 +205,27 @@ def _labels(surface: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None
             )
         # The middle one of three sorted labels is the one that occurs at least twice.
         return ordered[:, 1]
-    groups = surface.groups
-    if len(set(groups)) > 1 or (groups and groups[0] in regions.values()):
-        return _named(groups, list(regions.values()))
+    groups, names = np.array(surface.groups), {name: name for name in regions.values()}
+    if len(set(groups)) > 1 or (len(groups) and groups[0] in names):
+        return _indices(groups, names, "triangles", "groups")
     return np.zeros(len(surface.triangles), dtype=np.int64) if len(regions) == 1 else None
 
 
-def _numbered(
-    labels: NDArray[np.generic], regions: Mapping[int, str], what: str, where: str
+def _indices(
+    labels: NDArray[np.generic], known: Mapping[Any, str], what: str, where: str
 ) -> IntArray:
-    """Labels as indices into the regions."""
-    values = np.asarray(labels, dtype=np.float64).reshape(len(labels), -1)
-    if values.shape[1] != 1:
-        raise InputError(f"{where} has {values.shape[1]} components, expected one label")
-    result = np.full(len(values), -1, dtype=np.int64)
-    for index, label in enumerate(regions):
-        result[values[:, 0] == label] = index
+    """Labels as indices into those that are known, by which words an error lists them."""
+    if labels.ndim != 1:
+        raise InputError(f"{where} has {labels.shape[1]} components, expected one label")
+    found, inverse = np.unique(labels, return_inverse=True)
+    place = {label: k for k, label in enumerate(known)}
+    result = np.array([place.get(label, -1) for label in found.tolist()])[inverse]
     bad = np.flatnonzero(result < 0)
     if len(bad):
-        known = ", ".join(f"{label} ({name})" for label, name in regions.items())
-        odd = sorted({f"{v:g}" for v in values[bad, 0]})
+        odd = [k if isinstance(k, str) else f"{k:g}" for k in found[np.unique(inverse[bad])]]
         raise InputError(
-            f"{where}: unknown label {', '.join(odd[:5])} at {what} {bad[:5].tolist()}"
-            f"{f' and {len(bad) - 5} more' if len(bad) > 5 else ''}; known are {known}"
+            f"{where}: unknown label {one_line(', '.join(odd[:5]), 80)} at {what} "
+            f"{bad[:5].tolist()}{f' and {len(bad) - 5} more' if len(bad) > 5 else ''}; known are "
+            f"{', '.join(known.values())}"
         )
     return result
-
-
-def _named(groups: Sequence[str], names: list[str]) -> IntArray:
-    unknown = sorted(set(groups) - set(names))
-    if unknown:
-        raise InputError(
-            f"groups {', '.join(repr(name) for name in unknown[:5])} are no regions; known are "
-            f"{', '.join(names)}"
-        )
-    return np.array([names.index(name) for name in groups], dtype=np.int64)

@@ -8,11 +8,9 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import meshio
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +18,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.exchange.child import in_child
 from mvest.exchange.mesh_files import polydata, read_cells, vtk_module
 from mvest.files import write_atomically
+from mvest.reading.text import MAX_NUMBER
 from mvest.typing import FloatArray, IntArray
 
 Data = Mapping[str, NDArray[np.generic]]
@@ -28,8 +27,6 @@ Data = Mapping[str, NDArray[np.generic]]
 WRITTEN_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
 SURFACE_SUFFIXES = (*WRITTEN_SUFFIXES, ".vtk", ".glb")
 """That are read."""
-_WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
-"""Formats that are written without data."""
 REGION_PREFIX = "region."
 
 
@@ -53,7 +50,7 @@ class SurfaceFile:
     triangles: IntArray
     point_data: Data = field(default_factory=dict)
     cell_data: Data = field(default_factory=dict)
-    groups: tuple[str, ...] = ()
+    groups: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,13 +81,13 @@ class Mesh:
 
     points: FloatArray
     triangles: IntArray
-    lines: tuple[IntArray, ...]
+    lines: Sequence[IntArray]
     others: Mapping[str, int]
     point_data: Data
     cell_data: Data
     field_data: Mapping[str, Any]
     space: str | None
-    groups: tuple[str, ...]
+    groups: Sequence[str]
 
 
 def read_mesh(path: Path | str) -> Mesh:
@@ -102,19 +99,18 @@ def read_mesh(path: Path | str) -> Mesh:
         Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.vtk`` (legacy),
         ``.stl``, ``.obj``, ``.ply``, ``.glb``.
     GeometryError
-        Points that are not finite, or cells that name points that do not exist.
+        Points that are not finite or beyond `MAX_NUMBER`, or cells that name points that do not
+        exist.
     """
     source = Path(path)
     _check_suffix(source, SURFACE_SUFFIXES)
     found = in_child(read_cells, source, source.suffix.lower())
-    bad = np.flatnonzero(~np.isfinite(found["points"]).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(found["points"]) <= MAX_NUMBER).all(axis=1))
     if len(bad):
-        raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
-    group, names = found.pop("group"), found.pop("names")
-    groups = () if group is None else tuple(names[k] for k in group.tolist())
-    line_points, sizes = found.pop("line_points"), found.pop("line_sizes")
-    lines = tuple(np.split(line_points, np.cumsum(sizes)[:-1])) if len(sizes) else ()
-    return Mesh(**found, lines=lines, groups=groups)
+        raise GeometryError(
+            f"{source}: points {bad[:5].tolist()} are not finite numbers of at most {MAX_NUMBER:g}"
+        )
+    return Mesh(**found)
 
 
 def read_surface(path: Path | str) -> SurfaceFile:
@@ -142,68 +138,59 @@ def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
         raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
 
 
-def _checked_data(data: Data | None, rows: int, what: str) -> dict[str, NDArray[np.generic]]:
-    """Copy of `data` in types that the files can hold, after a check of the number of rows."""
-    result = {}
-    for name, values in (data or {}).items():
-        array = np.asarray(values)
-        if array.ndim not in (1, 2) or len(array) != rows:
-            raise InputError(
-                f"{what} data {name!r}: shape {array.shape}, expected ({rows},) or ({rows}, c)"
-            )
-        if array.dtype == bool:
-            array = array.astype(np.int8)
-        if array.dtype.kind not in "iuf":
-            raise InputError(f"{what} data {name!r}: type {array.dtype}, expected numbers")
-        result[name] = np.ascontiguousarray(array)
-    return result
-
-
 def write_surface(
     path: Path | str,
     vertices: FloatArray,
     triangles: IntArray,
     point_data: Data | None = None,
     cell_data: Data | None = None,
+    space: str = "",
 ) -> Path:
     """Write a triangulated surface; the extension chooses the format.
 
+    ``space`` ("LPS") names the axes of a ``.vtp`` file, where 3D Slicer finds it.
+
     Raises
     ------
-    InputError
-        Unknown extension, wrong shapes, data for a format that holds none here (STL, OBJ, PLY), or
-        a file that cannot be written.
+    InputError, GeometryError
+        Unknown extension, no triangles, points that are not finite, data of another number of rows
+        or for a format that holds none here (STL, OBJ, PLY), or a file that cannot be written.
     """
     target = Path(path)
     _check_suffix(target, WRITTEN_SUFFIXES)
     points = np.ascontiguousarray(vertices, dtype=np.float64)
     faces = np.ascontiguousarray(triangles, dtype=np.int64)
-    _check_triangles(points, faces, str(target))
-    at_points = _checked_data(point_data, len(points), "point")
-    at_cells = _checked_data(cell_data, len(faces), "cell")
-    suffix = target.suffix.lower()
-    if suffix in _WRITERS:
-        if at_points or at_cells:
-            raise InputError(f"{target}: {suffix[1:].upper()} holds no data; write .vtu or .vtp")
-        # PLY knows no 64-bit integers.
-        mesh = meshio.Mesh(points, [("triangle", faces.astype(np.int32))])
-        write_atomically(target, lambda file: _WRITERS[suffix](str(file), mesh))
-    elif suffix == ".vtp":
-        content = SurfaceFile(points, faces, at_points, at_cells)
-        write_atomically(target, lambda file: _write_vtp(file, content))
-    else:
-        arrays: dict[str, list[Any]] = {name: [values] for name, values in at_cells.items()}
-        mesh = meshio.Mesh(points, [("triangle", faces)], point_data=at_points, cell_data=arrays)
-        write_atomically(
-            target, lambda file: meshio.vtu.write(str(file), mesh, binary=True, compression="zlib")
-        )
-    return target
+    if not np.isfinite(points).all():
+        raise GeometryError(f"{target}: points that are not finite numbers")
+    if points.shape[1:] != (3,) or faces.shape[1:] != (3,) or not len(faces):
+        raise InputError(f"{target}: {points.shape} and {faces.shape}, expected (n, 3) and (m, 3)")
+    if faces.min() < 0 or faces.max() >= len(points):
+        raise InputError(f"{target}: triangles name points outside 0 to {len(points) - 1}")
+    data = [
+        {name: np.ascontiguousarray(v, np.int8 if v.dtype == bool else None) for name, v in given}
+        for given in ((point_data or {}).items(), (cell_data or {}).items())
+    ]
+    for arrays, rows in zip(data, (len(points), len(faces)), strict=True):
+        for name, values in arrays.items():
+            if len(values) != rows or values.dtype.kind not in "iuf":
+                raise InputError(
+                    f"{target}: data {name!r} of shape {values.shape} and type {values.dtype}, "
+                    f"expected {rows} rows of numbers"
+                )
+    if target.suffix.lower() == ".vtp":
+        surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
+        return write_atomically(target, lambda file: _write_vtp(file, surface, space))
+    if any(data) and target.suffix.lower() != ".vtu":
+        raise InputError(f"{target}: {target.suffix[1:].upper()} holds no data; write .vtu or .vtp")
+    import meshio
+
+    # PLY knows no 64-bit integers.
+    cells = [("triangle", faces.astype(np.int32))]
+    mesh = meshio.Mesh(points, cells, data[0], {name: [v] for name, v in data[1].items()})
+    return write_atomically(target, lambda file: mesh.write(file))
 
 
-def _write_vtp(path: Path, data: SurfaceFile, space: str = "") -> None:
-    """Write a ``.vtp`` file; 3D Slicer finds the name ``space`` of the axes in its field data."""
-    faces = (data.triangles.ravel(), np.full(len(data.triangles), 3))
-    surface = polydata(data.vertices, faces, None, data.point_data, data.cell_data)
+def _write_vtp(path: Path, surface: Any, space: str) -> None:
     if space:
         words = vtk_module("vtkCommonCore").vtkStringArray()
         words.SetName("SPACE")
@@ -212,20 +199,9 @@ def _write_vtp(path: Path, data: SurfaceFile, space: str = "") -> None:
     writer = vtk_module("vtkIOXML").vtkXMLPolyDataWriter()
     writer.SetFileName(str(path))
     writer.SetInputData(surface)
+    writer.SetDataModeToBinary()
     if not writer.Write():
         raise OSError(f"VTK's error {writer.GetErrorCode()}")
-
-
-def _check_triangles(points: FloatArray, cells: IntArray, name: str) -> None:
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{name}: points of shape {points.shape}, expected (n, 3)")
-    if not np.isfinite(points).all():
-        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-        raise GeometryError(f"{name}: points {bad[:5].tolist()} are not finite numbers")
-    if cells.ndim != 2 or cells.shape[1] != 3 or len(cells) == 0:
-        raise InputError(f"{name}: cells of shape {cells.shape}, expected (m, 3) with m > 0")
-    if cells.min() < 0 or cells.max() >= len(points):
-        raise InputError(f"{name}: cells name points outside 0 to {len(points) - 1}")
 
 
 def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
@@ -257,25 +233,11 @@ def write_surface_series(
             f"{index}: {len(states)} states and times {moments.tolist()}, expected as many, "
             "increasing, at least one"
         )
-    names = [f"{index.stem}_{number:04d}.vtp" for number in range(len(states))]
-    for name, state in zip(names, states, strict=True):
-        target = index.with_name(name)
-        _check_triangles(state.vertices, state.triangles, str(target))
-        content = SurfaceFile(
-            state.vertices,
-            state.triangles,
-            _checked_data(state.point_data, len(state.vertices), "point"),
-            _checked_data(state.cell_data, len(state.triangles), "cell"),
-        )
-        write_atomically(target, partial(_write_vtp, data=content, space="LPS"))
-    return _write_index(index, moments, names)
-
-
-def _write_index(index: Path, times: FloatArray, names: Sequence[str]) -> Path:
     root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(root, "Collection")
-    for time, name in zip(times, names, strict=True):
-        ET.SubElement(collection, "DataSet", timestep=repr(float(time)), file=name)
-    tree = ET.ElementTree(root)
-    write_atomically(index, lambda file: tree.write(file, xml_declaration=True, encoding="utf-8"))
-    return index
+    for number, (time, state) in enumerate(zip(moments.tolist(), states, strict=True)):
+        file = index.with_name(f"{index.stem}_{number:04d}.vtp")
+        data = (state.point_data, state.cell_data)
+        write_surface(file, state.vertices, state.triangles, *data, space="LPS")
+        ET.SubElement(collection, "DataSet", timestep=repr(time), file=file.name)
+    return write_atomically(index, ET.tostring(root, encoding="utf-8", xml_declaration=True))

@@ -317,7 +317,7 @@ CASES = {
     "NaN in vertices": (not_a_number("open"), G, OPEN, r"open.obj: points \[7\] are not finite"),
     "vertex beyond sense": (
         surfaces(lambda x, t, r: (np.vstack([[1e200] * 3, x[1:]]), t, r)),
-        G, OPEN, r"points \[0\] have coordinates beyond 1e\+09",
+        G, OPEN, r"points \[0\] are not finite numbers of at most 1e\+09",
     ),
     "another region": (
         surface(lambda x, t, r: (x, t, 1 - r), "closed"),
@@ -327,7 +327,7 @@ CASES = {
         seam(0.01), G, OPEN, r"2 pieces that do not touch .* sharing the vertices of their seams"
     ),
     # Labels.
-    "too few labels": (labels_as_text("0 1 1"), I, OPEN, "data 'region' has 3 rows, expected 336"),
+    "too few labels": (labels_as_text("0 1 1"), I, OPEN, 'damaged: .*"region"'),
     "no labels": (
         surfaces(lambda x, t, r: (x, t, None)), I, OPEN, "without labels; expected cell data"
     ),
@@ -527,8 +527,8 @@ CASES = {
         both(text("x", "open.off"), put("frames", 0, "surface", "open.off")),
         I, OPEN, r"extension '.off', expected .vtu, .vtp, .stl, .obj, .ply",
     ),
-    "damaged file": (text("<VTKFile", "open.vtp"), I, OPEN, "damaged or no VTK XML file"),
-    "a file that is quoted": (labels_as_text("x" * 5000), I, OPEN, "damaged .*'xxxx"),
+    "damaged file": (text("<VTKFile", "open.vtp"), I, OPEN, "damaged: Error parsing XML"),
+    "a file that is quoted": (labels_as_text("x" * 5000), I, OPEN, 'damaged: .*"region"'),
     "truncated file": (
         lambda folder, document: os.truncate(folder / "closed.vtp", 3000), I, CLOSED, "damaged"
     ),
