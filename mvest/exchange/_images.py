@@ -149,6 +149,8 @@ SHORT = {
     for space in (name, f"{name}-time")
 }
 UNSTATED = ("", "???", "none")
+MAX_LINES = 1000
+"""To skip; pynrrd counts them also where there are none left."""
 KINDS_OF_SPACE = ("domain", "space", *UNSTATED)
 KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 IMAGE_NODE = "vtkMRMLScalarVolumeNode"
@@ -182,6 +184,8 @@ def _nrrd(path: Path, head: bytes) -> Opened:
         fields["data file"] = str(_beside(path, "data file", data_file))
     elif end is None:
         raise fault(path, "header", f"no end in {len(head)} bytes", "an empty line")
+    if int(fields.get("line skip", fields.get("lineskip", 0))) > MAX_LINES:
+        raise fault(path, "line skip", "more lines", f"at most {MAX_LINES}")
     field, times, unit = "dimension", None, ""
     if axis is not None:
         field, times, unit = _nrrd_times(path, fields, axis, shape[0])

@@ -228,8 +228,8 @@ def _voxels(path: Path, stated: Stated) -> NDArray[Any]:
     frames: NDArray[Any] = in_child(
         _images.voxels,
         path,
-        memory_gb=MEMORY * size / 2**30 + 1,
-        seconds=60 + size / BYTES_PER_SECOND,
+        memory_gb=round(MEMORY * size / 2**30 + 1, 1),
+        seconds=60 + size // BYTES_PER_SECOND,
     )
     return frames.astype(frames.dtype.newbyteorder("="), copy=False)
 

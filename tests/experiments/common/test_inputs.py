@@ -140,7 +140,10 @@ def test_of_a_case_what_is_not_read_does_not_count(given):
 
 def test_the_data_that_a_header_names_beside_it_count(given):
     header, data = given / "a.mhd", given / "a.raw"
-    header.write_text("NDims = 3\nElementDataFile = a.raw\n")
+    header.write_text(
+        "NDims = 3\nDimSize = 2 2 2\nElementSpacing = 1 1 1\nOffset = 0 0 0\n"
+        "TransformMatrix = 1 0 0 0 1 0 0 0 1\nElementType = MET_UCHAR\nElementDataFile = a.raw\n"
+    )
     data.write_bytes(b"1")
     (given / "other").write_bytes(b"1")
     first = hash_of({"study": "volume", "volume": str(header)})
