@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
@@ -36,6 +36,9 @@ CORRELATED_MM = 10.0
 """Along the leaflets over which errors of a segmentation are alike."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
+
+
+_Seen: TypeAlias = tuple[SeenPhase, Role]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +149,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     return replace(case, sha256="")
 
 
-def _chosen(
-    source: Path, options: SlicerheartOptions, derived: list[str]
-) -> list[tuple[SeenPhase, Role]]:
+def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
     """The phases that are taken, in the order of time."""
     by_phase = {s.phase: s for s in read_folder(source, options.scene, options.only)}
     closed = options.closed
@@ -178,7 +179,7 @@ def _chosen(
 
 
 def _placed(
-    chosen: Sequence[tuple[SeenPhase, Role]], options: SlicerheartOptions, derived: list[str]
+    chosen: Sequence[_Seen], options: SlicerheartOptions, derived: list[str]
 ) -> list[_Phase]:
     phases: list[_Phase] = []
     offset = (0.0, 0.0)
@@ -198,7 +199,7 @@ def _placed(
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")
         notes = list(seen.notes)
         try:
-            tips = _tips_of(seen, role, options, phases, notes)
+            tips = _tips_of((seen, role), options, phases, notes)
             surface, seams = _join(seen, tips, options, how, notes)
         except MvestError as fault:
             raise type(fault)(f"{label}: {fault}") from fault
@@ -213,24 +214,21 @@ def _placed(
 
 
 def _tips_of(
-    seen: SeenPhase,
-    role: Role,
-    options: SlicerheartOptions,
-    before: Sequence[_Phase],
-    notes: list[str],
+    phase: _Seen, options: SlicerheartOptions, before: Sequence[_Phase], notes: list[str]
 ) -> FloatArray:
+    seen, role = phase
     given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
     if given is not None:
         return np.array(given, dtype=np.float64).reshape(2, 3)
-    if seen.tips is not None:
-        return seen.tips
-    if before:
+    if seen.tips is None and before:
         notes.append(f"papillary tips where they are in {before[0].name}")
         return before[0].tips
-    raise InputError(
-        "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial, "
-        "with base, tip and insertion); give tips=[x,y,z,x,y,z] in LPS mm"
-    )
+    if seen.tips is None:
+        raise InputError(
+            "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial"
+            ", with base, tip and insertion); give tips=[x,y,z,x,y,z] in LPS mm"
+        )
+    return seen.tips
 
 
 def _join(
@@ -329,24 +327,16 @@ def _document(
                 "pressure_mmHg=... states it"
             )
     frames: list[dict[str, Any]] = []
-    time = 0.0
     for number, phase in enumerate(phases):
         file = f"{number}.vtp"
         surface, labels = phase.surface, {"region": np.asarray(phase.surface.region)}
         write_surface(folder / file, surface.vertices, surface.triangles, {}, labels)
-        reference = phase.role is Role.REFERENCE
-        time = 0.0 if reference else max(time + 0.01, TIMES.get(phase.seen.phase, 0.6))
-        frames.append(
-            {
-                "name": phase.name,
-                "time": time,
-                "role": phase.role.value,
-                "surface": file,
-                "papillary_tips": phase.tips.tolist(),
-                "pressure": 0.0 if reference else float(pressure),
-                **({} if reference else {"corresponds": False}),
-            }
-        )
+        frame = {"name": phase.name, "role": phase.role.value, "surface": file}
+        frames.append(frame | {"papillary_tips": phase.tips.tolist(), "time": 0.0, "pressure": 0.0})
+        if phase.role is not Role.REFERENCE:
+            time = max(frames[-2]["time"] + 0.01, TIMES.get(phase.seen.phase, 0.6))
+            frames[-1] |= {"time": time, "pressure": float(pressure), "corresponds": False}
+    stated = {"std_mm": options.std_mm, "correlation_length_mm": CORRELATED_MM}
     return {
         "version": 1,
         "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
@@ -356,11 +346,7 @@ def _document(
         "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
         "frames": frames,
         **_chordae(folder, phases[0], derived),
-        **(
-            {}
-            if options.std_mm is None
-            else {"observation": {"std_mm": options.std_mm, "correlation_length_mm": CORRELATED_MM}}
-        ),
+        **({} if options.std_mm is None else {"observation": stated}),
         "derived": derived,
     }
 

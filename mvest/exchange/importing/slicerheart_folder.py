@@ -44,7 +44,7 @@ _NAME = re.compile(
 )
 _PHASE = re.compile(r"(?:.*[^A-Za-z0-9])?(?P<phase>[MEC][DS])(?:[^A-Za-z0-9].*)?")
 """In names of other kinds, where CT is a modality and P1 a scallop."""
-LEAFLETS = {"anterior": {"anterior", "aml"}, "posterior": {"posterior", "pml"}}
+LEAFLETS = {"anterior": {"anterior", "aml", "amvl"}, "posterior": {"posterior", "pml", "pmvl"}}
 MUSCLES = (
     ({"antero", "lateral"}, {"anterolateral"}, {"al"}),
     ({"postero", "medial"}, {"posteromedial"}, {"pm"}),

@@ -141,6 +141,15 @@ def test_landmarks_placed_by_hand_are_handed_on(run, tmp_path):
     ((_, landmarks),) = run.told
     assert set(landmarks) == {2}
     np.testing.assert_array_equal(landmarks[2]["commissure_180"], [4.0, 5.0, 6.0])
+    # One of them is not placed, and a line lies beside.
+    lists = json.loads((tmp_path / "hand.mrk.json").read_text())
+    lists["markups"][0]["controlPoints"][0] |= {"position": "", "positionStatus": "undefined"}
+    lists["markups"].insert(0, {"type": "Line", "controlPoints": [{"position": [1, 2, 3]}]})
+    (tmp_path / "hand.mrk.json").write_text(json.dumps(lists))
+    status, out, _ = run("check=true", "imaged.landmarks=[[2,hand.mrk.json]]")
+    assert status == 0
+    assert "landmarks of frame 2: tip_0 not placed" in out
+    assert set(run.told[-1][1][2]) == {"commissure_180"}
     strange = PointList(("apex",), np.zeros((1, 3)))
     write_markups(tmp_path / "hand.mrk.json", {"mine": strange})
     status, _, err = run("check=true", "imaged.landmarks=[[2,hand.mrk.json]]")
