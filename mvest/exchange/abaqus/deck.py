@@ -129,6 +129,19 @@ class Deck:
         if not self.period:
             raise InputError("holds no step with a duration")
 
+    @property
+    def section(self) -> IntArray:
+        """Number ``(m,)`` of the section of each element; -1 where there is none."""
+        result = np.full(len(self.cells), -1)
+        for k, (members, _, _) in enumerate(self.sections):
+            result[members] = k
+        return result
+
+    @property
+    def trusses(self) -> IntArray:
+        """Numbers of the trusses; all other elements are shells."""
+        return np.flatnonzero([len(cell) == 2 for cell in self.cells])
+
     def share(self, amplitude: str, times: FloatArray) -> FloatArray:
         """Share of a prescribed quantity at times ``(k,)`` s, constant before and after.
 

@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import InputError
 from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
-from mvest.exchange.abaqus.deck import Deck, lookup
+from mvest.exchange.abaqus.deck import Deck, lookup, some
 from mvest.exchange.child import in_child
 from mvest.exchange.surfaces import read_mesh
 from mvest.reading.text import one_line
@@ -164,22 +164,17 @@ def read_recording(
                 f"{TOLERANCE_MM} mm)"
             )
         frames.append(points[vertices])
-    times = found["times"]
-    t = times / times[-1]
-    phase = t**3 * (10 - 15 * t + 6 * t**2)  # as a closure is paced
-    chordae = {key: value for key, value in found["chordae"].items() if key != "family_names"}
+    names = tuple(found["family_names"])
     valve = Valve(
-        surface=LeafletSurface(nodes[vertices], region_names=tuple(leaflets), **found["surface"]),
+        surface=LeafletSurface(**found["surface"], region_names=tuple(leaflets)),
         annulus=found["annulus"],
         free_edge=found["free_edge"],
-        papillary_tips=found["tips"][0],
-        chordae=Chordae(
-            **chordae, family_names=tuple(found["chordae"]["family_names"]), toe_strain=toe_strain
-        ),
-        motion=Motion(phase, found["held_path"][:, : len(found["annulus"])], found["tips"]),
+        papillary_tips=found["motion"]["papillary_tips"][0],
+        chordae=Chordae(**found["chordae"], family_names=names, toe_strain=toe_strain),
+        motion=Motion(**found["motion"]),
     )
-    pressure, share = found["pressure"], found["pressure_share"]
-    return Recording(valve, np.array(frames), times, pressure, share)
+    rest = {name: found[name] for name in ("times", "pressure", "pressure_share")}
+    return Recording(valve, np.array(frames), **rest)
 
 
 def deck_sets(path: Path) -> list[str]:
@@ -201,57 +196,64 @@ def recorded(
     Returns
     -------
     dict
-        Parts of the valve and of its pressure; ``vertices`` are numbers of ``nodes``. The nodes
-        ``held``, first those of the annulus, take the path ``held_path`` ``(f, h, 3)``.
+        Parts of the valve, whose ``vertices`` are numbers of ``nodes``, and of its pressure. The
+        nodes ``held`` take the path ``held_path`` ``(f, h, 3)``.
     """
     deck = Deck(path)
-    times = np.linspace(0.0, deck.period, count)
+    nodes, times = np.array(deck.nodes), np.linspace(0.0, deck.period, count)
     groups = _shells(deck, leaflets)
     pressure, share = _pressure(deck, np.concatenate(groups), times)
-    nodes = np.array(deck.nodes)
     surface, vertices, rims = _leaflets(deck, groups, annulus, free_edge, turned=pressure < 0)
-    extent = float(np.ptp(nodes[vertices], axis=0).max())
+    at_rest = nodes[vertices]
+    extent = float(np.ptp(at_rest, axis=0).max())
     if not EXTENT_MM[0] <= extent <= EXTENT_MM[1]:
         raise InputError(
             f"the leaflets span {extent:g}, expected {EXTENT_MM[0]:g} to {EXTENT_MM[1]:g}: lengths "
             "must be mm"
         )
-    coordinates = surface_coordinates(nodes[vertices], surface["triangles"], *rims)
-    edges, section = _trusses(deck)
+    fibre = surface_coordinates(at_rest, surface["triangles"], *rims).circumferential
+    trusses = deck.trusses
+    edges, section = np.array([deck.cells[k] for k in trusses]), deck.section[trusses]
+    if not trusses.size or section.min() < 0:
+        raise InputError("no chordae: expected elements of type T3D2 or CONN3D2, each in a section")
     anchors = np.intersect1d(np.setdiff1d(edges, vertices), deck.held())
     if not anchors.size:
         raise InputError("no node of the chordae is held, so no papillary muscle is known")
     held = np.concatenate([vertices[rims[0]], anchors])
-    path_of_held = nodes[held] + deck.moved(held, times)
-    tips, tip_of_anchor = _group_anchors(path_of_held[:, len(rims[0]) :])
+    held_path = nodes[held] + deck.moved(held, times)
+    tips, tip = _group_anchors(held_path[:, len(rims[0]) :])
     anchor, insertion, length, stiffness_share = trace_cables(nodes, edges, anchors, vertices)
     # The family of a cable is the section of the first truss in the deck at its insertion.
     ends, first = np.unique(edges, return_index=True)
-    used, family_of_truss = np.unique(section, return_inverse=True)
-    family = family_of_truss[first // 2][np.searchsorted(ends, insertion)]
-    sections = [deck.sections[k] for k in used]
+    used, of_truss = np.unique(section, return_inverse=True)
+    family = of_truss[first // 2][np.searchsorted(ends, insertion)]
+    materials = [deck.sections[k][1:] for k in used]
     stiffness = [
-        truss_stiffness(name, size, deck.laws.get(name, {}), toe_strain)
-        for _, name, size in sections
+        truss_stiffness(name, area, deck.laws.get(name, {}), toe_strain) for name, area in materials
     ]
+    t = times / times[-1]
     return {
-        "surface": {**surface, "fibre": coordinates.circumferential},
         "nodes": nodes,
         "vertices": vertices,
+        "held": held,
+        "held_path": held_path,
+        "times": times,
+        "surface": {"vertices": at_rest, "fibre": fibre, **surface},
         "annulus": rims[0],
         "free_edge": rims[1],
-        "held": held,
-        "held_path": path_of_held,
-        "tips": tips,
         "chordae": {
-            "tip": tip_of_anchor[np.searchsorted(anchors, anchor)],
+            "tip": tip[np.searchsorted(anchors, anchor)],
             "insertion": nodes[insertion],
             "family": family,
-            "family_names": [name.lower() for _, name, _ in sections],
             "rest_length": length,
             "axial_stiffness": np.array(stiffness)[family] * stiffness_share,
         },
-        "times": times,
+        "family_names": [material.lower() for material, _ in materials],
+        "motion": {
+            "phase": t**3 * (10 - 15 * t + 6 * t**2),  # as a closure is paced
+            "annulus": held_path[:, : len(rims[0])],
+            "papillary_tips": tips,
+        },
         "pressure": abs(pressure),
         "pressure_share": share,
     }
@@ -260,10 +262,10 @@ def recorded(
 def _shells(deck: Deck, leaflets: Sequence[str]) -> list[IntArray]:
     """Numbers of the elements of each leaflet."""
     groups = [lookup(deck.sets["ELSET"], name, "element set") for name in leaflets]
-    for name, group in zip(leaflets, groups, strict=True):
-        if not len(group) or min(len(deck.cells[k]) for k in group) < 3:
-            raise InputError(f"element set {one_line(name, 60)!r}: expected shells, one or more")
-    if len(np.unique(np.concatenate(groups))) != sum(map(len, groups)):
+    together = np.concatenate(groups)
+    if not all(map(len, groups)) or np.isin(together, deck.trusses).any():
+        raise InputError(f"element sets {some(leaflets)}: expected shells, one or more in each")
+    if len(np.unique(together)) != len(together):
         raise InputError("leaflets share elements")
     return groups
 
@@ -329,14 +331,12 @@ def _leaflets(
             f"sets {one_line(annulus, 60)} and {one_line(free_edge, 60)}: expected the two "
             f"boundary loops of the leaflets, which have {len(loops)}"
         )
-    sizes = np.full(len(deck.cells), np.nan)
-    for members, _, size in deck.sections:
-        sizes[members] = size
-    if np.isnan(sizes[elements]).any():
+    sizes = np.array([*(size for _, _, size in deck.sections), np.nan])[deck.section[elements]]
+    if np.isnan(sizes).any():
         raise InputError("shells without a section that states a thickness")
     # Where leaflets meet, the thicker one counts; the last place is that of the corner -1.
     thickness = np.zeros(len(vertices) + 1)
-    np.maximum.at(thickness, corners.ravel(), np.repeat(sizes[elements], 4))
+    np.maximum.at(thickness, corners.ravel(), np.repeat(sizes, 4))
     surface = {"triangles": triangles, "region": region[element], "thickness": thickness[:-1]}
     return surface, vertices, rims
 
@@ -359,19 +359,6 @@ def _split(vertices: FloatArray, corners: IntArray, on_rim: IntArray) -> tuple[I
     two = np.where(by_02, quads[:, [0, 2, 3]], quads[:, [1, 2, 3]])
     triangles = np.vstack([one, two, corners[rest, :3]])
     return triangles, np.concatenate([whole, whole, rest])
-
-
-def _trusses(deck: Deck) -> tuple[IntArray, IntArray]:
-    """Ends ``(k, 2)`` of the trusses, and the number of the section ``(k,)`` of each."""
-    numbers = np.array([k for k, cell in enumerate(deck.cells) if len(cell) == 2], dtype=np.int64)
-    if not numbers.size:
-        raise InputError("no chordae: no elements of type T3D2, CONN3D2")
-    section = np.full(len(deck.cells), -1)
-    for k, (members, _, _) in enumerate(deck.sections):
-        section[members] = k
-    if section[numbers].min() < 0:
-        raise InputError("trusses without a section")
-    return np.array([deck.cells[k] for k in numbers]), section[numbers]
 
 
 def _group_anchors(path: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
-from mvest.exchange.febio.valve import FebSettings, valve_document
+from mvest.exchange.febio.valve import FebioOptions, differences, valve_document
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.problem.registration import REGISTRATION
 from mvest.reading.documents import read_mapping
@@ -24,65 +23,6 @@ CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
 """Points at which the valve is sampled for patches of chordae and the annulus."""
 MAX_RECORD = 1 << 28
 """Bytes of a run's record that are read."""
-
-
-@dataclass(frozen=True, slots=True)
-class FebioOptions:
-    """What is not in the case.
-
-    Attributes
-    ----------
-    case : str, optional
-        Folder of the case of a run; by default where the run says that it was.
-    E_f, ratio : tuple of float, optional
-        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; by default
-        what the run estimated, or the generic ones of an anterior and a posterior leaflet.
-    nu, reading : float, str
-        Poisson ratio and how it is read (A or C), where no run says so.
-    pressure_mmHg : float, optional
-        By default that of the closed frame.
-    mesh : str
-        ``structured`` (two leaflets: bricks) or ``tetwild`` (tetrahedra).
-    columns, rows : int
-        Bricks around the valve and along the leaflets.
-    edge_length : float
-        mm, of tetrahedra.
-    law, contact, contact_gap_mm, contact_reach_mm, penalty
-        As in `mvest.exchange.febio.valve.FebSettings`.
-    dynamic, density_factor, steps, quasi_newton, tolerance
-        As in `mvest.exchange.febio.valve.FebSettings`.
-    """
-
-    case: str | None = None
-    E_f: tuple[float, ...] | None = None
-    ratio: tuple[float, ...] | None = None
-    nu: float = 0.488
-    reading: str = "A"
-    pressure_mmHg: float | None = None
-    mesh: str = "structured"
-    columns: int = 24
-    rows: int = 4
-    edge_length: float = 2.5
-    law: str = "neo-hookean"
-    contact: str = "potential"
-    contact_gap_mm: float = 1.0
-    contact_reach_mm: float = 1.65
-    penalty: float = 1.0
-    dynamic: bool = True
-    density_factor: float = 1000.0
-    steps: int = 30
-    quasi_newton: int = 10
-    tolerance: float = 1e-3
-
-    def __post_init__(self) -> None:
-        if self.mesh not in ("structured", "tetwild"):
-            raise InputError(f"mesh {self.mesh!r}, expected structured or tetwild")
-        _ = self.febio
-
-    @property
-    def febio(self) -> FebSettings:
-        """What is chosen in FEBio."""
-        return FebSettings(**{own.name: getattr(self, own.name) for own in fields(FebSettings)})
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
@@ -109,9 +49,9 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
         source = place
     case = read_case(source)
     model = model_of_case(case, options, values, tissue)
-    document = valve_document(model, np.zeros(0), options.febio)
-    head = (f"{case.name}: closure under {model.settings.protocol.pressure_mmHg:g} mmHg.",)
-    return replace(document, remarks=head + document.remarks).write(target)
+    document = valve_document(model, np.zeros(0), options)
+    head = f"{case.name}: closure under {model.settings.protocol.pressure_mmHg:g} mmHg."
+    return document.write(target, [head, *differences(model, options)])
 
 
 def read_run(folder: Path) -> tuple[str, dict[str, float], dict[str, TissueSettings]]:

@@ -1,4 +1,4 @@
-"""FEBio's input file, section by section, in the order in which FEBio reads them.
+"""FEBio's input file, and the positions of nodes that FEBio logs beside it.
 
 Written by this project after the reader of FEBio 4.11 (``FEBioXML``): every tag and attribute is
 one that it asks for. Numbers are written so that they are read back the same.
@@ -6,146 +6,29 @@ one that it asks for. Numbers are written so that they are read back the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.exchange.febio.mesh import FebLaw, FebMesh
+from mvest.exchange.febio.mesh import FIBRED, NAMES, QUADRILATERAL, FebLaw
 from mvest.files import write_atomically
+from mvest.reading.text import read_text
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.mesh.solid_mesh import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh
 
 AXES = ("x", "y", "z")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prescribed:
-    """Nodes that go to where they are told.
-
-    Attributes
-    ----------
-    name : str
-    nodes : (k,)
-    displacement : (k, 3) mm
-        In full; zeros hold the nodes.
-    curve : (c, 2)
-        Times and shares of it.
-    axes : tuple of str
-        Coordinates that are prescribed.
-    """
-
-    name: str
-    nodes: IntArray
-    displacement: FloatArray
-    curve: FloatArray
-    axes: tuple[str, ...] = AXES
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pressure:
-    """Follower pressure on faces of the mesh; ``curve (c, 2)`` of times (s) and MPa."""
-
-    faces: IntArray
-    curve: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Averages:
-    """Further nodes that follow weighted averages of others, as constraints without forces.
-
-    Attributes
-    ----------
-    nodes : (k,)
-    of : Embedding
-        ``(k,)`` of the nodes of the mesh.
-    """
-
-    nodes: IntArray
-    of: Embedding
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Support:
-    """Elastic support of weighted averages of nodes at further nodes.
-
-    Attributes
-    ----------
-    targets : (k,)
-        Nodes that they are drawn to, from where the averages are at rest.
-    of : Embedding
-        ``(k,)``.
-    stiffness : (k,) N/mm
-    """
-
-    targets: IntArray
-    of: Embedding
-    stiffness: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Springs:
-    """Springs between pairs of nodes, each with its own force.
-
-    Attributes
-    ----------
-    pairs : (k, 2)
-    forces : sequence of (p, 2)
-        Elongation against the distance at rest (mm) and force (N), linear between the points and
-        beyond them.
-    """
-
-    pairs: IntArray
-    forces: Sequence[FloatArray]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PotentialContact:
-    """FEBio's ``contact potential`` between a surface and itself.
-
-    The force between two points at distance r is ``kc / r^p`` less a constant within ``R_in`` and
-    falls to zero as a parabola at ``R_out``.
-
-    Attributes
-    ----------
-    surfaces : mapping
-        Name -> faces ``(f, k)``; all of them together are the surface.
-    stiffness : float
-        kc.
-    exponent, inner, outer : float
-        p, and R_in and R_out in mm.
-    """
-
-    surfaces: Mapping[str, IntArray]
-    stiffness: float
-    exponent: float
-    inner: float
-    outer: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SlidingContact:
-    """FEBio's ``sliding-elastic`` between the first surface and each of the others.
-
-    Attributes
-    ----------
-    surfaces : mapping
-        Name -> faces ``(f, k)``.
-    penalty : float
-        Factor on the penalty that FEBio works out.
-    reach : float
-        mm within which a surface looks for the other.
-    offset : float
-        mm that the surfaces keep from each other.
-    """
-
-    surfaces: Mapping[str, IntArray]
-    penalty: float
-    reach: float
-    offset: float = 0.0
+SECTIONS = ("Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "Loads",
+            "Contact", "Constraints", "Discrete", "LoadData", "Output")  # fmt: skip
+"""In the order in which FEBio can resolve names."""
+MAX_LOG = 1 << 28
+"""Bytes of a log that are read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,91 +37,252 @@ class Control:
 
     Attributes
     ----------
-    end : float
-        s.
-    step, smallest, largest : float
-        s, the first time step and the bounds within which FEBio chooses the others.
+    end, step : float
+        s, and the first and largest time step.
+    tolerance : float
+        Of displacements, relative; that of the energy is its square.
     dynamic : bool
         With inertia (the generalised alpha rule at its most dissipative) or static.
     quasi_newton : int
         BFGS updates between two new tangents; 0 for Newton's method.
-    displacement, energy, residual : float
-        Tolerances; 0 asks nothing.
-    retries : int
-        How often a step may be shortened.
-    line_search : float
-        Its tolerance; 0 for none.
     """
 
     end: float
     step: float
-    smallest: float
-    largest: float
+    tolerance: float
     dynamic: bool = False
     quasi_newton: int = 0
-    displacement: float = 1e-6
-    energy: float = 1e-10
-    residual: float = 0.0
-    retries: int = 10
-    line_search: float = 0.9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class FebDocument:
-    """A body and what acts on it.
+    """A body, to which each method adds something that acts on it.
 
-    Attributes
+    Parameters
     ----------
-    mesh : FebMesh
-    laws : tuple of FebLaw
+    mesh : SolidMesh
+        In elements that FEBio has (`mvest.exchange.febio.mesh.febio_mesh`).
+    laws : sequence of FebLaw
         One per region.
     control : Control
-    pressure : Pressure or None
-    prescribed : tuple of Prescribed
     further : (k, 3) mm
         Nodes that belong to no element; they are numbered after those of the mesh.
-    averages, support, springs, contact : optional
     density : float
         t/mm^3.
-    alpha : float
-        1/s, damping by mass of a dynamic run.
-    remarks : tuple of str
-        Comments at the head of the file.
     """
 
-    mesh: FebMesh
-    laws: tuple[FebLaw, ...]
-    control: Control
-    pressure: Pressure | None = None
-    prescribed: tuple[Prescribed, ...] = ()
-    further: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    averages: Averages | None = None
-    support: Support | None = None
-    springs: Springs | None = None
-    contact: PotentialContact | SlidingContact | None = None
-    density: float = 1.04e-9
-    alpha: float = 0.0
-    remarks: tuple[str, ...] = ()
+    def __init__(
+        self,
+        mesh: SolidMesh,
+        laws: Sequence[FebLaw],
+        control: Control,
+        further: FloatArray = np.zeros((0, 3)),  # noqa: B008
+        density: float = 1.04e-9,
+    ) -> None:
+        self.nodes = np.vstack([mesh.nodes, further])
+        self._at = {name: Xml.Element(name) for name in SECTIONS}
+        self._at["Module"].set("type", "solid")
+        self._curves = self._springs = 0
+        self._face = mesh.reference.face
+        _fill(
+            self._at["Control"],
+            analysis="DYNAMIC" if control.dynamic else "STATIC",
+            time_steps=max(1, round(control.end / control.step)),
+            step_size=control.step,
+            plot_level="PLOT_MAJOR_ITRS",
+        )
+        stepper = {"max_retries": 10, "opt_iter": 15, "aggressiveness": 1, "cutback": 0.5,
+                   "dtmin": 1e-4 * control.step, "dtmax": control.step}  # fmt: skip
+        _fill(_add(self._at["Control"], "time_stepper", type="default"), **stepper)
+        solver = _add(self._at["Control"], "solver", type="solid")
+        _fill(solver, symmetric_stiffness=0, equation_scheme="staggered", optimize_bw=0, lstol=0.9)
+        _fill(solver, max_refs=25, diverge_reform=1, min_residual=1e-16, dtol=control.tolerance)
+        _fill(solver, etol=control.tolerance**2, rtol=0, rhoi=0)
+        _fill(_add(solver, "qn_method", type="BFGS"), max_ups=control.quasi_newton)
+        nodes = _add(self._at["Mesh"], "Nodes", name="all")
+        for k, x in enumerate(self.nodes, start=1):
+            _add(nodes, "node", x, id=k)
+        number = 0
+        name, rule, order = NAMES[mesh.element_type]
+        for k, (region, law) in enumerate(zip(mesh.region_names, laws, strict=True)):
+            material = _add(self._at["Material"], "material", id=k + 1, name=region)
+            material.set("type", str(law["type"]))
+            _fill(material, density=density, **{key: law[key] for key in law if key != "type"})
+            _add(self._at["MeshDomains"], "SolidDomain", name=region, mat=region, **rule)
+            elements = _add(self._at["Mesh"], "Elements", type=name, name=region)
+            own = np.flatnonzero(mesh.region == k)
+            for element in mesh.elements[own][:, order] + 1:
+                number += 1
+                _add(elements, "elem", element, id=number)
+            if law["type"] == FIBRED:
+                _add(material, "fiber", f"fibre_{region}", type="map")
+                self._data("Element", f"fibre_{region}", region, "vec3", mesh.fibre[own][:, order])
+            else:
+                self._axes(mesh, own, region)
+        log = {"data": "x;y;z", "name": "positions", "delim": ","}
+        self._log = Xml.Element("node_data", log)
+        self._log.text = f"1:{len(self.nodes)}"
+        plot = _add(self._at["Output"], "plotfile", type="febio")
+        for field in ("displacement", "stress", "Lagrange strain", "contact pressure"):
+            _add(plot, "var", type=field)
+        _add(self._at["Output"], "logfile").append(self._log)
 
-    def __post_init__(self) -> None:
-        regions = len(self.mesh.solid.region_names)
-        if len(self.laws) != regions:
-            raise InputError(f"{len(self.laws)} laws of {regions} regions")
+    def prescribe(
+        self,
+        name: str,
+        nodes: IntArray,
+        displacement: FloatArray,
+        curve: FloatArray,
+        axes: Sequence[str] = AXES,
+    ) -> None:
+        """Move nodes ``(k,)`` by ``displacement (k, 3)`` mm along some axes; zeros hold them.
 
-    @property
-    def n_nodes(self) -> int:
-        """Nodes of the file."""
-        return len(self.mesh.solid.nodes) + len(self.further)
+        ``curve (c, 2)`` are times and the shares of it.
+        """
+        _add(self._at["Mesh"], "NodeSet", nodes + 1, name=name)
+        for axis, values in zip(AXES, displacement.T, strict=True):
+            self._data("Node", f"{name}_{axis}", name, "scalar", values)
+        if not displacement.any():
+            fixed = _add(self._at["Boundary"], "bc", type="zero displacement", node_set=name)
+            _fill(fixed, **{f"{axis}_dof": int(axis in axes) for axis in AXES})
+            return
+        number = self._curve(curve)
+        for axis in axes:
+            moved = _add(self._at["Boundary"], "bc", type="prescribed displacement", node_set=name)
+            _add(moved, "dof", axis)
+            _add(moved, "value", f"{name}_{axis}", lc=number, type="map")
+            _add(moved, "relative", 0)
 
-    def write(self, path: Path) -> Path:
-        """Write the file, positions of whose nodes FEBio will log into `positions_file`.
+    def press(self, faces: IntArray, curve: FloatArray) -> None:
+        """Follower pressure on faces of the mesh; ``curve (c, 2)`` of times (s) and MPa."""
+        self._surface("pressed", faces)
+        load = _add(self._at["Loads"], "surface_load", type="pressure", surface="pressed")
+        _add(load, "pressure", 1.0, lc=self._curve(curve))
+        _fill(load, symmetric_stiffness=0, linear=0)
+
+    def damp(self, alpha: float) -> None:
+        """Damping by mass (1/s)."""
+        _fill(_add(self._at["Loads"], "body_load", type="mass damping"), C=alpha)
+
+    def average(self, nodes: IntArray, of: Embedding) -> None:
+        """Let nodes ``(k,)`` follow weighted averages ``(k,)`` of others, as linear constraints."""
+        for (node, terms), axis in itertools.product(zip(nodes, _sums(of), strict=True), AXES):
+            follow = _add(self._at["Boundary"], "bc", type="linear constraint")
+            _fill(follow, node=node + 1, dof=axis)
+            for member, weight in terms:
+                _fill(_add(follow, "child_dof"), node=member, dof=axis, value=weight)
+
+    def support(self, targets: IntArray, of: Embedding, stiffness: FloatArray) -> None:
+        """Draw weighted averages ``(k,)`` of nodes to nodes ``(k,)`` by ``stiffness (k,)`` N/mm."""
+        largest = stiffness.max()
+        constraint = _add(self._at["Constraints"], "constraint", type="linear constraint")
+        constraint.set("name", "support")
+        _fill(constraint, laugon=0, penalty=largest)
+        # The energy of a constraint is half its square times the penalty.
+        factors = np.sqrt(stiffness / largest)
+        rows = zip(targets, factors, _sums(of), strict=True)
+        for (target, factor, terms), axis in itertools.product(rows, AXES):
+            own = _add(constraint, "linear_constraint")
+            _add(own, "node", -factor, id=target + 1, bc=axis)
+            for member, weight in terms:
+                _add(own, "node", factor * weight, id=member, bc=axis)
+        # Nodes of no element have no freedom in FEBio: a spring without force gives them some.
+        material = self._spring("targets", np.stack([targets, np.roll(targets, 1)], axis=1))
+        material.attrib |= {"type": "linear spring", "name": "none"}
+        _fill(material, E=1e-12)
+
+    def pull(self, pairs: IntArray, forces: Sequence[FloatArray]) -> None:
+        """Springs between nodes ``(k, 2)``.
+
+        Each force ``(p, 2)`` is elongation against the distance at rest (mm) and force (N), linear
+        between the points and beyond them.
+        """
+        for k, (pair, force) in enumerate(zip(pairs, forces, strict=True)):
+            material = self._spring(f"spring_{k}", pair[None])
+            material.attrib |= {"type": "nonlinear spring", "name": f"chord_{k}"}
+            _add(material, "measure", "elongation")
+            function = _add(material, "force", type="point")
+            _fill(function, interpolate="linear", extend="extrapolate")
+            _points(function, force)
+
+    def touch(self, kind: str, surfaces: Mapping[str, IntArray], **parameters: float) -> None:
+        """Contact of the first surface with each other one, or of a single one with itself.
+
+        Parameters
+        ----------
+        kind : str
+            FEBio's name of it.
+        surfaces : mapping
+            Name -> faces ``(f, k)``.
+        **parameters : float
+            FEBio's.
+        """
+        for name, faces in surfaces.items():
+            self._surface(name, faces)
+        first, *others = surfaces
+        for other in others or [first]:
+            name = f"{first}_{other}"
+            pair = _add(self._at["Mesh"], "SurfacePair", name=name)
+            _fill(pair, primary=first, secondary=other)
+            _fill(_add(self._at["Contact"], "contact", type=kind, surface_pair=name), **parameters)
+
+    def write(self, path: Path, remarks: Sequence[str] = ()) -> Path:
+        """Write the file, with remarks at its head; FEBio logs positions into `positions_file`.
 
         Raises
         ------
-        OSError
+        InputError
             If it cannot be written.
         """
-        return write_atomically(path, _Writer(self, path).text())
+        self._log.set("file", positions_file(path).name)
+        root = Xml.Element("febio_spec", version="4.0")
+        # Two hyphens end a comment.
+        root.extend(Xml.Comment(f" {remark.replace('--', '- -')} ") for remark in remarks)
+        root.extend(section for section in self._at.values() if len(section) or section.attrib)
+        Xml.indent(root, " ")
+        text = Xml.tostring(root, encoding="unicode")
+        return write_atomically(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
+
+    def _curve(self, curve: FloatArray) -> int:
+        """Number of a load curve."""
+        self._curves += 1
+        at = _add(self._at["LoadData"], "load_controller", id=self._curves, type="loadcurve")
+        _fill(at, interpolate="LINEAR", extend="CONSTANT")
+        _points(at, curve)
+        return self._curves
+
+    def _data(self, of: str, name: str, on: str, kind: str, rows: FloatArray) -> None:
+        """Values for each node or element of a set."""
+        set_ = {"Node": "node_set", "Element": "elem_set"}[of]
+        data = _add(self._at["MeshData"], f"{of}Data", name=name, data_type=kind, **{set_: on})
+        for j, row in enumerate(rows, start=1):
+            _add(data, "node" if of == "Node" else "elem", row, lid=j)
+
+    def _axes(self, mesh: SolidMesh, own: IntArray, region: str) -> None:
+        """The direction of the fibre at the centre of each element."""
+        data = _add(self._at["MeshData"], "ElementData", elem_set=region, type="mat_axis")
+        shape = mesh.reference.shape(mesh.reference.centre)[0]
+        for j, along in enumerate(np.einsum("a,mai->mi", shape, mesh.fibre[own]), start=1):
+            a = along / np.linalg.norm(along)
+            # Any other direction: the laws are the same all around the fibre.
+            _fill(_add(data, "elem", lid=j), a=a, d=np.roll(a, 1) + np.array([0.1, 0.2, 0.3]))
+
+    def _surface(self, name: str, faces: IntArray) -> None:
+        surface = _add(self._at["Mesh"], "Surface", name=name)
+        order = QUADRILATERAL if self._face == "quad9" else slice(None)
+        for k, face in enumerate(faces[:, order] + 1, start=1):
+            _add(surface, self._face, face, id=k)
+
+    def _spring(self, name: str, pairs: IntArray) -> Xml.Element:
+        """A material of springs between nodes ``(k, 2)``, yet to be filled."""
+        connected = _add(self._at["Mesh"], "DiscreteSet", name=name)
+        for pair in pairs:
+            _add(connected, "delem", pair + 1)
+        section = self._at["Discrete"]
+        material = Xml.Element("discrete_material")
+        section.insert(self._springs, material)
+        self._springs += 1
+        _add(section, "discrete", dmat=self._springs, discrete_set=name)
+        return material
 
 
 def positions_file(path: Path) -> Path:
@@ -246,296 +290,55 @@ def positions_file(path: Path) -> Path:
     return path.with_name(f"{path.stem}_positions.csv")
 
 
-class _Writer:
-    """The tree of one document."""
+def read_positions(path: Path, n: int) -> tuple[FloatArray, FloatArray]:
+    """Times ``(s,)`` and positions ``(s, n, 3)`` mm that FEBio has logged of n nodes.
 
-    def __init__(self, document: FebDocument, path: Path) -> None:
-        self.document = document
-        self.positions = positions_file(path).name
-        self.root = Xml.Element("febio_spec", version="4.0")
-        self.curves: list[FloatArray] = []
+    A last step that was not written in full is left out.
 
-    def text(self) -> str:
-        document = self.document
-        for remark in document.remarks:
-            # Two hyphens end a comment.
-            self.root.append(Xml.Comment(f" {remark.replace('--', '- -')} "))
-        _add(self.root, "Module", type="solid")
-        self._control(document.control)
-        self._materials()
-        self._mesh()
-        domains = _add(self.root, "MeshDomains")
-        rule = {"elem_type": document.mesh.rule} if document.mesh.rule else {}
-        for name in document.mesh.solid.region_names:
-            _add(domains, "SolidDomain", name=name, mat=name, **rule)
-        self._mesh_data()
-        self._boundary()
-        self._loads()
-        self._contact()
-        self._support()
-        self._springs()
-        load_data = _add(self.root, "LoadData")
-        for k, curve in enumerate(self.curves, start=1):
-            controller = _add(load_data, "load_controller", id=str(k), type="loadcurve")
-            _add(controller, "interpolate", "LINEAR")
-            _add(controller, "extend", "CONSTANT")
-            _points(controller, curve)
-        output = _add(self.root, "Output")
-        plot = _add(output, "plotfile", type="febio")
-        for name in ("displacement", "stress", "Lagrange strain", "contact pressure"):
-            _add(plot, "var", type=name)
-        log = _add(output, "logfile")
-        _add(log, "node_data", f"1:{document.n_nodes}", data="x;y;z", name="positions",
-             file=self.positions, delim=",")  # fmt: skip
-        Xml.indent(self.root, " ")
-        return (
-            '<?xml version="1.0" encoding="UTF-8"?>\n'
-            + Xml.tostring(self.root, encoding="unicode")
-            + "\n"
-        )
-
-    def _curve(self, curve: FloatArray) -> str:
-        """Number of a load curve."""
-        self.curves.append(curve)
-        return str(len(self.curves))
-
-    def _control(self, control: Control) -> None:
-        at = _add(self.root, "Control")
-        _add(at, "analysis", "DYNAMIC" if control.dynamic else "STATIC")
-        _add(at, "time_steps", str(max(1, round(control.end / control.step))))
-        _add(at, "step_size", control.step)
-        _add(at, "plot_level", "PLOT_MAJOR_ITRS")
-        stepper = _add(at, "time_stepper", type="default")
-        _add(stepper, "max_retries", str(control.retries))
-        _add(stepper, "opt_iter", "15")
-        _add(stepper, "aggressiveness", "1")
-        _add(stepper, "cutback", 0.5)
-        _add(stepper, "dtmin", control.smallest)
-        _add(stepper, "dtmax", control.largest)
-        solver = _add(at, "solver", type="solid")
-        _add(solver, "symmetric_stiffness", "0")
-        _add(solver, "equation_scheme", "staggered")
-        _add(solver, "optimize_bw", "0")
-        _add(solver, "lstol", control.line_search)
-        _add(solver, "max_refs", "25")
-        _add(solver, "diverge_reform", "1")
-        _add(solver, "min_residual", 1e-16)
-        _add(solver, "dtol", control.displacement)
-        _add(solver, "etol", control.energy)
-        _add(solver, "rtol", control.residual)
-        _add(solver, "rhoi", "0")
-        method = _add(solver, "qn_method", type="BFGS")
-        _add(method, "max_ups", str(control.quasi_newton))
-
-    def _materials(self) -> None:
-        materials = _add(self.root, "Material")
-        names = self.document.mesh.solid.region_names
-        for k, (name, law) in enumerate(zip(names, self.document.laws, strict=True), start=1):
-            material = _add(materials, "material", id=str(k), name=name, type=law.name)
-            _add(material, "density", self.document.density)
-            for tag, value in law.parameters.items():
-                _add(material, tag, value)
-            if law.directed == "fiber":
-                _add(material, "fiber", f"fibre_{name}", type="map")
-
-    def _mesh(self) -> None:
-        document, mesh = self.document, self.document.mesh
-        at = _add(self.root, "Mesh")
-        nodes = _add(at, "Nodes", name="all")
-        for k, x in enumerate(np.vstack([mesh.solid.nodes, document.further]), start=1):
-            _add(nodes, "node", _row(x), id=str(k))
-        number = 0
-        for region, name in enumerate(mesh.solid.region_names):
-            elements = _add(at, "Elements", type=mesh.element, name=name)
-            for element in mesh.elements[mesh.solid.region == region]:
-                number += 1
-                _add(elements, "elem", _numbers(element), id=str(number))
-        for group in document.prescribed:
-            _add(at, "NodeSet", _numbers(group.nodes), name=group.name)
-        surfaces = {} if document.contact is None else dict(document.contact.surfaces)
-        if isinstance(document.contact, PotentialContact):
-            surfaces = {"contact": np.vstack(list(surfaces.values()))}
-        if document.pressure is not None:
-            surfaces["pressed"] = document.pressure.faces
-        for name, faces in surfaces.items():
-            self._surface(at, name, faces)
-        for pair, (primary, secondary) in self._pairs().items():
-            surface_pair = _add(at, "SurfacePair", name=pair)
-            _add(surface_pair, "primary", primary)
-            _add(surface_pair, "secondary", secondary)
-        if document.springs is not None:
-            for k, ends in enumerate(document.springs.pairs):
-                _add(_add(at, "DiscreteSet", name=f"spring_{k}"), "delem", _numbers(ends))
-        if document.support is not None:
-            # Nodes of no element have no freedom in FEBio: a spring without force gives them some.
-            pairs = np.stack([document.support.targets, np.roll(document.support.targets, 1)], 1)
-            chain = _add(at, "DiscreteSet", name="targets")
-            for ends in pairs:
-                _add(chain, "delem", _numbers(ends))
-
-    def _surface(self, at: Xml.Element, name: str, faces: IntArray) -> None:
-        kind, nodes = self.document.mesh.faces(faces)
-        surface = _add(at, "Surface", name=name)
-        for k, face in enumerate(nodes, start=1):
-            _add(surface, kind, _numbers(face), id=str(k))
-
-    def _pairs(self) -> dict[str, tuple[str, str]]:
-        """Pairs of surfaces in contact."""
-        contact = self.document.contact
-        if contact is None:
-            return {}
-        if isinstance(contact, PotentialContact):
-            return {"contact_pair": ("contact", "contact")}
-        first, *others = contact.surfaces
-        return {f"{first}_{other}": (first, other) for other in others}
-
-    def _mesh_data(self) -> None:
-        mesh = self.document.mesh
-        data = _add(self.root, "MeshData")
-        for group in self.document.prescribed:
-            for k, axis in enumerate(AXES):
-                name = f"{group.name}_{axis}"
-                values = _add(data, "NodeData", name=name, node_set=group.name, data_type="scalar")
-                for j, value in enumerate(group.displacement[:, k], start=1):
-                    _add(values, "node", value, lid=str(j))
-        reference = mesh.solid.reference
-        at_centre = np.einsum("a,mai->mi", reference.shape(reference.centre)[0], mesh.solid.fibre)
-        order = mesh.elements
-        for region, (name, law) in enumerate(
-            zip(mesh.solid.region_names, self.document.laws, strict=True)
-        ):
-            own = np.flatnonzero(mesh.solid.region == region)
-            if law.directed == "fiber":
-                values = _add(data, "ElementData", name=f"fibre_{name}", elem_set=name,
-                              data_type="vec3")  # fmt: skip
-                for j, e in enumerate(own, start=1):
-                    columns = [int(np.flatnonzero(mesh.solid.elements[e] == n)[0])
-                               for n in order[e]]  # fmt: skip
-                    _add(values, "elem", _row(mesh.solid.fibre[e, columns].ravel()), lid=str(j))
-                continue
-            values = _add(data, "ElementData", elem_set=name, type="mat_axis")
-            for j, e in enumerate(own, start=1):
-                axes = _add(values, "elem", lid=str(j))
-                along = at_centre[e] / np.linalg.norm(at_centre[e])
-                _add(axes, "a", _row(along))
-                # Any other direction: the laws are the same all around the fibre.
-                _add(axes, "d", _row(np.roll(along, 1) + np.array([0.1, 0.2, 0.3])))
-
-    def _boundary(self) -> None:
-        at = _add(self.root, "Boundary")
-        for group in self.document.prescribed:
-            if not group.displacement.any():
-                fixed = _add(at, "bc", type="zero displacement", node_set=group.name)
-                for axis in AXES:
-                    _add(fixed, f"{axis}_dof", "1" if axis in group.axes else "0")
-                continue
-            curve = self._curve(group.curve)
-            for axis in group.axes:
-                moved = _add(at, "bc", type="prescribed displacement", node_set=group.name)
-                _add(moved, "dof", axis)
-                _add(moved, "value", f"{group.name}_{axis}", lc=curve, type="map")
-                _add(moved, "relative", "0")
-        averages = self.document.averages
-        if averages is None:
-            return
-        for node, members, weights in zip(
-            averages.nodes, averages.of.nodes, averages.of.weights, strict=True
-        ):
-            for axis in AXES:
-                follow = _add(at, "bc", type="linear constraint")
-                _add(follow, "node", str(node + 1))
-                _add(follow, "dof", axis)
-                for member, weight in zip(members, weights, strict=True):
-                    if weight:
-                        child = _add(follow, "child_dof")
-                        _add(child, "node", str(member + 1))
-                        _add(child, "dof", axis)
-                        _add(child, "value", weight)
-
-    def _loads(self) -> None:
-        at = _add(self.root, "Loads")
-        pressure = self.document.pressure
-        if pressure is not None:
-            load = _add(at, "surface_load", type="pressure", surface="pressed")
-            _add(load, "pressure", 1.0, lc=self._curve(pressure.curve))
-            _add(load, "symmetric_stiffness", "0")
-            _add(load, "linear", "0")
-        if self.document.control.dynamic and self.document.alpha:
-            _add(_add(at, "body_load", type="mass damping"), "C", self.document.alpha)
-
-    def _contact(self) -> None:
-        at, contact = _add(self.root, "Contact"), self.document.contact
-        for pair in self._pairs():
-            if isinstance(contact, PotentialContact):
-                own = _add(at, "contact", type="contact potential", surface_pair=pair)
-                _add(own, "kc", contact.stiffness)
-                _add(own, "p", contact.exponent)
-                _add(own, "R_in", contact.inner)
-                _add(own, "R_out", contact.outer)
-            elif isinstance(contact, SlidingContact):
-                own = _add(at, "contact", type="sliding-elastic", surface_pair=pair)
-                _add(own, "laugon", "0")
-                _add(own, "penalty", contact.penalty)
-                _add(own, "auto_penalty", "1")
-                _add(own, "two_pass", "1")
-                _add(own, "search_radius", contact.reach)
-                _add(own, "offset", contact.offset)
-
-    def _support(self) -> None:
-        support = self.document.support
-        if support is None:
-            return
-        at = _add(self.root, "Constraints")
-        largest = float(support.stiffness.max())
-        constraint = _add(at, "constraint", type="linear constraint", name="support")
-        _add(constraint, "laugon", "0")
-        _add(constraint, "penalty", largest)
-        for target, members, weights, stiffness in zip(
-            support.targets, support.of.nodes, support.of.weights, support.stiffness, strict=True
-        ):
-            # The energy of a constraint is half its square times the penalty.
-            factor = float(np.sqrt(stiffness / largest))
-            for axis in AXES:
-                own = _add(constraint, "linear_constraint")
-                _add(own, "node", -factor, id=str(target + 1), bc=axis)
-                for member, weight in zip(members, weights, strict=True):
-                    if weight:
-                        _add(own, "node", factor * weight, id=str(member + 1), bc=axis)
-
-    def _springs(self) -> None:
-        at = _add(self.root, "Discrete")
-        forces = () if self.document.springs is None else self.document.springs.forces
-        for k, force in enumerate(forces):
-            material = _add(at, "discrete_material", type="nonlinear spring", name=f"chord_{k}")
-            _add(material, "measure", "elongation")
-            function = _add(material, "force", type="point")
-            _add(function, "interpolate", "linear")
-            _add(function, "extend", "extrapolate")
-            _points(function, force)
-        if self.document.support is not None:
-            material = _add(at, "discrete_material", type="linear spring", name="none")
-            _add(material, "E", 1e-12)
-        for k in range(len(forces)):
-            _add(at, "discrete", dmat=str(k + 1), discrete_set=f"spring_{k}")
-        if self.document.support is not None:
-            _add(at, "discrete", dmat=str(len(forces) + 1), discrete_set="targets")
+    Raises
+    ------
+    InputError
+        If the file is not such a log.
+    """
+    times: list[float] = []
+    frames: list[FloatArray] = []
+    parts = re.split(r"^\*Step.*$", read_text(path, MAX_LOG), flags=re.MULTILINE)
+    for part in parts[1:]:
+        found = re.search(r"^\*Time\s*=\s*(\S+)\s*$", part, re.MULTILINE)
+        rows = [line for line in part.splitlines() if line and not line.startswith("*")]
+        if found is None or len(rows) < n:
+            continue
+        try:
+            values = np.array([row.split(",") for row in rows], dtype=np.float64)
+            times.append(float(found.group(1)))
+        except ValueError as error:
+            raise InputError(f"{path}: rows that are no log of positions") from error
+        if values.shape != (n, 4) or not np.array_equal(values[:, 0], np.arange(1, n + 1)):
+            raise InputError(f"{path}: rows of shape {values.shape}, expected {n} nodes x,y,z")
+        frames.append(values[:, 1:])
+    return np.array(times), np.array(frames).reshape(len(frames), n, 3)
 
 
-def _add(at: Xml.Element, tag: str, value: float | str = "", **attributes: str) -> Xml.Element:
-    element = Xml.SubElement(at, tag, attributes)
-    element.text = value if isinstance(value, str) else repr(float(value))
+def _sums(of: Embedding) -> list[list[tuple[int, float]]]:
+    """Numbers of the nodes of each weighted sum, and their weights."""
+    rows = zip((of.nodes + 1).tolist(), of.weights.tolist(), strict=True)
+    return [[term for term in zip(*row, strict=True) if term[1]] for row in rows]
+
+
+def _add(at: Xml.Element, tag: str, value: Any = None, **attributes: Any) -> Xml.Element:
+    element = Xml.SubElement(at, tag, {key: str(own) for key, own in attributes.items()})
+    if value is not None:
+        numbers = "" if isinstance(value, str) else np.ravel(value).tolist()
+        element.text = value if isinstance(value, str) else ",".join(map(repr, numbers))
     return element
+
+
+def _fill(at: Xml.Element, **values: Any) -> None:
+    for tag, value in values.items():
+        _add(at, tag, value)
 
 
 def _points(at: Xml.Element, points: FloatArray) -> None:
     rows = _add(at, "points")
     for point in points:
-        _add(rows, "pt", _row(point))
-
-
-def _row(values: Iterable[float]) -> str:
-    return ",".join(repr(float(value)) for value in values)
-
-
-def _numbers(nodes: Iterable[int]) -> str:
-    return ",".join(str(int(node) + 1) for node in nodes)
+        _add(rows, "pt", point)

@@ -9,39 +9,51 @@ import numpy as np
 
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
-from mvest.exchange.febio.document import (
-    Averages,
-    Control,
-    FebDocument,
-    PotentialContact,
-    Prescribed,
-    Pressure,
-    SlidingContact,
-    Springs,
-    Support,
+from mvest.exchange.febio.document import Control, FebDocument
+from mvest.exchange.febio.mesh import (
+    FIBRED,
+    LAWS,
+    NAMES,
+    FebLaw,
+    febio_law,
+    febio_mesh,
+    opposite_faces,
 )
-from mvest.exchange.febio.mesh import FebLaw, FebMesh, febio_law, febio_mesh, opposite_faces
-from mvest.mechanics.forces.cables import Cables, Hinge, cable_force
+from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading, build_system
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 CONTACTS = ("potential", "sliding", "none")
-SAMPLES = 61
-"""Points of the curves of pressure and motion over the ramp."""
-TOE_POINTS = 41
-"""Points of the force of a chord over its toe."""
+SAMPLES, TOE_POINTS = 61, 41
+"""Points of pressure and motion over the ramp, and of a chord's force over its toe."""
 EXPONENT = 4.0
 """p of the contact potential, FEBio's own choice."""
 
 
 @dataclass(frozen=True, slots=True)
-class FebSettings:
-    """What is chosen in FEBio.
+class FebioOptions:
+    """What is not in the case, and what is chosen in FEBio.
 
     Attributes
     ----------
+    case : str, optional
+        Folder of the case of a run; by default where the run says that it was.
+    E_f, ratio : tuple of float, optional
+        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; by default
+        what the run estimated, or the generic ones of an anterior and a posterior leaflet.
+    nu, reading : float, str
+        Poisson ratio and how it is read (A or C), where no run says so.
+    pressure_mmHg : float, optional
+        By default that of the closed frame.
+    mesh : str
+        ``structured`` (two leaflets: bricks) or ``tetwild`` (tetrahedra).
+    columns, rows : int
+        Bricks around the valve and along the leaflets.
+    edge_length : float
+        mm, of tetrahedra.
     law : str
         Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
         keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
@@ -69,6 +81,16 @@ class FebSettings:
         Of displacements, relative; that of the energy is its square.
     """
 
+    case: str | None = None
+    E_f: tuple[float, ...] | None = None
+    ratio: tuple[float, ...] | None = None
+    nu: float = 0.488
+    reading: str = "A"
+    pressure_mmHg: float | None = None
+    mesh: str = "structured"
+    columns: int = 24
+    rows: int = 4
+    edge_length: float = 2.5
     law: str = "neo-hookean"
     contact: str = "potential"
     contact_gap_mm: float = 1.0
@@ -81,8 +103,10 @@ class FebSettings:
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        if self.contact not in CONTACTS:
-            raise InputError(f"contact {self.contact!r}, expected one of {', '.join(CONTACTS)}")
+        choices = {"mesh": ("structured", "tetwild"), "law": LAWS, "contact": CONTACTS}
+        for name, known in choices.items():
+            if (given := getattr(self, name)) not in known:
+                raise InputError(f"{name} {given!r}, expected one of {', '.join(known)}")
         if not 0 <= self.contact_gap_mm < self.contact_reach_mm:
             raise InputError(
                 f"contact_gap_mm = {self.contact_gap_mm}, contact_reach_mm = "
@@ -97,7 +121,7 @@ class FebSettings:
         require_numbers(self, "FEBio", "penalty", "tolerance", "density_factor")
 
 
-def valve_document(model: ClosureModel, m: FloatArray, settings: FebSettings) -> FebDocument:
+def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) -> FebDocument:
     """The closure of a valve with parameters ``m (p,)``, which are values in the file.
 
     Raises
@@ -108,7 +132,7 @@ def valve_document(model: ClosureModel, m: FloatArray, settings: FebSettings) ->
         If a modulus is inadmissible.
     """
     values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
-    mechanics = model.settings
+    mechanics, protocol = model.settings, model.settings.protocol
     if len(model.valve.motion.phase) != 2:
         raise InputError(
             f"the boundary has {len(model.valve.motion.phase)} key frames; expected two, between "
@@ -120,81 +144,48 @@ def valve_document(model: ClosureModel, m: FloatArray, settings: FebSettings) ->
         raise InputError("leaflets are tied together, as by a clip; expected a valve without")
     mesh = febio_mesh(model.mesh)
     unhindered = replace(mechanics, contact=replace(mechanics.contact, active=False))
-    system = build_system(model.valve, model.contact_valve, mesh.solid, unhindered, values)
-    boundary = _Boundary.of(model, system, mechanics)
-    assert system.cables is not None
-    first = len(mesh.solid.nodes)
-    tips, ends = boundary.tips[0], system.cables.patches(mesh.solid.nodes)
-    at = np.cumsum([first, len(tips), len(ends), len(boundary.hinge[0])])
+    system = build_system(model.valve, model.contact_valve, mesh, unhindered, values)
+    cables, hinge = system.cables, system.hinge
+    assert cables is not None
+    assert hinge is not None
+    loading = boundary_loading(system, model.valve, model.contact_valve, mechanics)
+    times = np.linspace(0.0, protocol.ramp, SAMPLES)
+    pressure = np.array([loading(t).pressure for t in times]) * system.factors.pressure
+    phase = np.stack([times, [protocol.phase(t) for t in times]], axis=1)
+    opened, closed = loading(0.0), loading(protocol.ramp)
+    ends = cables.patches(mesh.nodes)
+    further = [opened.tips, ends, opened.hinge]
+    at = np.cumsum([len(mesh.nodes), *map(len, further)])
     tip_nodes, end_nodes, hinge_nodes = (np.arange(a, b) for a, b in itertools.pairwise(at))
-    protocol, times = mechanics.protocol, boundary.times
-    end = protocol.end if settings.dynamic else protocol.ramp
-    step = protocol.ramp / settings.steps
-    return FebDocument(
+    document = FebDocument(
         mesh,
-        tuple(_law(mechanics, values, name, settings) for name in mesh.solid.region_names),
+        [_law(mechanics, values, name, options) for name in mesh.region_names],
         Control(
-            end,
-            step,
-            1e-4 * step,
-            step,
-            settings.dynamic,
-            settings.quasi_newton,
-            settings.tolerance,
-            settings.tolerance**2,
+            protocol.end if options.dynamic else protocol.ramp,
+            protocol.ramp / options.steps,
+            options.tolerance,
+            options.dynamic,
+            options.quasi_newton,
         ),
-        Pressure(mesh.solid.pressure_faces, np.stack([times, boundary.pressure], axis=1)),
-        (
-            Prescribed("tips", tip_nodes, boundary.tips[1] - tips, boundary.curve),
-            Prescribed("annulus", hinge_nodes, np.diff(boundary.hinge, axis=0)[0], boundary.curve),
-        ),
-        np.concatenate([tips, ends, boundary.hinge[0]]),
-        Averages(end_nodes, system.cables.patches),
-        Support(hinge_nodes, boundary.hinge_of.points, boundary.hinge_of.stiffness),
-        Springs(
-            np.stack([tip_nodes[system.cables.tip], end_nodes], axis=1),
-            _chord_forces(system, tips, ends),
-        ),
-        _contact(mesh, model, settings),
-        mechanics.density * settings.density_factor,
-        mechanics.damping.alpha,
-        tuple(f"{part}: here {ours}; in this file {theirs}." for part, ours, theirs in
-              differences(model, settings)),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Boundary:
-    """Times (s), pressure (MPa), and where tips and hinge are open and closed."""
-
-    times: FloatArray
-    pressure: FloatArray
-    curve: FloatArray
-    tips: FloatArray
-    hinge: FloatArray
-    hinge_of: Hinge
-
-    @classmethod
-    def of(cls, model: ClosureModel, system: System, mechanics: MechanicsSettings) -> _Boundary:
-        protocol = mechanics.protocol
-        assert system.hinge is not None
-        loading = boundary_loading(system, model.valve, model.contact_valve, mechanics)
-        times = np.linspace(0.0, protocol.ramp, SAMPLES)
-        pressure = np.array([loading(t).pressure for t in times]) * system.factors.pressure
-        phase = np.array([protocol.phase(t) for t in times])
-        ends = [loading(0.0), loading(protocol.ramp)]
-        return cls(
-            times,
-            pressure,
-            np.stack([times, phase], axis=1),
-            np.stack([load.tips for load in ends]),
-            np.stack([load.hinge for load in ends]),
-            system.hinge,
-        )
+        np.concatenate(further),
+        mechanics.density * options.density_factor,
+    )
+    document.prescribe("tips", tip_nodes, closed.tips - opened.tips, phase)
+    document.prescribe("annulus", hinge_nodes, closed.hinge - opened.hinge, phase)
+    document.average(end_nodes, cables.patches)
+    document.press(mesh.pressure_faces, np.stack([times, pressure], axis=1))
+    if options.dynamic and mechanics.damping.alpha:
+        document.damp(mechanics.damping.alpha)
+    if options.contact != "none" and mechanics.contact.active:
+        _add_contact(document, mesh, mechanics.contact.reference_pressure, options)
+    pairs = np.stack([tip_nodes[cables.tip], end_nodes], axis=1)
+    document.pull(pairs, _chord_forces(system, document.nodes[pairs]))
+    document.support(hinge_nodes, hinge.points, hinge.stiffness)
+    return document
 
 
 def _law(
-    mechanics: MechanicsSettings, values: dict[str, float], region: str, settings: FebSettings
+    mechanics: MechanicsSettings, values: dict[str, float], region: str, options: FebioOptions
 ) -> FebLaw:
     tissue = mechanics.tissue[region]
     own = {
@@ -205,52 +196,51 @@ def _law(
             f"{region}: its tissue is between two laws or prestretched; the file has no such law"
         )
     if tissue.law == "exponential":
-        return febio_law(tissue.coefficients(own), settings.law)
+        return febio_law(tissue.coefficients(own), options.law)
     moduli = tissue.moduli(own["E_f"], own.get("ratio"), own.get("G"))
-    return febio_law(moduli.material, settings.law)
+    return febio_law(moduli.material, options.law)
 
 
-def _chord_forces(system: System, tips: FloatArray, ends: FloatArray) -> list[FloatArray]:
-    """Elongation against the distance at rest (mm) and force (N) of each chord."""
+def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
+    """Elongation against the distance at rest (mm) and force (N) of chords, ends ``(c, 2, 3)``."""
     cables, factors = system.cables, system.factors
-    assert isinstance(cables, Cables)
-    n = len(cables.rest_length)
-    length = np.broadcast_to(factors.chord_rest_length, n) * cables.rest_length
-    stiffness = np.broadcast_to(factors.chord_stiffness, n) * cables.axial_stiffness
+    assert cables is not None
+    apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    length = np.broadcast_to(factors.chord_rest_length, apart.shape) * cables.rest_length
+    stiffness = np.broadcast_to(factors.chord_stiffness, apart.shape) * cables.axial_stiffness
     toe = cables.toe_strain
     strain = np.concatenate([[-1.0], np.linspace(0.0, toe, TOE_POINTS), [toe + 1.0]])
-    force = cable_force(strain, toe)[0]
-    apart = np.linalg.norm(ends - tips[cables.tip], axis=1)
-    return [
-        np.stack([own * (1 + strain) - start, ea * force], axis=1)
-        for own, start, ea in zip(length, apart, stiffness, strict=True)
-    ]
+    elongation = length[:, None] * (1 + strain) - apart[:, None]
+    force = stiffness[:, None] * cable_force(strain, toe)[0]
+    return list(np.stack([elongation, force], axis=2))
 
 
-def _contact(
-    mesh: FebMesh, model: ClosureModel, settings: FebSettings
-) -> PotentialContact | SlidingContact | None:
-    if settings.contact == "none" or not model.settings.contact.active:
-        return None
-    faces = opposite_faces(mesh.solid)
-    names = mesh.solid.region_names
-    region = _region_of_faces(mesh, faces)
-    surfaces = {f"{name}_atrial": faces[region == k] for k, name in enumerate(names)}
-    gap, reach = settings.contact_gap_mm, settings.contact_reach_mm
-    if settings.contact == "sliding":
-        return SlidingContact(surfaces, settings.penalty, reach, gap)
-    inner = 0.5 * (gap + reach)
-    pressure = model.settings.contact.reference_pressure
-    # Each pair of elements of one surface is counted twice.
-    stiffness = 0.5 * pressure / _pressure_of_sheets(gap, EXPONENT, inner, reach)
-    return PotentialContact(surfaces, stiffness, EXPONENT, inner, reach)
+def _add_contact(
+    document: FebDocument, mesh: SolidMesh, pressure: float, options: FebioOptions
+) -> None:
+    faces, gap, reach = opposite_faces(mesh), options.contact_gap_mm, options.contact_reach_mm
+    if options.contact == "potential":
+        inner = 0.5 * (gap + reach)
+        # Each pair of elements of one surface is counted twice.
+        kc = 0.5 * pressure / _pressure_of_sheets(gap, EXPONENT, inner, reach)
+        own = {"kc": kc, "p": EXPONENT, "R_in": inner, "R_out": reach}
+        document.touch("contact potential", {"atrial": faces}, **own)
+    elif len(mesh.region_names) > 1:
+        # A face is of the region of the first element that has all its nodes.
+        hosts = [np.isin(mesh.elements, face).sum(axis=1).argmax() for face in faces]
+        region = mesh.region[hosts]
+        surfaces = {f"{n}_atrial": faces[region == k] for k, n in enumerate(mesh.region_names)}
+        own = {"laugon": 0, "penalty": options.penalty, "auto_penalty": 1, "two_pass": 1,
+               "search_radius": reach, "offset": gap}  # fmt: skip
+        document.touch("sliding-elastic", surfaces, **own)
 
 
 def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> float:
     r"""Pressure (MPa) between two flat sheets that are ``gap`` mm apart, for kc = 1.
 
     With the force f(r) between two points, :math:`2 \pi d \int_d^\infty f(r) dr`: the derivative of
-    the energy :math:`2 \pi \int_d^\infty \varphi(r) r dr` by d.
+    the energy :math:`2 \pi \int_d^\infty \varphi(r) r dr` by d. FEBio's force is :math:`r^{-p}`
+    less a constant within ``inner``, and falls to zero as a parabola at ``outer``.
     """
     c1 = 0.5 * p / ((outer - inner) * inner ** (p + 1))
     c2 = inner**-p - c1 * (inner - outer) ** 2
@@ -261,103 +251,34 @@ def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> flo
     return 2 * np.pi * gap * (power + parabola)
 
 
-def _region_of_faces(mesh: FebMesh, faces: IntArray) -> IntArray:
-    """Region ``(f,)`` of the element that each face ``(f, k)`` is part of."""
-    at: dict[int, set[int]] = {}
-    for e, nodes in enumerate(mesh.solid.elements):
-        for node in nodes:
-            at.setdefault(int(node), set()).add(e)
-    hosts = [min(set.intersection(*(at[int(node)] for node in face))) for face in faces]
-    return np.asarray(mesh.solid.region[hosts])
-
-
-def differences(model: ClosureModel, settings: FebSettings) -> list[tuple[str, str, str]]:
-    """What is not the same in FEBio: what it is about, as it is here, and as it is there."""
+def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
+    """What is not the same in FEBio, a line each."""
     mesh, mechanics = model.mesh, model.settings
-    kinds = {mechanics.tissue[name].law for name in mesh.region_names}
-    rows = [("element", *ELEMENTS[mesh.element_type])]
-    for kind in sorted(kinds):
-        rows.append(("law", *(LAW_WORDS[settings.law] if kind != "exponential" else EXPONENTIAL)))
-    rows.append(
-        (
-            "direction of the fibre",
-            "at every node of an element, interpolated",
-            "the same" if kinds == {"exponential"} else
-            "one in each element, that at its centre",
-        )
-    )  # fmt: skip
-    contact = mechanics.contact
-    ours = (
-        f"a potential between {len(model.contact_valve.surface.vertices)} points of the "
-        f"midsurface, {contact.reference_distance:g} thicknesses apart under "
-        f"{1e3 * contact.reference_pressure:g} kPa and beginning at "
-        f"{contact.activation_distance:g}; no step takes leaflets through each other"
-        if contact.active
-        else "none"
-    )
+    contact, damping = mechanics.contact, mechanics.damping
+    law = f"linear in the Biot strain; in this file {LAWS[options.law]} with the same moduli"
+    if {mechanics.tissue[name].law for name in mesh.region_names} == {"exponential"}:
+        law = f"exponential; in this file {FIBRED}, fibres by their isochoric stretch"
+    gap, reach = options.contact_gap_mm, options.contact_reach_mm
     theirs = {
-        "potential": "contact potential between the integration points of the atrial faces, "
-        f"{settings.contact_gap_mm:g} mm apart under the same pressure and beginning at "
-        f"{settings.contact_reach_mm:g} mm; none between elements that share a node, nor anything "
-        "that keeps leaflets from passing through",
-        "sliding": "sliding-elastic by penalty between the atrial faces of different leaflets, "
-        f"{settings.contact_gap_mm:g} mm apart; none of a leaflet with itself",
+        "potential": f"a contact potential, atrial faces {gap:g} mm apart under this pressure and "
+        f"contact from {reach:g} mm on; nothing keeps leaflets from passing through each other",
+        "sliding": f"sliding-elastic between the atrial faces of different leaflets, {gap:g} mm "
+        "apart; none of a leaflet with itself",
         "none": "none",
-    }[settings.contact if contact.active else "none"]
-    rows.append(("contact", ours, theirs))
-    damping = mechanics.damping
-    rows.append(
-        (
-            "time",
-            f"implicit Euler with damping {damping.alpha:g} 1/s of mass and {damping.beta:g} s of "
-            "the Biot strain's stiffness"
-            + (", then an equilibrium" if mechanics.protocol.equilibrium else ""),
-            f"the generalised alpha rule (rho 0), density times {settings.density_factor:g}, "
-            f"damping {damping.alpha:g} 1/s of mass alone"
-            if settings.dynamic
-            else "a static equilibrium at each time",
-        )
-    )  # fmt: skip
-    rows.append(
-        (
-            "chordae",
-            "cables with a toe of the fourth power",
-            f"springs whose force is linear between {TOE_POINTS} points of that toe",
-        )
-    )
-    rows.append(
-        (
-            "annulus, chord patches",
-            "weighted averages of nodes on elastic supports, and at the ends of cables",
-            "the same, as a penalty on linear constraints and as linear constraints",
-        )
-    )
-    return rows
-
-
-ELEMENTS = {
-    "tet4": ("tet4, one point of integration", "the same"),
-    "tet10": ("tet10, four points of integration", "the same"),
-    "hex27": ("hex27, 3 x 3 x 2 points of integration", "hex27, 3 x 3 x 3 points"),
-    "hex18": (
-        "hex18, linear through the thickness with enhanced thickness strain, 3 x 3 x 2 points",
-        "hex27, quadratic through the thickness, 3 x 3 x 3 points",
-    ),
-    "hex18_thin": (
-        "hex18_thin, as hex18 with assumed strains",
-        "hex27, quadratic through the thickness, 3 x 3 x 3 points, locking where it is thin",
-    ),
-    "wedge12": ("wedge12, enhanced thickness strain", "penta15, without the sides' middles"),
-    "wedge18": ("wedge18", "penta15, without the sides' middles"),
-}
-LAW_WORDS = {
-    "orthotropic": (
-        "linear in the Biot strain",
-        "orthotropic elastic, the same stiffness of the Green-Lagrange strain",
-    ),
-    "neo-hookean": ("linear in the Biot strain", "neo-Hookean transiso with the same moduli"),
-}
-EXPONENTIAL = (
-    "exponential, fibres by their full stretch",
-    "the same exponential, uncoupled: fibres by their isochoric stretch",
-)
+    }[options.contact if contact.active else "none"]
+    time = "a static equilibrium at each time"
+    if options.dynamic:
+        time = f"the generalised alpha rule with {options.density_factor:g} times the density"
+    return [
+        f"element: here {mesh.element_type}; in this file "
+        f"{NAMES[febio_mesh(mesh).element_type][0]} without enhanced or assumed strains.",
+        f"law: here {law}.",
+        "direction of the fibre: here at every node; in this file at the centre of each element, "
+        "or at its nodes for the exponential law.",
+        f"contact: here a potential, midsurfaces {contact.reference_distance:g} thicknesses apart "
+        f"under {1e3 * contact.reference_pressure:g} kPa; in this file {theirs}.",
+        f"time: here implicit Euler with damping {damping.alpha:g} 1/s of mass and "
+        f"{damping.beta:g} s of stiffness; in this file {time} and damping by mass alone.",
+        "chordae: here cables with a toe of the fourth power; in this file springs whose force is "
+        f"linear between {TOE_POINTS} points of that toe.",
+    ]

@@ -223,7 +223,7 @@ def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, u
         ({"contact": "glue"}, "potential, sliding, none"),
         ({"contact_gap_mm": 2.0}, "gap < reach"),
         ({"law": "mooney"}, "orthotropic, neo-hookean"),
-        ({"mesh": "voxels"}, "structured or tetwild"),
+        ({"mesh": "voxels"}, "structured, tetwild"),
         ({"steps": 0}, ">= 1"),
     ],
 )

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import ConfigurationError
-from mvest.exchange.febio.document import FebDocument, positions_file
-from mvest.exchange.febio.positions import MAX_LOG, read_positions
+from mvest.exchange.febio.document import FebDocument, positions_file, read_positions
+from mvest.exchange.febio.mesh import febio_mesh
 from mvest.processes import run
-from mvest.reading.text import read_text
 from mvest.typing import FloatArray
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 VARIABLE = "MVEST_FEBIO"
 
@@ -73,12 +73,33 @@ def febio_program() -> Path:
     return Path(found)
 
 
-def run_febio(document: FebDocument, path: Path, *, time_limit_s: float = 3600.0) -> FebRun:
+def restored(mesh: SolidMesh, x: FloatArray) -> FloatArray:
+    """Positions ``(..., n, 3)`` mm of the nodes of a mesh, from those of FEBio's of it.
+
+    Those that FEBio's wedge lacks, in the middle of the sides of wedge18, follow from its
+    interpolation.
+    """
+    own, x = febio_mesh(mesh), np.array(x)
+    if own.element_type == "wedge18":
+        e = own.elements
+        for i, side in enumerate((9, 10, 11)):
+            j = (i + 1) % 3
+            corners = x[..., e[:, [i, j, 12 + i, 12 + j]], :].sum(axis=-2)
+            middles = x[..., e[:, [3 + i, 15 + i, 6 + i, 6 + j]], :].sum(axis=-2)
+            x[..., e[:, side], :] = 0.5 * middles - 0.25 * corners
+    return x[..., : len(mesh.nodes), :]
+
+
+def run_febio(
+    document: FebDocument, mesh: SolidMesh, path: Path, *, time_limit_s: float = 3600.0
+) -> FebRun:
     """Write a document and run FEBio on it, with one thread.
 
     Parameters
     ----------
     document : FebDocument
+    mesh : SolidMesh
+        That it was made from.
     path : Path
         Of the input file; FEBio writes beside it.
     time_limit_s : float
@@ -113,22 +134,21 @@ def run_febio(document: FebDocument, path: Path, *, time_limit_s: float = 3600.0
     seconds = after.children_user + after.children_system
     seconds -= before.children_user + before.children_system
     log = path.with_suffix(".log")
-    said = read_text(log, MAX_LOG) if log.is_file() else ""
+    said = log.read_text(errors="replace") if log.is_file() else ""
     converged = code == 0 and "N O R M A L" in said
     if not (converged or reason):
         complaints = re.findall(r"^ *\*[^*\n]*[a-z][^*\n]*\* *$", said, re.MULTILINE)
         reason = complaints[-1].strip(" *") if complaints else f"exit status {code}"
-    rest = np.vstack([document.mesh.solid.nodes, document.further])
-    logged = positions_file(path)
+    rest, logged = document.nodes, positions_file(path)
     times, frames = np.zeros(0), np.zeros((0, *rest.shape))
     if logged.is_file():
         times, frames = read_positions(logged, len(rest))
-    frames = np.concatenate([rest[None], frames])[:, : len(document.mesh.solid.nodes)]
+    frames = np.concatenate([rest[None], frames])
     return FebRun(
         converged,
         reason,
         np.concatenate([[0.0], times]),
-        document.mesh.restored(frames),
+        restored(mesh, frames),
         len(times),
         _iterations(said),
         seconds,

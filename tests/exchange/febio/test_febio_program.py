@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import ConfigurationError, InputError
-from mvest.exchange.febio.document import Control, FebDocument, Prescribed, Pressure
+from mvest.exchange.febio.document import Control, FebDocument, read_positions
 from mvest.exchange.febio.mesh import febio_law, febio_mesh
-from mvest.exchange.febio.positions import read_positions
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
@@ -54,16 +53,14 @@ def ours(mesh, fibre, rim, law):
 
 
 def theirs(mesh, fibre, rim, kind, folder):
-    directed = febio_mesh(replace(mesh, fibre=fibre))
-    nodes = np.flatnonzero(np.isin(directed.solid.nodes[:, 0], (0.0, 8.0)))
-    document = FebDocument(
-        directed,
-        (febio_law(MATERIAL, kind),),
-        Control(1.0, 0.2, 1e-4, 0.2, displacement=1e-9, energy=1e-20),
-        Pressure(directed.solid.pressure_faces, np.array([[0.0, 0.0], [1.0, PRESSURE]])),
-        (Prescribed("rim", nodes, np.zeros((len(nodes), 3)), np.array([[0.0, 0.0], [1.0, 1.0]])),),
-    )
-    return run_febio(document, folder / "sheet.feb")
+    directed = replace(mesh, fibre=fibre)
+    own = febio_mesh(directed)
+    nodes = np.flatnonzero(np.isin(own.nodes[:, 0], (0.0, 8.0)))
+    curve = np.array([[0.0, 0.0], [1.0, 1.0]])
+    document = FebDocument(own, [febio_law(MATERIAL, kind)], Control(1.0, 0.2, 1e-9))
+    document.prescribe("rim", nodes, np.zeros((len(nodes), 3)), curve)
+    document.press(own.pressure_faces, curve * [1.0, PRESSURE])
+    return run_febio(document, directed, folder / "sheet.feb")
 
 
 # FEBio writes twelve digits, and knows the points of integration of tet10 to eight.
