@@ -7,6 +7,7 @@ estimated on it. Neither is part of this project; the messages say where they ar
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Mapping
@@ -34,6 +35,13 @@ from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
+from mvest.cases.chord_layout import (
+    CLOSED_DEPTH,
+    LeafletBand,
+    assumed_closure,
+    lay_out_chordae,
+)
+from mvest.cases.frames import MM_PER
 from mvest.cases.plausibility import free_orifice
 from mvest.cases.writer import write_case
 from mvest.closure.model import ClosureModel
@@ -42,30 +50,28 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import Remembered, SharedStart
+from mvest.exchange.abaqus.mesh import SetNames
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
-from mvest.exchange.importing.reference_heart import (
-    CITATION,
-    ReferenceHeartOptions,
-    heart_files,
-    heart_parts,
-    import_reference_heart,
-)
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
+from mvest.exchange.regions import part_of
+from mvest.exchange.surfaces import read_surface
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
 from mvest.problem.problem import Problem
 from mvest.problem.record import EstimateRecord, record_of
-from mvest.quantities import Share
+from mvest.quantities import Length, Share, Thickness
 from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
-from mvest.valve.anatomy.valve import Valve
+from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.measurements import leaflet_length
+from mvest.valve.mesh.remesh import Remeshed, remesh
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 from mvest.valve.mesh.structured import layered_wedges
 
@@ -78,6 +84,55 @@ DONOR_CITATION = (
     "Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w; data: "
     "https://github.com/SoftTissueBiomechanicsLab/Texas_TriValve_1.1, licence CC BY 4.0"
 )
+
+HEART_VARIABLE = "MVEST_HRA"
+"""Environment variable that names the file of the heart, or a folder with its parts."""
+HEART_PARTS = (
+    "mitral_valve.ply",
+    "papillary_muscle_anterolateral.ply",
+    "papillary_muscle_posteromedial.ply",
+)
+"""In mm: the valve and its muscles."""
+HEART_OBJECTS = (
+    "VH_M_mitral_valve",
+    "VH_M_papillary_muscle_of_heart_anterolateral",
+    "VH_M_papillary_muscle_of_heart_posteromedial",
+)
+"""What the parts are called in the heart's own file, whose lengths are metres."""
+HEART_CITATION = (
+    "Browne K., Schlehlein H., Herr B. W., Quardokus E., Bueckle A., Börner K. 2022, 3D Reference "
+    "Organ for Heart, Male v1.2, doi 10.48539/HBM373.VSTV.568, licence CC BY 4.0; midsurface, "
+    "thickness, tips and chordae derived from it by mvest"
+)
+SHAPE_ALONE = (
+    "One still shape, modelled by illustrators from sections of a male donor (Visible Human): its "
+    "shape is all that is real. Motion, pressure, chordae and moduli are assumed, and nothing "
+    "about the moduli of this donor follows."
+)
+
+
+def heart_files(place: Path | str | None = None) -> tuple[Path, ...]:
+    """The heart's own file (GLB), or those of its parts in a folder; or where ``MVEST_HRA`` says.
+
+    Raises
+    ------
+    InputError
+        They are not there; the message says where to get them.
+    """
+    place = place or os.environ.get(HEART_VARIABLE)
+    if place is not None and Path(place).suffix.lower() == ".glb" and Path(place).is_file():
+        return (Path(place),)
+    files = tuple(Path(place or ".") / name for name in HEART_PARTS)
+    missing = [file.name for file in files if not file.is_file()]
+    if place is None or missing:
+        where = "no folder is named" if place is None else f"{place}: no {', '.join(missing)}"
+        raise InputError(
+            f"{where}. The reference heart is not part of this package: take "
+            "v1.2/models/VH_M_Heart.glb from https://github.com/hubmapconsortium/ccf-releases and "
+            f"name it here or in {HEART_VARIABLE}, or a folder with its parts in mm, "
+            f"{', '.join(HEART_PARTS)}"
+        )
+    return files
 
 
 def recording_folder(recording: str | None, case: str) -> Path:
@@ -132,12 +187,23 @@ class DonorSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HeartOptions:
+    """How the heart becomes a case; thickness is kept within bounds, as parts are no leaflet."""
+
+    smoothing_mm: Length = 4.0  # round the valve: a spike is sharper than leaflets are thick
+    min_thickness_mm: Thickness = 0.3
+    max_thickness_mm: Thickness = 3.0
+    # Of the free edges below the annulus, closed over open, for which chordae are long enough.
+    closed_depth: Share = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeartSettings:
     """The shape of a reference heart."""
 
     # The heart (GLB) or a folder with its parts; null: what the variable MVEST_HRA names.
     source: Annotated[str | None, Reads(_parts)] = None
-    options: ReferenceHeartOptions = field(default_factory=ReferenceHeartOptions)
+    options: HeartOptions = field(default_factory=HeartOptions)
     # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).
     closures: dict[str, dict[str, Share]] = field(default_factory=dict)
     gate: tuple[str, ...] = ()  # variations of the gate
@@ -169,16 +235,16 @@ class Recorded:
     """A recorded valve, ready to be closed; ``coarse`` is its midsurface as meshed and observed."""
 
     recording: Recording
-    coarse: Valve
-    contact: Valve
+    coarse: Remeshed
+    contact: Remeshed
     mesh: SolidMesh
     settings: MechanicsSettings
     seen: FloatArray
 
     def model(self, parameters: tuple[str, ...], **settings: Any) -> ClosureModel:
         """A model of the open valve."""
-        valves = self.coarse, self.contact
-        return ClosureModel(*valves, self.mesh, self.settings, parameters, **settings)
+        coarse, contact = map(self.recording.valve, (self.coarse, self.contact))
+        return ClosureModel(coarse, contact, self.mesh, self.settings, parameters, **settings)
 
     def distances(self, closed: FloatArray) -> dict[str, float]:
         """Distances (mm) of closed positions ``(n, 3)`` from where they were recorded.
@@ -186,7 +252,7 @@ class Recorded:
         The surface's is the mean of the whole surface from the recorded one, both ways.
         """
         d, surface = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface
-        recorded = self.recording.frames[-1], self.recording.valve.surface.triangles
+        recorded = self.recording.frames[-1], self.recording.surface.triangles
         return {
             "mean": float(d.mean()),
             "median": float(np.median(d)),
@@ -207,8 +273,8 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     MvestError
         If the data are absent or a setting is inadmissible.
     """
-    names = donor.leaflets, donor.annulus, donor.free_edge
-    recording = read_recording(recording_folder(donor.recording, donor.case), *names)
+    names = SetNames(donor.leaflets, donor.annulus, donor.free_edge)
+    recording = read_recording(recording_folder(donor.recording, donor.case), names)
     settings = mechanics_of(config)
     protocol = settings.protocol
     if protocol.pressure_mmHg != 0 or protocol.curve:
@@ -218,19 +284,21 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
         )
     # The pressure may rise otherwise than the motion.
     shares, times = recording.pressure_share, recording.times / recording.times[-1] * protocol.ramp
-    together = np.allclose(shares, recording.valve.motion.phase, rtol=0, atol=1e-12)
+    together = np.allclose(shares, recording.phase, rtol=0, atol=1e-12)
     curve = () if together else tuple(zip(times.tolist(), shares.tolist(), strict=True))
     loaded = replace(protocol, pressure_mmHg=mpa_to_mmhg(recording.pressure), curve=curve)
-    unknown = [f"E_f.{name}" for name in recording.valve.surface.region_names]
+    unknown = [f"E_f.{name}" for name in recording.surface.region_names]
     if sorted(unknown) != sorted(config["parameters"]):
         raise ConfigurationError(
             f"parameters = {config['parameters']}, expected one modulus for each leaflet: {unknown}"
         )
-    places, coarse = recording.remeshed(donor.vertices)
-    _, contact = recording.remeshed(donor.contact_vertices)
+    coarse, contact = (
+        remesh(recording.surface, recording.annulus, recording.free_edge, count)
+        for count in (donor.vertices, donor.contact_vertices)
+    )
     layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
-    mesh = layered_wedges(coarse.surface, onto=recording.valve.surface, **layers).solid
-    seen = recording.positions(places.triangle, places.weights, -1)
+    mesh = layered_wedges(coarse.surface, onto=recording.surface, **layers).solid
+    seen = recording.positions(coarse.triangle, coarse.weights, -1)
     return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
 
 
@@ -281,7 +349,7 @@ def _donor(job: Job[Settings]) -> Result:
             rows.append(row)
             records.append(record)
     rest = valve.coarse.surface.vertices
-    tips = valve.recording.valve.motion.papillary_tips
+    tips = valve.recording.papillary_tips
     failed = [one for one in records if not one.converged]
     ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
     return Result(
@@ -332,7 +400,7 @@ def moduli_table(records: list[EstimateRecord]) -> Table:
 
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
     """As those of a case (`mvest.problem.fields`)."""
-    surface, tips = valve.coarse.surface, valve.recording.valve.motion.papillary_tips
+    surface, tips = valve.coarse.surface, valve.recording.papillary_tips
     away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
     return {
         "triangles": surface.triangles,
@@ -349,11 +417,47 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
     }
 
 
+def import_heart(source: str | None, options: HeartOptions) -> tuple[ValveCase, float]:
+    """The reference heart as a case of its open frame, and the volume (mm³) of its tissue.
+
+    Raises
+    ------
+    InputError, GeometryError
+        A part is missing or is none of a thick valve with two muscles.
+    """
+    files = heart_files(source)
+    whole, unit = read_surface(files[0]), "mm" if len(files) > 1 else "m"
+    valve, *muscles = HEART_OBJECTS if unit == "m" else map(str, files)
+    whole = part_of(whole, valve) if unit == "m" else whole
+    known = LeafletsOptions(
+        leaflets=valve if unit == "m" else None,
+        units=unit,
+        muscles=tuple(muscles),
+        smoothing_mm=options.smoothing_mm,
+        thickness_range_mm=(options.min_thickness_mm, options.max_thickness_mm),
+    )
+    case = import_leaflets(files[0], known)
+    surface, tips = case.surface, case.frames[0].papillary_tips
+    loops = case.annulus, case.free_edge
+    band = LeafletBand.of(surface.vertices, surface.triangles, surface.region, *loops, anterior=0)
+    closed = assumed_closure(band, surface.vertices[loops[0]], tips, options.closed_depth)
+    said = f"at {CLOSED_DEPTH:g} of their depth", f"at {options.closed_depth:g} of their depth"
+    case = replace(
+        case,
+        name="mitral valve of a reference heart",
+        description=SHAPE_ALONE,
+        source=HEART_CITATION,
+        licence="CC BY 4.0",
+        chordae=lay_out_chordae(band, tips, closed, tips, ChordLayout()),
+        derived=tuple(line.replace(*said) for line in case.derived),
+    )
+    return case, MM_PER[unit] ** 3 * abs(enclosed_volume(whole.vertices, whole.triangles))
+
+
 def _heart(job: Job[Settings]) -> Result:
     heart, values = job.settings.heart, job.values
     asked = gate_cases(heart.gate)
-    source = None if heart.source is None else Path(heart.source)
-    case = import_reference_heart(source, heart.options)
+    case, volume = import_heart(heart.source, heart.options)
     own = _on_case(values, case, job.folder / "case")
     usual = {
         "annulus_contraction": own["valve"]["annulus_contraction"],
@@ -366,7 +470,7 @@ def _heart(job: Job[Settings]) -> Result:
         assumed = usual | changes
         options = replace(heart.options, closed_depth=assumed["closed_depth"])
         place = job.folder / f"case_{number}"
-        there = _on_case(values, import_reference_heart(source, options), place)
+        there = _on_case(values, import_heart(heart.source, options)[0], place)
         there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
         rows += _closure_rows(name, assumed, close_valve(there, name).ends().steps())
     truth = np.array(own["truth"]["values"], dtype=float)
@@ -378,8 +482,6 @@ def _heart(job: Job[Settings]) -> Result:
         on_path=lambda path: _say(f"gate, along {path.name}: {path.reason or 'no jump'}"),
     )
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
-    tissue = heart_parts(source)[0]
-    volume = abs(enclosed_volume(tissue.vertices, tissue.triangles))
     shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
     failed = [one.reason for one in records if not one.converged]
     steps = closing.result.simulation
@@ -395,7 +497,7 @@ def _heart(job: Job[Settings]) -> Result:
             "derived": table([{"what follows from the source": text} for text in case.derived]),
         },
         estimates=tuple(records),
-        numbers={"anatomy": anatomy_digest(own), "passed": gate.passed, "data": CITATION},
+        numbers={"anatomy": anatomy_digest(own), "passed": gate.passed, "data": HEART_CITATION},
         arrays=ends.arrays(),
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",

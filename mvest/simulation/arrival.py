@@ -23,7 +23,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError
-from mvest.exchange.importing.segmented import LabelsOptions, import_labels
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.exchange.surfaces import write_surface
 from mvest.problem.registration import displace
@@ -135,15 +135,15 @@ def _through_labels(
         raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
     opened, closed = (folder / f"{frame.name}.nii.gz" for frame in frames)
     tips = [tuple(frame.papillary_tips.ravel().tolist()) for frame in frames]
-    options = LabelsOptions(tips=tips[0], observer_mm=0.0)
+    options = LeafletsOptions(anterior=1, posterior=2, tips=tips[0], observer_mm=0.0)
     _write_label_map(opened, frames[0], thickness, door.voxel_mm)
     if not door.closed:
-        imported = import_labels(opened, options)
+        imported = import_leaflets(opened, options)
         return _with_closed(imported, frames[1], door.std_mm, folder / "by_hand")
     _write_label_map(closed, frames[1], thickness, door.voxel_mm)
     pressure = frames[1].pressure_mmHg
     both = replace(options, closed=str(closed), tips_closed=tips[1], pressure_mmHg=pressure)
-    return import_labels(opened, both)
+    return import_leaflets(opened, both)
 
 
 def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:

@@ -1,7 +1,8 @@
-"""Thick leaflets as they were segmented: label maps, or closed surfaces of each or both."""
+"""Thick leaflets as they were segmented: label maps, or closed surfaces of each or of both."""
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,48 +14,36 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Role, ValveCase
+from mvest.cases.checks import LARGEST_THICKNESS
 from mvest.cases.folder import read_case
 from mvest.cases.frames import MM_PER
 from mvest.cases.schema import CASE_FILE
 from mvest.errors import GeometryError, InputError, MvestError
-from mvest.exchange.importing.tissue import (
+from mvest.exchange.importing.leaflet_parts import (
     REGIONS,
     Content,
     Tissue,
-    muscle_points,
-    paired_files,
-    read_files,
+    filled_frames,
     tissue_of,
 )
-from mvest.exchange.surfaces import write_surface
-from mvest.exchange.volumes import LabelMap
-from mvest.typing import FloatArray, IntArray
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface, write_surface
+from mvest.exchange.volumes import LabelMap, read_labels
+from mvest.quantities import EdgeLength, Length
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.geometry.leaflet_fields import (
-    CLOSED_STEP_MM,
-    STEP_MM,
-    ThickLeaflets,
-    fields_of_masks,
-    thick_leaflets,
-)
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
-from mvest.valve.geometry.papillary import HEAD_MM, papillary_tip
+from mvest.valve.geometry.papillary import HEAD_MM, TALLER, check_tips_of, papillary_tip
+from mvest.valve.geometry.segmented import BEND_MM, masks_midsurface, segmentation_std
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.thickening import thicken
 
 OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
 """Standard deviation of where a person or a network draws a leaflet's wall, and over which length
 along the leaflets such errors are alike; those which a case has without any statement."""
-BEND_MM = 3.0
-"""Radius to which leaflets bend at the commissures."""
 CLOSED_AT = 0.35
 """s after the open frame, in a generic cardiac cycle."""
-MAX_AWAY = 60.0
-"""mm from the leaflets to the papillary tips."""
-TALLER = 1.1
-"""Height of a leaflet over that of the other, from which on it is the anterior one."""
 REPAIRS_MM = (0.0, 1.0, 2.0, 4.0)
-"""Further smoothing that is tried where leaflets would pass through themselves."""
+"""Further smoothing that is tried where leaflets pass through themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,30 +52,29 @@ class LeafletsOptions:
 
     Attributes
     ----------
-    anterior, posterior : names, numbers, files, or lists of these
-        Which segments, labels or objects are a leaflet, such as ``anterior=2`` or
-        ``posterior=[P1,P2,P3]``; or its file. Without them: SlicerHeart's terminology, names, or
-        of two nameless labels the anatomy.
-    leaflets : names, numbers, or a list of these
+    anterior, posterior : name, number or file, or list of names and numbers
+        Segments, labels or objects of a leaflet (``anterior=2``, ``posterior=[P1,P2,P3]``), or its
+        file. Else SlicerHeart's terminology, names or, of two nameless labels, the anatomy.
+    leaflets : name or number, or list of them
         What both leaflets are together.
     open, closed : number, file, or list of two files
-        The frames: of a map over time the number, of layers that of the layer; or for the closed
-        one another file, folder, or list with the file of each leaflet.
+        Frames of a map over time, or layers of a segmentation; the closed frame may be another
+        file, or the files of its anterior and of its posterior leaflet.
     units : str or None
-        Of lengths in surfaces and of all points given here: mm, cm or m. Maps are in mm.
+        Of lengths in surfaces and of the points given here: mm, cm or m. Maps are in mm.
     tips, tips_closed : tuple of float or None
         Papillary tips, antero-lateral and postero-medial: six numbers, LPS; ``tips_closed`` where
-        they have moved in the closed frame.
-    muscles : list of two names or files, or None
-        Segments, objects or surfaces of the papillary muscles, from which the tips follow.
+        they are others in the closed frame.
+    muscles : list of two names or files
+        Papillary muscles in the same order, from whose shape the tips follow.
     commissures, anterior_point : tuple of float or None
-        Six numbers, and a point of the anterior annulus, where both leaflets are one label or
-        surface; else they are shortest at the commissures, and the anterior one is the taller one.
+        Six numbers, and a point of the anterior annulus, of leaflets that are one label or surface.
+        Else these are shortest at the commissures, and the anterior one is the taller one.
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve.
     thickness_mm, thickness_range_mm : tuple of float or None
-        Of the anterior and of the posterior leaflet, instead of that between the walls; or least
-        and largest one that is kept.
+        Of the anterior and of the posterior leaflet, instead of that between the walls; the
+        smallest and the largest one that is kept.
     seam_mm : tuple of float or None
         How far down from the annulus the leaflets are one piece at the two commissures, where the
         open frame does not show it.
@@ -94,7 +82,7 @@ class LeafletsOptions:
         Of the triangles of the case.
     blur_voxels, smoothing_mm : float
         Standard deviation of the smoothing of the voxels' distances, and of that of the midsurface
-        round the valve (along the annulus; shorter lines are smoothed less).
+        round the valve.
     observer_mm : float
         Standard deviation of where the walls were drawn; 0 for a voxelised model.
     mirrored : bool
@@ -116,59 +104,37 @@ class LeafletsOptions:
     thickness_mm: tuple[float, ...] | None = None
     thickness_range_mm: tuple[float, ...] | None = None
     seam_mm: tuple[float, ...] | None = None
-    edge_mm: float = 1.2
-    blur_voxels: float = 0.5
-    smoothing_mm: float = 0.0
-    observer_mm: float = OBSERVER_MM
+    edge_mm: EdgeLength = 1.2
+    blur_voxels: Length = 0.5
+    smoothing_mm: Length = 0.0
+    observer_mm: Length = OBSERVER_MM
     mirrored: bool = False
 
     def __post_init__(self) -> None:
-        if self.units is not None and self.units not in MM_PER:
-            raise InputError(f"units={self.units}, expected {', '.join(MM_PER)}")
-        counts = {"tips": 6, "tips_closed": 6, "commissures": 6, "anterior_point": 3, "muscles": 2}
-        for name in ("thickness_mm", "thickness_range_mm", "seam_mm"):
-            counts[name] = 2
-        for name, count in counts.items():
+        six, pairs = ("tips", "tips_closed", "commissures"), ("muscles", "thickness_mm")
+        counts = dict.fromkeys(six, 6) | {"anterior_point": 3, "thickness_range_mm": 2}
+        for name, count in (counts | dict.fromkeys((*pairs, "seam_mm"), 2)).items():
             given = getattr(self, name)
-            finite = name == "muscles" or given is None or np.isfinite(given).all()
-            if given is not None and (len(given) != count or not finite):
-                raise InputError(f"{name}={list(given)}, expected {count}")
-        limits = {"edge_mm": (0.3, 5), "blur_voxels": (0, 2), "smoothing_mm": (0, 10)}
-        for name, (low, high) in (limits | {"observer_mm": (0, 5)}).items():
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name}={getattr(self, name)}, expected {low:g} to {high:g}")
+            if given is not None and (
+                len(given) != count or (name != "muscles" and not np.isfinite(given).all())
+            ):
+                raise InputError(f"{name}={list(given)}, expected {count} of them")
 
-    def points(self, name: str, scale: float) -> FloatArray | None:
-        """An option's points ``(k, 3)`` in mm."""
+    def words(self, name: str) -> tuple[str, ...]:
+        """Names, numbers or files of an option that is one or a list of them."""
         given = getattr(self, name)
-        return None if given is None else scale * np.reshape(given, (-1, 3))
+        many = given if isinstance(given, list | tuple) else [] if given is None else [given]
+        return tuple(map(str, many))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """A frame in its files: number of the frame, and of the layer if it is one layer alone."""
+    """A frame: its role, its file or the files of both leaflets, and its number there."""
 
+    role: Role
     files: tuple[Path, ...]
-    contents: list[Content]
-    role: Role
-    frame: int = 0
-    layer: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Imported:
-    """A frame: its midsurface and papillary tips ``(2, 3)``, mm.
-
-    Also what the next frame follows: the seams ``(2,)`` mm, and whether nameless leaflets were
-    exchanged; and the size of a voxel in mm, 0 of a surface.
-    """
-
-    role: Role
-    surface: Midsurface
-    tips: FloatArray
-    seams: FloatArray | None
-    exchanged: bool
-    voxel_mm: float
+    contents: tuple[Content, ...]
+    frame: int | None
 
 
 def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
@@ -178,7 +144,8 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     ----------
     source : Path
         Label map (NRRD, ``.seg.nrrd``, NIfTI, MetaImage; LPS as the file states it) or closed
-        surfaces (STL, PLY, OBJ, GLB, VTK); or a folder with one file of each leaflet.
+        surfaces (STL, PLY, OBJ, GLB, VTK). If its name says ``anterior``, the file beside it that
+        says ``posterior`` is the other leaflet, and the other way round.
     options : LeafletsOptions
 
     Raises
@@ -188,25 +155,48 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
         recognised, with holes, in pieces, open, that meet nowhere, or without an orifice.
     """
     derived: list[str] = []
-    frames: list[Imported] = []
+    frames: list[tuple[Role, Midsurface, FloatArray]] = []
     with _named(source):
         seen = _frames(source, options, derived)
         scale = _scale(seen[0].contents[0], options)
+    point, commissures = (
+        None if at is None else scale * np.array(at).reshape(-1, 3)
+        for at in (options.anterior_point, options.commissures)
+    )
+    anterior = None if point is None else point[0]
+    known: dict[str, Any] = {"commissures": commissures, "edge_mm": options.edge_mm}
+    seams: Any = options.seam_mm
+    exchanged, voxel = False, 0.0
     for one in seen:
         with _named(*one.files):
-            given = {name: words(getattr(options, name)) for name in ("leaflets", *REGIONS)}
-            if len(one.files) == 2:
-                given = dict.fromkeys(given, ())
-            tissue = tissue_of(one.contents, one.frame, one.layer, given, scale, derived)
-            tips = _tips(one, tissue, frames, options, scale, derived)
-            frames.append(_imported(one.role, tissue, tips, frames, options, scale, derived))
+            given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
+            tissue = tissue_of(one.contents, one.frame, given, scale, derived)
+            known |= {"tips": _tips(one, tissue, frames, options, scale, derived)}
+            known |= {"anterior": anterior}
+            if tissue.surface is None:
+                voxel = float(np.prod(tissue.grid[0]) ** (1 / 3))
+                blur = options.blur_voxels
+                surface, seams = masks_midsurface(
+                    tissue.masks, tissue.grid, seams=seams, blur=blur, **known
+                )
+            else:
+                surface = midsurface(*tissue.surface, **known)
+            derived += [line for line in surface.derived if line not in derived]
+            if not frames and (tissue.nameless or (anterior is None and len(tissue.masks) < 2)):
+                exchanged = _posterior_first(surface, tissue.nameless, derived)
+            surface = surface.exchanged() if exchanged else surface
+            check_tips_of(surface, known["tips"], handedness=not options.mirrored)
+            surface = _sound(_thick(surface, options, derived), one.role, options, derived)
+            anterior = surface.vertices[surface.annulus[len(surface.annulus) // 4]]
+            frames.append((one.role, surface, known["tips"]))
     with _named(source):
-        return _case(frames, options, derived)
+        std = segmentation_std(voxel, options.blur_voxels * voxel, options.observer_mm)
+        return _case(frames, std, options, derived)
 
 
 @contextmanager
 def _named(*files: Path) -> Iterator[None]:
-    """Put the first file before what is wrong with it, unless a file is named already."""
+    """Put the first file before what is wrong with it, unless one is named already."""
     try:
         yield
     except MvestError as fault:
@@ -214,250 +204,108 @@ def _named(*files: Path) -> Iterator[None]:
         raise type(fault)(str(fault) if known else f"{files[0]}: {fault}") from fault
 
 
-def words(value: Any) -> tuple[str, ...]:
-    """Names, numbers or files of an option that is one or a list of them."""
-    if value is None:
-        return ()
-    return tuple(map(str, value if isinstance(value, list | tuple) else [value]))
+def _read(files: tuple[Path, ...]) -> tuple[Content, ...]:
+    return tuple(
+        (read_surface if file.suffix.lower() in SURFACE_SUFFIXES else read_labels)(file)
+        for file in files
+    )
 
 
-def _frames(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Seen]:
-    """The open frame, and the closed one if there is one."""
-    named = words(options.closed)
-    if named and options.pressure_mmHg is None:
-        raise InputError("no pressure of the closed frame; give pressure_mmHg=...")
-    files = _files(source, options)
-    opened = Seen(files, read_files(files), Role.REFERENCE)
-    first = opened.contents[0]
-    numbers = [int(word) for word in named if word.isdecimal()]
-    if isinstance(first, LabelMap) and first.is_layers:
-        if numbers:
-            opened = replace(opened, layer=options.open or 0)
-            return [opened, replace(opened, role=Role.CLOSED, layer=numbers[0])]
-    elif isinstance(first, LabelMap):
-        filled = _filled(first)
-        if options.open is None and not named and len(filled) == 2:
-            numbers = filled[1:]
-            if options.pressure_mmHg is None:
-                raise InputError(
-                    f"frames {filled[0]} and {filled[1]} hold labels: give pressure_mmHg=... of "
-                    f"the second, the closed one, or open={filled[0]} for the open one alone"
-                )
-        opened = replace(opened, frame=filled[0] if options.open is None else options.open)
-        used = [opened.frame, *numbers]
-        for frame in used:
-            if frame not in filled:
-                raise InputError(f"frame {frame} holds no labels, expected one of {filled}")
-        if len(first.frames) > 1:
-            left = [frame for frame in filled if frame not in used]
-            derived.append(
-                f"frames: {opened.frame} open"
-                + "".join(f", {frame} closed" for frame in numbers)
-                + (f"; labelled ones that are not used: {left}" if left else "")
-            )
-        if numbers:
-            return [opened, replace(opened, role=Role.CLOSED, frame=numbers[0])]
-    if not named:
-        return [opened]
-    files = paired_files(Path(named[0])) if len(named) == 1 else tuple(map(Path, named))
-    with _named(*files):
-        contents = read_files(files)
-        frame = _filled(contents[0])[0] if isinstance(contents[0], LabelMap) else 0
-    return [opened, Seen(files, contents, Role.CLOSED, frame)]
-
-
-def _files(source: Path, options: LeafletsOptions) -> tuple[Path, ...]:
-    given = [words(getattr(options, region)) for region in REGIONS]
-    anterior, posterior = (len(own) == 1 and Path(own[0]).is_file() for own in given)
-    if posterior:
-        return Path(given[0][0]) if anterior else source, Path(given[1][0])
-    return (source,) if any(given) or words(options.leaflets) else paired_files(source)
-
-
-def _filled(labels: LabelMap) -> list[int]:
-    """Numbers of the frames with labels."""
-    filled: list[int] = np.flatnonzero(labels.frames.any(axis=(1, 2, 3))).tolist()
-    if not filled:
-        raise InputError("no voxel has a label")
-    return filled
+def _paired(source: Path) -> tuple[Path, ...]:
+    """A file, or those of the anterior and of the posterior leaflet beside each other."""
+    pair = [source.with_name(re.sub("|".join(REGIONS), name, source.name)) for name in REGIONS]
+    return tuple(pair) if pair[0] != pair[1] and all(p.is_file() for p in pair) else (source,)
 
 
 def _scale(content: Content, options: LeafletsOptions) -> float:
     """Millimetres per unit of a source and of what the options state."""
-    if isinstance(content, LabelMap):
-        if options.units not in (None, "mm"):
-            raise InputError(f"units={options.units}, expected none: label maps are in mm")
-        return 1.0
-    if options.units is None:
+    if isinstance(content, LabelMap) and options.units not in (None, "mm"):
+        raise InputError(f"units={options.units}, but a label map is in mm")
+    if not isinstance(content, LabelMap) and options.units not in MM_PER:
         raise InputError("surfaces state no unit of length; give units=mm, cm or m")
-    return MM_PER[options.units]
+    return MM_PER[options.units or "mm"]
+
+
+def _frames(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Seen]:
+    """The open frame, and the closed one if there is one."""
+    anterior, posterior, closed = map(options.words, (*REGIONS, "closed"))
+    if len(posterior) == 1 and Path(posterior[0]).is_file():
+        files: tuple[Path, ...] = (Path(*anterior) if anterior else source, Path(*posterior))
+    else:
+        files = (source,) if anterior or posterior or options.leaflets else _paired(source)
+    if closed and options.pressure_mmHg is None:
+        raise InputError("no pressure of the closed frame; give pressure_mmHg=...")
+    opened = Seen(Role.REFERENCE, files, _read(files), options.open)
+    content = opened.contents[0]
+    number = int(closed[0]) if len(closed) == 1 and closed[0].isdecimal() else None
+    if isinstance(content, LabelMap) and content.is_layers and number is not None:
+        opened = replace(opened, frame=opened.frame or 0)
+    if isinstance(content, LabelMap) and len(content.frames) > 1 and not content.is_layers:
+        filled = filled_frames(content)
+        if opened.frame is None and not closed and len(filled) == 2:
+            number = filled[1]
+            if options.pressure_mmHg is None:
+                raise InputError(
+                    f"frames {filled} hold labels: give pressure_mmHg=... of the second, the "
+                    f"closed one, or open={filled[0]} for the open one alone"
+                )
+        opened = replace(opened, frame=filled[0] if opened.frame is None else opened.frame)
+        derived.append(
+            f"of the frames with labels, {filled}, {opened.frame} is taken as the open one"
+            + ("" if number is None else f" and {number} as the closed one")
+        )
+    if number is not None:
+        return [opened, replace(opened, role=Role.CLOSED, frame=number)]
+    if not closed:
+        return [opened]
+    files = _paired(Path(*closed)) if len(closed) == 1 else tuple(map(Path, closed))
+    with _named(*files):
+        return [opened, Seen(Role.CLOSED, files, _read(files), None)]
 
 
 def _tips(
     seen: Seen,
     tissue: Tissue,
-    before: Sequence[Imported],
+    before: Sequence[tuple[Role, Midsurface, FloatArray]],
     options: LeafletsOptions,
     scale: float,
     derived: list[str],
 ) -> FloatArray:
-    """Papillary tips ``(2, 3)`` mm as stated, from the muscles, or as in the frame before."""
-    stated = options.points("tips_closed" if before else "tips", scale)
+    """Papillary tips ``(2, 3)`` mm as stated, from the muscles, or as in the open frame."""
+    stated = options.tips_closed if before else options.tips
     if stated is not None:
-        return stated
+        return scale * np.array(stated).reshape(2, 3)
     if before:
         derived.append("papillary tips of the closed frame: where they are in the open one")
-        return before[0].tips
+        return before[0][2]
     if options.muscles is None:
         raise InputError("no papillary tips; give tips=[x,y,z,x,y,z] in LPS, or muscles=[...]")
     derived.append(
         f"papillary tips: the middle of the last {HEAD_MM:g} mm of each muscle along its axis"
     )
-    muscles = [muscle_points(w, seen.contents[0], seen.frame, scale) for w in options.muscles]
+    muscles = []
+    for word in options.muscles:
+        file, part = Path(word), {"leaflets": (word,)}
+        whole = file.is_file()
+        contents = _read((file,)) if whole else seen.contents[:1]
+        muscles.append(tissue_of(contents, seen.frame, {} if whole else part, scale, []).points)
     return np.stack([papillary_tip(muscle, tissue.points) for muscle in muscles])
 
 
-def _imported(
-    role: Role,
-    tissue: Tissue,
-    tips: FloatArray,
-    before: Sequence[Imported],
-    options: LeafletsOptions,
-    scale: float,
-    derived: list[str],
-) -> Imported:
-    """The midsurface of a frame, its leaflets recognised, without a fault that can be repaired."""
-    seams = before[0].seams if before else None
-    if options.seam_mm is not None and not before:
-        seams = np.array(options.seam_mm, dtype=np.float64)
-    label, voxel, front = None, 0.0, options.points("anterior_point", scale)
-    try:
-        if tissue.surface is None:
-            voxel = float(np.prod(tissue.spacing) ** (1 / 3))
-            step = STEP_MM if seams is None else CLOSED_STEP_MM
-            blur = options.blur_voxels
-            fields, first = fields_of_masks(tissue.masks, tissue.spacing, blur, step)
-            origin = tissue.origin + tissue.direction @ (tissue.spacing * first)
-
-            def local(points: FloatArray) -> FloatArray:
-                return np.asarray((points - origin) @ tissue.direction)
-
-            def nearer(points: FloatArray) -> IntArray:
-                return fields.label(local(points))
-
-            solid = thick_leaflets(fields, local(tips), seams)
-            seams, label = solid.seams, nearer if len(tissue.masks) == 2 else None
-            derived += _cuts(solid)
-            walls = origin + solid.vertices @ tissue.direction.T, solid.triangles
-        else:
-            walls = tissue.surface
-        if label is None and front is None and before:
-            quarter = len(before[0].surface.annulus) // 4
-            front = before[0].surface.vertices[before[0].surface.annulus[quarter]]
-        surface = midsurface(
-            *walls,
-            tips=tips,
-            commissures=options.points("commissures", scale),
-            anterior=None if front is None else front.ravel(),
-            label=label,
-            edge_mm=options.edge_mm,
-        )
-    except GeometryError as fault:
-        if not tissue.titles:
-            raise
-        raise GeometryError(
-            f"{fault}; {' and '.join(tissue.titles)} were taken as the leaflets: give anterior=N "
-            "posterior=N, or leaflets=N if one of them is both"
-        ) from fault
-    if tissue.surface is None:
-        thick = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)
-        surface = replace(surface, thickness=thick)
-    derived += [line for line in surface.derived if line not in derived]
-    exchanged = before[0].exchanged if before else False
-    unknown = tissue.titles or (label is None and front is None)
-    if unknown and not before:
-        exchanged = _posterior_first(surface, tissue.titles, derived)
-    surface = surface.exchanged() if exchanged else surface
-    if not options.mirrored:
-        check_handedness(surface, tips)
-    surface = _sound(_thick(surface, options, derived), role, options, derived)
-    return Imported(role, surface, tips, seams, exchanged, voxel)
-
-
-def _cuts(solid: ThickLeaflets) -> Iterator[str]:
-    """What was done to draw leaflets as one closed surface."""
-    if solid.pieces:
-        yield f"{solid.pieces} loose pieces of the leaflets left out"
-    if solid.grown_mm:
-        yield f"walls drawn {solid.grown_mm:.2g} mm farther out, so that no hole is left"
-    if solid.contact_mm2:
-        lengths = " and ".join(f"{length:.1f}" for length in solid.seams)
-        yield (
-            f"leaflets cut apart where they touch, over {solid.contact_mm2:.0f} mm^2, and one "
-            f"piece within {lengths} mm of the annulus at the commissures, as in the open frame"
-        )
-
-
-def _posterior_first(surface: Midsurface, titles: tuple[str, ...], derived: list[str]) -> bool:
-    """Whether the second of two nameless leaflets is the anterior one: the taller one is.
-
-    Raises
-    ------
-    InputError
-        Both are about as tall.
-    """
+def _posterior_first(surface: Midsurface, nameless: Sequence[str], derived: list[str]) -> bool:
+    """Whether the second of two leaflets is the anterior one, which is the taller one."""
     heights = surface.heights
-    second = bool(heights[1] > heights[0])
     said = f"{heights.max():.1f} mm tall, the other {heights.min():.1f} mm"
     if heights.max() < TALLER * heights.min():
-        raise InputError(
-            f"the anterior leaflet is not recognised, one is {said}; give "
-            + ("anterior=N posterior=N" if titles else "anterior_point=[x,y,z]")
-        )
-    if titles:
+        options = "anterior=N posterior=N" if nameless else "anterior_point=[x,y,z]"
+        raise InputError(f"which leaflet is the anterior one? one is {said}; give {options}")
+    second = bool(heights[1] > heights[0])
+    if nameless:
         derived.append(
-            f"{titles[second]} taken as anterior and {titles[not second]} as posterior leaflet: "
-            f"the anterior one is {said}"
+            f"{nameless[second]} taken as the anterior and {nameless[not second]} as the posterior "
+            f"leaflet: it is {said}, and on the anterior side of the tips"
         )
     return second
-
-
-def check_handedness(surface: Midsurface, tips: FloatArray) -> None:
-    """Raise where tips have other axes than the leaflets, or the valve is its own mirror image.
-
-    Raises
-    ------
-    InputError
-        Seen from the atrium, the antero-lateral commissure is not on the left of the anterior
-        leaflet; tips are farther from the leaflets than any.
-    """
-    centre = surface.vertices.mean(axis=0)
-    away = float(np.linalg.norm(tips - centre, axis=1).max())
-    if away > MAX_AWAY:
-        other = float(np.linalg.norm(tips * (-1, -1, 1) - centre, axis=1).max())
-        hint = (
-            f" (with x and y turned it would be {other:.0f} mm: tips are in RAS, not in LPS)"
-            if other < MAX_AWAY
-            else ""
-        )
-        raise InputError(
-            f"tips: {away:.0f} mm from the leaflets, expected at most {MAX_AWAY:g} mm{hint}"
-        )
-    halves = [
-        surface.vertices[surface.triangles[surface.region == k]].mean(axis=(0, 1)) for k in (0, 1)
-    ]
-    sides = np.stack([tips[0] - tips[1], halves[0] - halves[1], tips.mean(axis=0) - centre])
-    if np.linalg.det(sides) < 0:
-        heights = surface.heights
-        what = (
-            "the leaflets are exchanged, as the posterior one is the taller one"
-            if heights[1] > TALLER * heights[0]
-            else "the postero-medial tip is given first, or an axis is turned"
-        )
-        raise InputError(
-            "tips and leaflets: seen from the atrium the first, antero-lateral tip is on the right "
-            f"of the anterior leaflet, as in a mirror; perhaps {what} (mirrored=true takes it so)"
-        )
 
 
 def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) -> Midsurface:
@@ -475,21 +323,26 @@ def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) ->
             f"{high:g} mm ({thick:.0f} % are thicker, up to {thickness.max():.1f} mm)"
         )
         thickness = np.clip(thickness, low, high)
+    if thickness.max() > LARGEST_THICKNESS:
+        raise GeometryError(
+            f"thickness of {thickness.max():.1f} mm, expected at most {LARGEST_THICKNESS:g} mm of "
+            "leaflets; thickness_range_mm=[LOW,HIGH] keeps it between two"
+        )
     return replace(surface, thickness=thickness)
 
 
 def _sound(
     surface: Midsurface, role: Role, options: LeafletsOptions, derived: list[str]
 ) -> Midsurface:
-    """The surface smoothed round the valve as given, and further if it passes through itself.
+    """The same smoothed round the valve as given, and further if it passes through itself.
 
-    The open one is meshed, so its two walls must not meet either.
+    The open one is thickened to be meshed, and its walls must not pass through each other either.
     """
     faults = []
     for extra in REPAIRS_MM:
         smooth, moved = surface.smoothed(options.smoothing_mm + extra)
         try:
-            check_surface(smooth.vertices, smooth.triangles, name="midsurface")
+            check_surface(smooth.vertices, smooth.triangles)
             if role is Role.REFERENCE:
                 fibre = np.tile([0.0, 0.0, 1.0], (len(smooth.vertices), 1))
                 band = smooth.vertices, smooth.triangles, smooth.region, REGIONS
@@ -499,36 +352,27 @@ def _sound(
             continue
         if moved:
             derived.append(
-                f"midsurface of the {'open' if role is Role.REFERENCE else 'closed'} frame: "
-                f"smoothed round the valve over {options.smoothing_mm + extra:g} mm, which moves "
-                f"it by at most {moved:.1f} mm"
-                + (", as it passes through itself with less" if extra else "")
+                f"{role.value} frame: smoothed round the valve over "
+                f"{options.smoothing_mm + extra:g} mm, which moves it by at most {moved:.1f} mm"
+                + ("; with less it passes through itself" if extra else "")
             )
         return smooth
     raise faults[0]
 
 
-def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> float:
-    """Standard deviation (mm) of a coordinate of the midsurface of a segmentation.
-
-    A wall lies anywhere within a voxel, with a standard deviation of ``voxel / sqrt(12)``, and the
-    midsurface is the mean of two walls. Smoothing a signed distance by a normal distribution moves
-    a surface of curvature k by ``blur^2 k / 2`` (mean curvature flow: Merriman, Bence and Osher
-    1994, J. Comput. Phys. 112:334). Whoever drew the walls was in error as well.
-    """
-    return float(np.sqrt(voxel_mm**2 / 24 + (blur_mm**2 / (2 * BEND_MM)) ** 2 + observer_mm**2))
-
-
-def _case(frames: Sequence[Imported], options: LeafletsOptions, derived: list[str]) -> ValveCase:
-    """The frames written as a folder and read: the checks and rules of every case."""
+def _case(
+    done: Sequence[tuple[Role, Midsurface, FloatArray]],
+    std_mm: float,
+    options: LeafletsOptions,
+    derived: list[str],
+) -> ValveCase:
+    """The frames as a folder that is written and read: the checks and rules of every case."""
     correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
-    voxel = max(frame.voxel_mm for frame in frames)
-    std = segmentation_std(voxel, options.blur_voxels * voxel, options.observer_mm)
     derived.append(
-        f"observation: {std:.3g} mm by voxels, smoothing and observer_mm={options.observer_mm:g}, "
-        f"alike over {correlated:g} mm"
+        f"observation: {std_mm:.3g} mm by voxels, smoothing and observer_mm="
+        f"{options.observer_mm:g}, alike over {correlated:g} mm"
     )
-    if len(frames) > 1:
+    if len(done) > 1:
         derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
     document: dict[str, Any] = {
         "version": 1,
@@ -536,31 +380,21 @@ def _case(frames: Sequence[Imported], options: LeafletsOptions, derived: list[st
         "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
         "regions": list(REGIONS),
         "thickness": {"point_data": "thickness"},
-        "observation": {"std_mm": std, "correlation_length_mm": correlated},
+        "observation": {"std_mm": std_mm, "correlation_length_mm": correlated},
         "frames": [],
         "derived": derived,
     }
+    pressure = float(options.pressure_mmHg or 0.0)
+    closed = {"name": "closed", "time": CLOSED_AT, "pressure": pressure, "corresponds": False}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        for frame, name in zip(frames, ("open", "closed"), strict=False):
-            surface, closed = frame.surface, name == "closed"
-            write_surface(
-                folder / f"{name}.vtp",
-                surface.vertices,
-                surface.triangles,
-                {"thickness": surface.thickness},
-                {"region": np.asarray(surface.region)},
-            )
+        for role, surface, tips in done:
+            file, label = f"{role.value}.vtp", {"region": np.asarray(surface.region)}
+            data = {"thickness": surface.thickness}
+            write_surface(folder / file, surface.vertices, surface.triangles, data, label)
             document["frames"].append(
-                {
-                    "name": name,
-                    "time": CLOSED_AT if closed else 0.0,
-                    "role": frame.role.value,
-                    "surface": f"{name}.vtp",
-                    "papillary_tips": frame.tips.tolist(),
-                    "pressure": float(options.pressure_mmHg or 0.0) if closed else 0.0,
-                    **({"corresponds": False} if closed else {}),
-                }
+                {"role": role.value, "surface": file, "papillary_tips": tips.tolist()}
+                | (closed if role is Role.CLOSED else {"name": "open", "time": 0, "pressure": 0})
             )
         return read_back(folder, document)
 

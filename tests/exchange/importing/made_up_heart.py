@@ -5,11 +5,14 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from mvest.exchange.importing.reference_heart import HEAD_MM, PARTS
+from experiments.studies.imported import HEART_PARTS
 from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.papillary import HEAD_MM
 from mvest.valve.geometry.thickening import thicken
 
 TEMPLATE = Template()
+# Seen from the atrium the antero-lateral tip is on the left of the anterior leaflet.
+TIPS = TEMPLATE.valve(64, 20).papillary_tips[::-1]
 SHIFT = np.array([40.0, 470.0, -12.0])
 
 
@@ -34,13 +37,13 @@ def parts():
     """The template thickened and its muscles, mm: points and triangles of each."""
     valve = TEMPLATE.valve(64, 20)
     thick = thicken(valve.surface)
-    found = [(thick.vertices, thick.triangles), *map(muscle, valve.papillary_tips)]
+    found = [(thick.vertices, thick.triangles), *map(muscle, TIPS)]
     return [(points + SHIFT, triangles) for points, triangles in found]
 
 
 def heart(folder: Path) -> Path:
     """Write the parts of the template's heart."""
     folder.mkdir()
-    for name, (points, triangles) in zip(PARTS, parts(), strict=True):
+    for name, (points, triangles) in zip(HEART_PARTS, parts(), strict=True):
         meshio.Mesh(points, [("triangle", triangles.astype(np.int32))]).write(folder / name)
     return folder

@@ -8,54 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK
-from scipy.interpolate import PchipInterpolator
 
 from mvest.cases.case import Role, ValveCase
 from mvest.errors import InputError
-from mvest.exchange.importing.segmented import LabelsOptions, import_labels
-from mvest.valve.anatomy.valve import LeafletSurface, band_grid
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.valve.geometry.proximity import closest_points
-from tests.exchange.importing.voxelised import voxelised
-
-THICKNESS = 1.4
-HALF_LENGTH, HALF_WIDTH, DEPTH = 9.0, 6.0, 8.0
-TOUCHING_FROM = 3.5
-"""mm below the annulus."""
-POCKET = 2.8
-"""mm, half of the width of the pocket that stays open beside each commissure."""
-COLUMNS, ROWS = 96, 15
-
-
-def small_valve(closed: bool) -> LeafletSurface:
-    """A tube; closed, its leaflets touch all along but for a pocket beside each commissure."""
-    grid = band_grid(COLUMNS, ROWS)
-    turn = np.radians(grid.phi)
-    depth = DEPTH * grid.s
-    # From 0 at the commissures to 1 in the middle of a leaflet.
-    inwards = 1 - np.abs(np.mod(grid.phi, 180.0) - 90.0) / 90.0
-    open_at = HALF_WIDTH * np.abs(np.sin(turn))
-    touching = PchipInterpolator(
-        [0.0, 0.25, 0.6, 1.0], [0.0, POCKET, 0.5 * THICKNESS, 0.5 * THICKNESS]
-    )(inwards)
-    share = np.clip(depth / TOUCHING_FROM, 0, 1) if closed else np.zeros_like(depth)
-    away = (1 - share) * open_at + share * touching
-    points = np.stack([HALF_LENGTH * np.cos(turn), np.sign(np.sin(turn)) * away, -depth], axis=1)
-    return LeafletSurface(
-        points,
-        grid.triangles,
-        grid.region,
-        ("anterior", "posterior"),
-        np.tile([0.0, 0.0, 1.0], (len(points), 1)),
-        np.full(len(points), THICKNESS),
-    )
+from tests.exchange.importing.voxelised import COLUMNS, ROWS, small_valve, voxelised
 
 
 @pytest.fixture(scope="module")
-def options(tmp_path_factory: pytest.TempPathFactory) -> LabelsOptions:
+def options(tmp_path_factory: pytest.TempPathFactory) -> LeafletsOptions:
     folder = tmp_path_factory.mktemp("maps")
     for closed, name in ((False, "open.nii.gz"), (True, "closed.nii.gz")):
         SimpleITK.WriteImage(voxelised(small_valve(closed), 0.8), str(folder / name))
-    return LabelsOptions(
+    # Leaflets that are as tall as each other are not recognised.
+    return LeafletsOptions(
+        anterior=1,
+        posterior=2,
         tips=(-8.0, 0.0, -20.0, 8.0, 0.0, -20.0),
         closed=str(folder / "closed.nii.gz"),
         pressure_mmHg=100.0,
@@ -65,11 +34,11 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> LabelsOptions:
 
 
 @pytest.fixture(scope="module")
-def case(options: LabelsOptions) -> ValveCase:
-    return import_labels(_opened(options), options)
+def case(options: LeafletsOptions) -> ValveCase:
+    return import_leaflets(_opened(options), options)
 
 
-def _opened(options: LabelsOptions) -> Path:
+def _opened(options: LeafletsOptions) -> Path:
     assert options.closed is not None
     return Path(options.closed).with_name("open.nii.gz")
 
@@ -104,11 +73,16 @@ def test_each_vertex_has_the_label_of_its_leaflet(case: ValveCase) -> None:
     assert (true.region[nearest.triangle] == closed.region).mean() > 0.97
 
 
-def test_one_leaflet_is_no_closed_valve(options: LabelsOptions, tmp_path: Path) -> None:
+def test_leaflets_that_are_as_tall_are_asked_for(options: LeafletsOptions) -> None:
+    with pytest.raises(InputError, match=r"give anterior=N posterior=N"):
+        import_leaflets(_opened(options), LeafletsOptions(tips=options.tips))
+
+
+def test_one_leaflet_is_no_closed_valve(options: LeafletsOptions, tmp_path: Path) -> None:
     assert options.closed is not None
     image = SimpleITK.ReadImage(options.closed)
     path = tmp_path / "one.nii.gz"
     SimpleITK.WriteImage(image * SimpleITK.Cast(image == 1, image.GetPixelID()), str(path))
-    with pytest.raises(InputError, match=r"one.nii.gz: no voxel has the label 2") as caught:
-        import_labels(_opened(options), replace(options, closed=str(path)))
+    with pytest.raises(InputError, match=r"one.nii.gz: 0 parts of the name or number 2") as caught:
+        import_leaflets(_opened(options), replace(options, closed=str(path)))
     assert "\n" not in str(caught.value)

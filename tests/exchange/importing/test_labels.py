@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +15,16 @@ from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
-from mvest.exchange.importing.segmented import LabelsOptions, import_labels, segmentation_std
-from mvest.typing import FloatArray
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
+from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points
-from tests.exchange.importing.voxelised import voxelised, write_slicer
+from mvest.valve.geometry.segmented import segmentation_std
+from mvest.valve.geometry.thickening import thicken
+from tests.exchange.importing.voxelised import small_valve, voxelised, write_slicer
+from tests.places import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +53,7 @@ def slicer(image: SimpleITK.Image, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def case(slicer: Path, tips: tuple[float, ...]) -> ValveCase:
-    return import_labels(slicer, LabelsOptions(tips=tips, observer_mm=0.0))
+    return import_leaflets(slicer, LeafletsOptions(tips=tips, observer_mm=0.0))
 
 
 def _distances(case: ValveCase, valve: Valve) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -84,7 +89,7 @@ def test_regions_come_from_the_terminology(case: ValveCase, valve: Valve) -> Non
     centres = case.surface.vertices[case.surface.triangles].mean(axis=1)
     nearest = closest_points(centres, valve.surface.vertices, valve.surface.triangles)
     assert (valve.surface.region[nearest.triangle] == case.surface.region).mean() > 0.98
-    assert any("mitral_posterior_leaflet, label 2" in line for line in case.derived)
+    assert any("posterior: mitral_posterior_leaflet (2)" in line for line in case.derived)
 
 
 def test_the_case_is_written_and_read(case: ValveCase, tmp_path: Path) -> None:
@@ -94,46 +99,195 @@ def test_the_case_is_written_and_read(case: ValveCase, tmp_path: Path) -> None:
     assert [frame.role for frame in again.frames] == [Role.REFERENCE]
 
 
-def test_nifti_with_plain_labels_gives_the_same(
-    case: ValveCase, image: SimpleITK.Image, tips: tuple[float, ...], tmp_path: Path
+def _written(
+    image: SimpleITK.Image, path: Path, convention: Callable[[IntArray], IntArray]
+) -> Path:
+    """The map with its labels, z first, as someone else has them."""
+    labels = convention(SimpleITK.GetArrayFromImage(image).astype(np.int64)).astype(np.uint8)
+    other = SimpleITK.GetImageFromArray(labels, isVector=False)
+    if labels.ndim == 3:
+        other.CopyInformation(image)
+    else:
+        other.SetSpacing([*image.GetSpacing(), 0.04])
+        other.SetOrigin([*image.GetOrigin(), 0.0])
+    SimpleITK.WriteImage(other, str(path))
+    return path
+
+
+def _scallops(labels: IntArray) -> IntArray:
+    """2, 3 and 4 in place of the posterior leaflet."""
+    third = labels.shape[2] // 3
+    return np.where(labels == 2, 2 + np.clip(np.arange(labels.shape[2]) // third, 0, 2), labels)
+
+
+def _annulus(labels: IntArray) -> IntArray:
+    """1 where the leaflets begin, 2 and 3 the leaflets."""
+    top = np.flatnonzero((labels > 0).any(axis=(1, 2))).max()
+    ring = (np.arange(len(labels)) > top - 2)[:, None, None] & (labels > 0)
+    return np.where(ring, 1, np.where(labels > 0, labels + 1, 0))
+
+
+def _sparse(labels: IntArray) -> IntArray:
+    """Six frames, of which two are segmented."""
+    return np.stack([(frame in (1, 4)) * labels for frame in range(6)])
+
+
+SMALL_TIPS = (-8.0, 0.0, -20.0, 8.0, 0.0, -20.0)
+
+
+@pytest.fixture(scope="module")
+def small() -> SimpleITK.Image:
+    return voxelised(small_valve(closed=False, taller=0.4), 0.8)
+
+
+@pytest.mark.parametrize(
+    ("convention", "given", "said"),
+    [
+        (lambda labels: labels, {}, "label 1 taken as the anterior and label 2 as the posterior"),
+        (
+            lambda labels: np.choose(labels, [0, 2, 1]),
+            {},
+            "label 2 taken as the anterior and label 1 as the posterior",
+        ),
+        (lambda labels: (labels > 0).astype(np.int64), {}, "anterior leaflet: the taller one"),
+        (_scallops, {"anterior": 1, "posterior": [2, 3, 4]}, "posterior: 2, 3, 4"),
+        (_annulus, {"anterior": 2, "posterior": 3}, "anterior: 2; posterior: 3; not used: 1"),
+        (_sparse, {"open": 4}, "[1, 4], 4 is taken as the open one"),
+    ],
+)
+def test_labels_of_all_conventions_are_the_same_valve(
+    small: SimpleITK.Image,
+    tmp_path: Path,
+    convention: Callable[[IntArray], IntArray],
+    given: dict[str, Any],
+    said: str,
 ) -> None:
-    path = tmp_path / "valve.nii.gz"
-    SimpleITK.WriteImage(image, str(path))
-    other = import_labels(path, LabelsOptions(tips=tips, observer_mm=0.0))
-    away = closest_points(other.surface.vertices, case.surface.vertices, case.surface.triangles)
-    assert away.distance.max() < 0.05
-    assert any("label 1, as the file names none" in line for line in other.derived)
+    path = _written(small, tmp_path / "valve.nii.gz", convention)
+    assert any(said in line for line in _small(path, **given).derived)
 
 
-def test_segments_are_told_apart_by_names_or_numbers(slicer: Path, tips: tuple[float, ...]) -> None:
-    swapped = LabelsOptions(
+def _small(path: Path, **given: Any) -> ValveCase:
+    """A map of the small valve, imported and compared with it."""
+    found = import_leaflets(path, LeafletsOptions(tips=SMALL_TIPS, observer_mm=0.0, **given))
+    surface, true = found.surface, small_valve(closed=False, taller=0.4)
+    away = closest_points(surface.vertices, true.vertices, true.triangles)
+    assert np.sqrt(np.mean(away.distance**2)) < 0.25
+    centres = surface.vertices[surface.triangles].mean(axis=1)
+    nearest = closest_points(centres, true.vertices, true.triangles)
+    assert (true.region[nearest.triangle] == surface.region).mean() > 0.95
+    return found
+
+
+def test_a_file_for_each_leaflet(small: SimpleITK.Image, tmp_path: Path) -> None:
+    for label, name in ((1, "a_anterior_leaflet.nrrd"), (2, "a_posterior_leaflet.nrrd")):
+        _written(small, tmp_path / name, lambda labels, own=label: labels == own)
+    path = tmp_path / "a_posterior_leaflet.nrrd"
+    _small(path)
+    other = path.rename(tmp_path / "b.nrrd")
+    _small(tmp_path / "a_anterior_leaflet.nrrd", posterior=str(other))
+
+
+def test_two_labelled_frames_are_the_open_and_the_closed_one(
+    small: SimpleITK.Image, tmp_path: Path
+) -> None:
+    path = _written(small, tmp_path / "valve.nii.gz", _sparse)
+    with pytest.raises(InputError, match=r"frames \[1, 4\] hold labels: give pressure_mmHg="):
+        _small(path)
+    both = _small(path, pressure_mmHg=100.0)
+    assert [frame.role for frame in both.frames] == [Role.REFERENCE, Role.CLOSED]
+    assert any("1 is taken as the open one and 4 as the closed" in line for line in both.derived)
+
+
+def test_exchanged_leaflets_are_called_so(slicer: Path, tips: tuple[float, ...]) -> None:
+    swapped = LeafletsOptions(
         anterior="mitral_posterior_leaflet", posterior="1", tips=tips, mirrored=True
     )
-    turned = import_labels(slicer, swapped)
-    assert any("anterior leaflet: segment mitral_posterior_leaflet" in s for s in turned.derived)
-    with pytest.raises(InputError, match="as in a mirror"):
-        import_labels(slicer, replace(swapped, mirrored=False))
+    turned = import_leaflets(slicer, swapped)
+    assert any("anterior: mitral_posterior_leaflet (2)" in line for line in turned.derived)
+    with pytest.raises(InputError, match="as in a mirror: exchange the leaflets"):
+        import_leaflets(slicer, replace(swapped, mirrored=False))
+    with pytest.raises(InputError, match="as in a mirror: give the antero-lateral tip first"):
+        import_leaflets(slicer, LeafletsOptions(tips=(*tips[3:], *tips[:3])))
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"tips": None}, r"give tips=\[x,y,z,x,y,z\] in LPS mm"),
+        ({"tips": None}, r"give tips=\[x,y,z,x,y,z\] in LPS"),
         ({"closed": "1"}, "give pressure_mmHg="),
-        ({"anterior": "7"}, r"no voxel has the label 7 .* give anterior=LABEL"),
-        ({"anterior": "front"}, "0 segments of the anterior leaflet .* give anterior=NAME"),
-        ({"open": 3}, "frame 3, expected one of 1 from 0 on"),
+        ({"anterior": 7}, "0 parts of the name or number 7, expected one of mitral_anterior"),
+        ({"anterior": "front"}, "0 parts of the name or number front"),
+        ({"anterior": 2}, "give anterior=N and posterior=N"),
+        ({"open": 3}, r"frame 3 holds no labels, expected one of \[0\]"),
+        ({"units": "cm"}, "a label map is in mm"),
         ({"tips": (0.0, 0.0, 500.0, 9.0, 9.0, 500.0)}, "mm from the leaflets"),
     ],
 )
 def test_what_is_missing_is_asked_for_by_name(
     slicer: Path, tips: tuple[float, ...], change: dict[str, object], words: str
 ) -> None:
-    options = replace(LabelsOptions(tips=tips), **change)  # type: ignore[arg-type]
+    options = replace(LeafletsOptions(tips=tips), **change)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=words) as caught:
-        import_labels(slicer, options)
+        import_leaflets(slicer, options)
     assert "\n" not in str(caught.value)
     assert str(slicer) in str(caught.value)
+
+
+@pytest.mark.parametrize("names", [("AML", "PML"), ("Anterior", "Posterior"), ("A2", "P2")])
+def test_names_of_leaflets_are_recognised(
+    small: SimpleITK.Image, tmp_path: Path, names: tuple[str, str]
+) -> None:
+    path = tmp_path / "valve.seg.nrrd"
+    write_slicer(SimpleITK.Image(small), path, names, tags=False)
+    said = f"anterior: {names[0]} (1); posterior: {names[1]} (2)"
+    assert said in _small(path).derived
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("voxel_mm", [0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8])
+def test_whatever_is_imported_can_be_thickened(
+    valve: Valve, tips: tuple[float, ...], tmp_path: Path, voxel_mm: float
+) -> None:
+    path = tmp_path / "valve.nrrd"
+    SimpleITK.WriteImage(voxelised(valve.surface, voxel_mm), str(path))
+    imported = import_leaflets(path, LeafletsOptions(tips=tips, observer_mm=0.0))
+    thicken(imported.surface)
+    repaired = [line for line in imported.derived if "passes through itself" in line]
+    assert len(repaired) == (voxel_mm == 0.6)
+    write_case(tmp_path / "case", imported)
+    again = read_case(tmp_path / "case")
+    assert np.sqrt(np.mean(_distances(again, valve)[0] ** 2)) < 0.15
+
+
+FIELD_TIPS = (-16.0, -0.24, -25.0, 16.0, -0.24, -25.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("mvseg_posterior1_anterior2.nii.gz", {}),
+        ("scene_mitral_frame_3_MD_anterior_leaflet.nrrd", {}),
+        ("overlapping.seg.nrrd", {}),
+        ("overlapping_empty_layer.seg.nrrd", {}),
+        ("sparse4d_ms.nii.gz", {"pressure_mmHg": 110.0}),
+        ("full4d_default_times.nii.gz", {}),
+        ("int64_labels.nrrd", {}),
+        ("child_cropped.nii.gz", {}),
+    ],
+)
+def test_label_maps_of_the_field(name: str, given: dict[str, Any], tmp_path: Path) -> None:
+    path = ROOT.parent / "shared" / "data" / "field_inputs" / name
+    if not path.is_file():
+        pytest.skip(f"needs {path}")
+    imported = import_leaflets(path, LeafletsOptions(tips=FIELD_TIPS, **given))
+    thicken(imported.surface)
+    centres = imported.surface.vertices[imported.surface.triangles].mean(axis=1)
+    # The anterior leaflet is the one at y > 0.
+    middles = [centres[imported.surface.region == k, 1].mean() for k in (0, 1)]
+    assert middles[0] > 2.0 > -2.0 > middles[1]
+    write_case(tmp_path / "case", imported)
+    assert len(read_case(tmp_path / "case").frames) == 1 + bool(given)
 
 
 def test_leaflets_that_do_not_meet_are_refused(
@@ -148,4 +302,4 @@ def test_leaflets_that_do_not_meet_are_refused(
     apart.CopyInformation(image)
     SimpleITK.WriteImage(apart, str(path))
     with pytest.raises(InputError, match="the leaflets meet nowhere"):
-        import_labels(path, LabelsOptions(tips=tips))
+        import_leaflets(path, LeafletsOptions(tips=tips))

@@ -4,29 +4,30 @@ The tip of a papillary muscle is its end towards the leaflets, wherever it lies.
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from experiments.studies.imported import (
+    HEART_CITATION,
+    HEART_OBJECTS,
+    HEART_PARTS,
+    HEART_VARIABLE,
+    HeartOptions,
+    heart_files,
+    import_heart,
+)
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.importing.reference_heart import (
-    CITATION,
-    DATA_VARIABLE,
-    HEAD_MM,
-    OBJECTS,
-    PARTS,
-    ReferenceHeartOptions,
-    heart_files,
-    import_reference_heart,
-    papillary_tip,
-)
+from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
+from mvest.valve.geometry.papillary import HEAD_MM, papillary_tip
 from mvest.valve.geometry.proximity import closest_points
-from tests.exchange.importing.made_up_heart import SHIFT, TEMPLATE, heart, parts
+from tests.exchange.importing.made_up_heart import SHIFT, TEMPLATE, TIPS, heart, parts
 from tests.exchange.surfaces.glb import write_parts
 from tests.places import ROOT
 
@@ -38,11 +39,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def case(folder):
-    return import_reference_heart(folder, ReferenceHeartOptions())
+    return import_heart(folder, HeartOptions())[0]
 
 
 def test_the_valve_that_was_thickened_comes_back(folder):
-    case = import_reference_heart(folder, ReferenceHeartOptions(smoothing_mm=0.0))
+    case = import_heart(folder, HeartOptions(smoothing_mm=0.0))[0]
     valve = TEMPLATE.valve(112, 29)
     near = closest_points(
         case.surface.vertices - SHIFT, valve.surface.vertices, valve.surface.triangles
@@ -51,7 +52,7 @@ def test_the_valve_that_was_thickened_comes_back(folder):
     thickness = near.interpolate(valve.surface.thickness, valve.surface.triangles)
     assert np.median(np.abs(case.surface.thickness - thickness)) < 0.1
     tips = case.frames[0].papillary_tips - SHIFT
-    np.testing.assert_allclose(tips, valve.papillary_tips, atol=0.3)
+    np.testing.assert_allclose(tips, TIPS, atol=0.3)
     # The anterior leaflet is the one at y > 0.
     assert case.surface.region_names == ("anterior", "posterior")
     middle = [
@@ -66,7 +67,7 @@ def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_pa
     assert not doubts(case)
     back = read_case(write_case(tmp_path / "case", case))
     np.testing.assert_array_equal(back.surface.vertices, case.surface.vertices)
-    assert back.source == CITATION
+    assert back.source == HEART_CITATION
     assert "shape is all that is real" in back.description
     said = " ".join(back.derived)
     for word in ("papillary tips", "thickness: kept between", "assumed closure", "smoothed"):
@@ -74,55 +75,54 @@ def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_pa
 
 
 def test_chordae_are_shorter_for_edges_that_stay_deeper(folder, case):
-    deeper = import_reference_heart(folder, ReferenceHeartOptions(closed_depth=1.0))
+    deeper = import_heart(folder, HeartOptions(closed_depth=1.0))[0]
     assert deeper.chordae.rest_length.sum() < case.chordae.rest_length.sum() - 10.0
 
 
 def test_what_is_missing_is_asked_for_in_one_line(folder, tmp_path, monkeypatch):
-    monkeypatch.delenv(DATA_VARIABLE, raising=False)
+    monkeypatch.delenv(HEART_VARIABLE, raising=False)
     for place in (None, tmp_path):
         with pytest.raises(InputError, match="not part of this package: take ") as raised:
             heart_files(place)
         assert "\n" not in str(raised.value)
-    monkeypatch.setenv(DATA_VARIABLE, str(folder))
-    assert [file.name for file in heart_files()] == list(PARTS)
+    monkeypatch.setenv(HEART_VARIABLE, str(folder))
+    assert [file.name for file in heart_files()] == list(HEART_PARTS)
 
 
 def test_the_file_as_it_is_distributed_is_the_same_heart(case, tmp_path):
     # In metres, all parts of the heart in one file.
     objects = {"VH_M_aortic_valve": (np.eye(3), np.array([[0, 1, 2]]))}
-    for name, (points, triangles) in zip(OBJECTS, parts(), strict=True):
+    for name, (points, triangles) in zip(HEART_OBJECTS, parts(), strict=True):
         objects[name] = (1e-3 * points, triangles)
     path = write_parts(tmp_path / "heart.glb", objects)
-    found = import_reference_heart(path, ReferenceHeartOptions())
+    found = import_heart(path, HeartOptions())[0]
     # Single precision at half a metre.
     assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=2e-3)
     assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-3)
-    del objects[OBJECTS[2]]
+    del objects[HEART_OBJECTS[2]]
     write_parts(path, objects)
-    with pytest.raises(InputError, match=f"no part is called {OBJECTS[2]}"):
-        import_reference_heart(path, ReferenceHeartOptions())
+    with pytest.raises(InputError, match=f"name or number {HEART_OBJECTS[2]}"):
+        import_heart(path, HeartOptions())
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"smoothing_mm": -1.0}, "smoothing_mm"),
-        ({"min_thickness_mm": 3.0}, "0 < min < max"),
-        ({"max_thickness_mm": 6.0}, "max <= 5"),
-        ({"closed_depth": 1.5}, "closed_depth"),
-    ],
-)
-def test_options_that_are_none_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        ReferenceHeartOptions(**options)
+def test_any_heart_is_a_source_like_others(folder, case):
+    muscles = tuple(str(folder / name) for name in HEART_PARTS[1:])
+    known = LeafletsOptions(units="mm", muscles=muscles, smoothing_mm=4.0)
+    found = import_leaflets(folder / HEART_PARTS[0], known)
+    assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=1e-9)
+    assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-9)
+    assert any("the middle of the last 5 mm of each muscle" in line for line in found.derived)
+    with pytest.raises(InputError, match="as in a mirror"):
+        import_leaflets(folder / HEART_PARTS[0], replace(known, muscles=muscles[::-1]))
 
 
 def test_the_heart_itself_is_a_plausible_valve():
-    place = Path(os.environ.get(DATA_VARIABLE) or ROOT.parent / "shared" / "data" / "hra_mitral")
-    if not (place / PARTS[0]).is_file():
-        pytest.skip(f"needs the reference heart: {CITATION}; name its folder in {DATA_VARIABLE}")
-    case = import_reference_heart(place, ReferenceHeartOptions())
+    place = Path(os.environ.get(HEART_VARIABLE) or ROOT.parent / "shared" / "data" / "hra_mitral")
+    if not (place / HEART_PARTS[0]).is_file():
+        pytest.skip(
+            f"needs the reference heart: {HEART_CITATION}; name its folder in {HEART_VARIABLE}"
+        )
+    case = import_heart(place, HeartOptions())[0]
     assert not doubts(case)
     tips = case.frames[0].papillary_tips
     assert np.linalg.norm(tips[0] - tips[1]) == pytest.approx(24.1, abs=0.5)

@@ -16,10 +16,9 @@ from experiments.common.config import hash_of
 from experiments.common.schema import Reads, build
 from experiments.common.study import load_settings, study_names
 from experiments.run import main
-from experiments.studies.imported import DonorSettings, recorded_valve
+from experiments.studies.imported import HEART_PARTS, DonorSettings, recorded_valve
 from mvest.cases.writer import write_case
 from mvest.exchange.external.contract import write_points
-from mvest.exchange.importing.reference_heart import PARTS
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.documents import read_mapping
@@ -94,9 +93,9 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
             file.write_text("1")
         return str(folder), file
     if name == "heart.source":
-        for part in PARTS:
+        for part in HEART_PARTS:
             (folder / part).write_text("1")
-        return str(folder), folder / PARTS[0]
+        return str(folder), folder / HEART_PARTS[0]
     listed = {"imaged.landmarks": [[2, str(file)]], "external.inputs": [str(file)]}
     listed["external.command"] = [sys.executable, f"--mesh={file}"]
     listed["external.python"] = f"{file}:function"

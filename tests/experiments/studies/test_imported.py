@@ -9,9 +9,13 @@ import pytest
 from experiments.common.records.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
-from experiments.studies.imported import DATA_VARIABLE, DonorSettings, recorded_valve
+from experiments.studies.imported import (
+    DATA_VARIABLE,
+    HEART_VARIABLE,
+    DonorSettings,
+    recorded_valve,
+)
 from mvest.closure.robustness import GateReport, GateRow
-from mvest.exchange.importing import reference_heart
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.valve.mesh.solid_mesh import embed
 from tests.exchange.importing.made_up_heart import heart
@@ -176,7 +180,7 @@ def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
 
 
 def test_without_the_heart_it_says_where_to_get_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv(reference_heart.DATA_VARIABLE, str(tmp_path / "nowhere"))
+    monkeypatch.setenv(HEART_VARIABLE, str(tmp_path / "nowhere"))
     monkeypatch.chdir(tmp_path)
     assert run_heart(monkeypatch, "experiment=reference_heart", "tracking.enabled=false") == 2
     said = capsys.readouterr().err

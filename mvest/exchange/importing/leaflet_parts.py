@@ -1,0 +1,274 @@
+"""Which voxels or closed surfaces of a source are which leaflet."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from mvest.errors import GeometryError, InputError
+from mvest.exchange.regions import RegionSurface, merged, part_of
+from mvest.exchange.surfaces import SurfaceFile
+from mvest.exchange.volumes import LabelMap
+from mvest.reading.text import one_line
+from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.geometry.leaflet_fields import STEP_MM, inside_surfaces
+from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
+
+REGIONS = ("anterior", "posterior")
+TERMS = {"anterior": "sh-leaflet-mv-a", "posterior": "sh-leaflet-mv-p"}
+"""Codes of SlicerHeart's terminology for the leaflets of the mitral valve."""
+SCALLOPS = {"anterior": {"a1", "a2", "a3"}, "posterior": {"p1", "p2", "p3"}}
+"""Carpentier's names of the segments of a leaflet."""
+WORDS = {
+    "anterior": {"anterior", "aml", "amvl"} | SCALLOPS["anterior"],
+    "posterior": {"posterior", "pml", "pmvl"} | SCALLOPS["posterior"],
+}
+OTHERS = {"papillary", "muscle", "commissure", "annulus", "chordae", "tricuspid", "aortic"}
+"""Words in the names of what is no mitral leaflet."""
+VALVE_MM = (10.0, 120.0)
+"""Size of a valve."""
+Content: TypeAlias = SurfaceFile | LabelMap
+Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Spacing, direction and origin of voxels, as `mvest.exchange.volumes.LabelMap` has them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A segment, a label or an object of a source.
+
+    Attributes
+    ----------
+    name, label, tags : str
+        Nameless labels are called by their number.
+    shape : callable
+        Gives its voxels ``(I, J, K)``, or its `SurfaceFile`.
+    """
+
+    name: str
+    label: str
+    tags: str
+    shape: Callable[[], Any]
+
+    @property
+    def words(self) -> set[str]:
+        """The words of its name, in small letters."""
+        return set(re.findall(r"[a-z]+\d*", re.sub(r"([a-z])([A-Z])", r"\1 \2", self.name).lower()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tissue:
+    """The leaflets of one frame: both together, or the anterior and the posterior one.
+
+    Attributes
+    ----------
+    masks : (I, J, K) each
+    grid : Grid
+    surface : ((n, 3) mm, (m, 3)) or None
+        One closed surface of both leaflets; there are no masks then.
+    nameless : tuple of str
+        The two labels of which nothing says which leaflet they are.
+    """
+
+    masks: tuple[BoolArray, ...]
+    grid: Grid
+    surface: tuple[FloatArray, IntArray] | None
+    nameless: tuple[str, ...]
+
+    @property
+    def points(self) -> FloatArray:
+        """``(k, 3)`` mm: vertices of the surface, or centres of the voxels."""
+        if self.surface is not None:
+            return self.surface[0]
+        spacing, direction, origin = self.grid
+        index = np.argwhere(np.any(self.masks, axis=0))
+        return np.asarray(origin + (index * spacing) @ direction.T)
+
+
+def parts_of(content: Content, frame: int | None) -> list[Part]:
+    """The parts of a file.
+
+    Parameters
+    ----------
+    content
+    frame
+        Of a label map over time; None for the first one with labels. In a layered segmentation the
+        only layer that is looked at; None for all.
+
+    Raises
+    ------
+    InputError
+        The frame holds no labels.
+    """
+    if isinstance(content, SurfaceFile):
+        names = sorted(set(content.groups))
+        if len(names) < 2:
+            return [Part("".join(names) or "surface", "", "", lambda: content)]
+        return [Part(name, "", "", partial(part_of, content, name)) for name in names]
+    filled = filled_frames(content)
+    if frame not in (None, *filled):
+        raise InputError(f"frame {frame} holds no labels, expected one of {filled}")
+    at = filled[0] if frame is None else frame
+    values = {
+        k: set(np.unique(content.frames[k]).tolist()) - {0}
+        for k in (filled if content.is_layers and frame is None else [at])
+    }
+    own = [
+        (s.name, s.label, s.layer if content.is_layers else at, s.tags) for s in content.segments
+    ]
+    own = own or [(str(value), value, k, "") for k in values for value in sorted(values[k])]
+    return [
+        Part(name, str(label), tags, partial(np.equal, content.frames[layer], label))
+        for name, label, layer, tags in own
+        if label in values.get(layer, ())
+    ]
+
+
+def filled_frames(labels: LabelMap) -> list[int]:
+    """Numbers of the frames or layers with labels."""
+    filled: list[int] = np.flatnonzero(labels.frames.any(axis=(1, 2, 3))).tolist()
+    return filled
+
+
+def chosen_parts(
+    parts: Sequence[Part], given: Mapping[str, Sequence[str]], derived: list[str]
+) -> tuple[list[list[Part]], tuple[str, ...]]:
+    """The parts of both leaflets together or of each, and the names of two that tell nothing.
+
+    Parameters
+    ----------
+    parts
+    given
+        Names or numbers of the parts of the ``anterior`` and of the ``posterior`` leaflet, or of
+        both (``leaflets``). Else terminology and names tell them.
+    derived
+        Gets a sentence for what is used and what is not.
+
+    Raises
+    ------
+    InputError
+        No such part, or parts that are not recognised.
+    """
+    found = {
+        name: [named(parts, word) for word in given.get(name, ())]
+        for name in ("leaflets", *REGIONS)
+    }
+    if found["leaflets"] or (len(parts) == 1 and not any(given.values())):
+        chosen = [found["leaflets"] or list(parts)]
+    else:
+        for region in REGIONS:
+            tagged = [part for part in parts if TERMS[region] in part.tags]
+            called = [p for p in parts if p.words & WORDS[region] and not p.words & OTHERS]
+            found[region] = found[region] or tagged or called
+        chosen = [found[region] for region in REGIONS]
+        joined = all(
+            given.get(region) or len(own) < 2 or all(part.words & SCALLOPS[region] for part in own)
+            for region, own in zip(REGIONS, chosen, strict=True)
+        )
+        if not any(chosen) and len(parts) == 2:
+            return [[part] for part in parts], tuple(f"label {part.name}" for part in parts)
+        if not all(chosen) or not joined or set(chosen[0]) & set(chosen[1]):
+            raise InputError(
+                f"the leaflets are not recognised among {_listed(parts)}: give anterior=N and "
+                "posterior=N (names, numbers, or lists of them), or leaflets=N if one is both"
+            )
+    used = [part for own in chosen for part in own]
+    if len(parts) > 1:
+        names = ("both leaflets",) if len(chosen) == 1 else ("anterior", "posterior")
+        said = [f"{name}: {_listed(own)}" for name, own in zip(names, chosen, strict=True)]
+        rest = [part for part in parts if part not in used]
+        derived += ["; ".join([*said, *([f"not used: {_listed(rest)}"] if rest else [])])]
+    return chosen, ()
+
+
+def named(parts: Sequence[Part], word: str) -> Part:
+    """The part of a name or number.
+
+    Raises
+    ------
+    InputError
+        There is none, or several.
+    """
+    found = [p for p in parts if p.name == word] or [p for p in parts if p.label == word]
+    if len(found) != 1:
+        raise InputError(
+            f"{len(found)} parts of the name or number {one_line(word, 80)}, expected one of "
+            f"{_listed(parts)}"
+        )
+    return found[0]
+
+
+def _listed(parts: Sequence[Part]) -> str:
+    names = [p.name if p.label in ("", p.name) else f"{p.name} ({p.label})" for p in parts]
+    return one_line(", ".join(names), 300)
+
+
+def tissue_of(
+    contents: Sequence[Content],
+    frame: int | None,
+    given: Mapping[str, Sequence[str]],
+    scale: float,
+    derived: list[str],
+) -> Tissue:
+    """The leaflets of a frame in one file, or in one for each leaflet.
+
+    All but a single closed surface become voxels.
+
+    Parameters
+    ----------
+    contents, frame
+        See `parts_of`.
+    given, derived
+        See `chosen_parts`; of two files all is taken.
+    scale
+        mm per unit of surfaces.
+
+    Raises
+    ------
+    InputError, GeometryError
+        Leaflets that are not recognised, files that do not go together, surfaces in disorder.
+    """
+    chosen = [parts_of(content, frame) for content in contents]
+    nameless: tuple[str, ...] = ()
+    if len(contents) == 1:
+        chosen, nameless = chosen_parts(chosen[0], given, derived)
+    maps = [content for content in contents if isinstance(content, LabelMap)]
+    if maps:
+        grids = [(m.spacing, m.direction, m.origin) for m in maps]
+        alike = [np.allclose(a, b, atol=1e-3) for a, b in zip(grids[0], grids[-1], strict=True)]
+        if (
+            len(maps) < len(contents)
+            or maps[0].frames.shape != maps[-1].frames.shape
+            or not all(alike)
+        ):
+            raise InputError("the files of the leaflets have not the same voxels")
+        masks = [np.asarray(np.any([p.shape() for p in own], axis=0)) for own in chosen]
+        return Tissue(tuple(masks), grids[0], None, nameless)
+    pieces = [[_outwards(part.shape(), scale) for part in own] for own in chosen]
+    whole = [piece for own in pieces for piece in own]
+    size = float(np.ptp(np.concatenate([points for points, _ in whole]), axis=0).max())
+    if not VALVE_MM[0] <= size <= VALVE_MM[1]:
+        raise GeometryError(
+            f"{size:.3g} mm across, expected a valve of {VALVE_MM[0]:g} to {VALVE_MM[1]:g} mm: is "
+            "units= right?"
+        )
+    if len(whole) == 1:
+        return Tissue((), (np.ones(3), np.eye(3), np.zeros(3)), whole[0], ())
+    inside, origin = inside_surfaces(whole, STEP_MM)
+    parted = np.split(np.array(inside), np.cumsum([len(own) for own in pieces])[:-1])
+    masks = [np.asarray(own.any(axis=0)) for own in parted]
+    return Tissue(tuple(masks), (np.full(3, STEP_MM), np.eye(3), origin), None, nameless)
+
+
+def _outwards(part: SurfaceFile, scale: float) -> tuple[FloatArray, IntArray]:
+    """A closed surface in mm with its normals outwards and coincident vertices one."""
+    one = merged(RegionSurface(scale * part.vertices, part.triangles, None, {}))
+    faces = one.triangles
+    if enclosed_volume(one.vertices, faces) < 0:
+        faces = faces[:, ::-1]
+    check_surface(one.vertices, faces, self_intersections=False, name="leaflets")
+    return one.vertices, faces
