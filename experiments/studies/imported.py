@@ -50,7 +50,6 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import Remembered, SharedStart
-from mvest.exchange.abaqus.mesh import SetNames
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.regions import part_of
@@ -67,11 +66,11 @@ from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.anatomy.dimensions import ChordLayout
+from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.measurements import leaflet_length
-from mvest.valve.mesh.remesh import Remeshed, remesh
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 from mvest.valve.mesh.structured import layered_wedges
 
@@ -235,16 +234,16 @@ class Recorded:
     """A recorded valve, ready to be closed; ``coarse`` is its midsurface as meshed and observed."""
 
     recording: Recording
-    coarse: Remeshed
-    contact: Remeshed
+    coarse: Valve
+    contact: Valve
     mesh: SolidMesh
     settings: MechanicsSettings
     seen: FloatArray
 
     def model(self, parameters: tuple[str, ...], **settings: Any) -> ClosureModel:
         """A model of the open valve."""
-        coarse, contact = map(self.recording.valve, (self.coarse, self.contact))
-        return ClosureModel(coarse, contact, self.mesh, self.settings, parameters, **settings)
+        valves = self.coarse, self.contact
+        return ClosureModel(*valves, self.mesh, self.settings, parameters, **settings)
 
     def distances(self, closed: FloatArray) -> dict[str, float]:
         """Distances (mm) of closed positions ``(n, 3)`` from where they were recorded.
@@ -252,7 +251,7 @@ class Recorded:
         The surface's is the mean of the whole surface from the recorded one, both ways.
         """
         d, surface = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface
-        recorded = self.recording.frames[-1], self.recording.surface.triangles
+        recorded = self.recording.frames[-1], self.recording.valve.surface.triangles
         return {
             "mean": float(d.mean()),
             "median": float(np.median(d)),
@@ -273,8 +272,8 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     MvestError
         If the data are absent or a setting is inadmissible.
     """
-    names = SetNames(donor.leaflets, donor.annulus, donor.free_edge)
-    recording = read_recording(recording_folder(donor.recording, donor.case), names)
+    names = donor.leaflets, donor.annulus, donor.free_edge
+    recording = read_recording(recording_folder(donor.recording, donor.case), *names)
     settings = mechanics_of(config)
     protocol = settings.protocol
     if protocol.pressure_mmHg != 0 or protocol.curve:
@@ -284,21 +283,19 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
         )
     # The pressure may rise otherwise than the motion.
     shares, times = recording.pressure_share, recording.times / recording.times[-1] * protocol.ramp
-    together = np.allclose(shares, recording.phase, rtol=0, atol=1e-12)
+    together = np.allclose(shares, recording.valve.motion.phase, rtol=0, atol=1e-12)
     curve = () if together else tuple(zip(times.tolist(), shares.tolist(), strict=True))
     loaded = replace(protocol, pressure_mmHg=mpa_to_mmhg(recording.pressure), curve=curve)
-    unknown = [f"E_f.{name}" for name in recording.surface.region_names]
+    unknown = [f"E_f.{name}" for name in recording.valve.surface.region_names]
     if sorted(unknown) != sorted(config["parameters"]):
         raise ConfigurationError(
             f"parameters = {config['parameters']}, expected one modulus for each leaflet: {unknown}"
         )
-    coarse, contact = (
-        remesh(recording.surface, recording.annulus, recording.free_edge, count)
-        for count in (donor.vertices, donor.contact_vertices)
-    )
+    places, coarse = recording.remeshed(donor.vertices)
+    _, contact = recording.remeshed(donor.contact_vertices)
     layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
-    mesh = layered_wedges(coarse.surface, onto=recording.surface, **layers).solid
-    seen = recording.positions(coarse.triangle, coarse.weights, -1)
+    mesh = layered_wedges(coarse.surface, onto=recording.valve.surface, **layers).solid
+    seen = recording.positions(places.triangle, places.weights, -1)
     return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
 
 
@@ -349,7 +346,7 @@ def _donor(job: Job[Settings]) -> Result:
             rows.append(row)
             records.append(record)
     rest = valve.coarse.surface.vertices
-    tips = valve.recording.papillary_tips
+    tips = valve.recording.valve.motion.papillary_tips
     failed = [one for one in records if not one.converged]
     ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
     return Result(
@@ -400,7 +397,7 @@ def moduli_table(records: list[EstimateRecord]) -> Table:
 
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
     """As those of a case (`mvest.problem.fields`)."""
-    surface, tips = valve.coarse.surface, valve.recording.papillary_tips
+    surface, tips = valve.coarse.surface, valve.recording.valve.motion.papillary_tips
     away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
     return {
         "triangles": surface.triangles,

@@ -87,17 +87,32 @@ def _triangulated(data: Any) -> tuple[IntArray, list[IntArray], IntArray]:
     cutter = vtk_module("vtkFiltersCore").vtkTriangleFilter()
     cutter.PassLinesOff()
     cutter.PassVertsOff()
-    cut = _output(cutter, data)
-    point = _numpy(data.GetPointData().GetArray("number of mvest"))
-    sizes = np.diff(_numpy(cut.GetPolys().GetOffsetsArray()))
-    corners = _numpy(cut.GetPolys().GetConnectivityArray())[np.repeat(sizes == 3, sizes)]
-    rows = _numpy(cut.GetCellData().GetArray("number of mvest"))[sizes == 3]
+    point, cell = (
+        _numpy(of.GetArray("number of mvest")) for of in (data.GetPointData(), data.GetCellData())
+    )
+    first = data.GetNumberOfVerts() + data.GetNumberOfLines()
+    parts: list[tuple[IntArray, IntArray]] = []
+    for kind in ("Polys", "Strips"):  # apart, as VTK 9.7 makes up the cells of triangles if both
+        part, cells = vtk_module("vtkCommonDataModel").vtkPolyData(), getattr(data, f"Get{kind}")()
+        part.SetPoints(data.GetPoints())
+        getattr(part, f"Set{kind}")(cells)
+        last = first + cells.GetNumberOfCells()
+        _add(part.GetCellData(), {"number of mvest": cell[first:last]})
+        first, cut = last, _output(cutter, part)
+        if not cut.GetNumberOfPolys():
+            continue
+        sizes = np.diff(_numpy(cut.GetPolys().GetOffsetsArray()))
+        corners = _numpy(cut.GetPolys().GetConnectivityArray())[np.repeat(sizes == 3, sizes)]
+        rows = _numpy(cut.GetCellData().GetArray("number of mvest"))[sizes == 3]
+        parts.append((point[corners.reshape(-1, 3)], rows))
+    none = np.zeros(0, dtype=np.int64)
+    corners, rows = map(np.concatenate, zip((none.reshape(0, 3), none), *parts, strict=True))
     order = np.argsort(rows, kind="stable")
-    triangles = point[corners.reshape(-1, 3)[order]]
+    triangles = corners[order]
     lines = data.GetLines()
     ends = _numpy(lines.GetOffsetsArray())[1:-1].astype(np.int64)
-    parts = np.split(point[_numpy(lines.GetConnectivityArray())], ends)
-    return triangles, [part for part in parts if len(part)], rows[order]
+    curves = np.split(point[_numpy(lines.GetConnectivityArray())], ends)
+    return triangles, [curve for curve in curves if len(curve)], rows[order]
 
 
 def _output(step: Any, data: Any) -> Any:

@@ -11,7 +11,9 @@ import numpy as np
 from experiments.common.records.record import read_record, write_record
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import read_case, write_error_samples
+from mvest.errors import GeometryError
 from mvest.estimation.prediction import Prediction
+from mvest.exchange.abaqus.recording import read_recording
 from mvest.exchange.external.contract import (
     RunRequest,
     read_answer,
@@ -19,7 +21,8 @@ from mvest.exchange.external.contract import (
     write_answer,
     write_request,
 )
-from mvest.exchange.febio.positions import read_positions
+from mvest.exchange.febio.document import read_positions
+from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.exchange.markups import read_markups
 from mvest.exchange.regions import read_regions
 from mvest.exchange.volumes import read_labels, read_volume
@@ -28,6 +31,7 @@ from mvest.imaging.valve_sequence import MovingValve
 from mvest.imaging.volume import Modality
 from mvest.simulation.population import Population, load_population, save_population
 from tests.cases import folders
+from tests.exchange.surfaces import recorded
 from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
 from tests.experiments.studies.made_up import made_up, made_up_estimate
 from tests.fuzz.trial import Enter, Makers
@@ -74,6 +78,21 @@ def case(folder: Path) -> None:
     folders.save(folder, document)
 
 
+def slicerheart(folder: Path) -> None:
+    """One phase, whose annulus lies along the rim of the surface."""
+    for side in ("anterior", "posterior"):
+        (file,) = of("VTK: header of 3D Slicer, 4.2, text")
+        file(folder).rename(folder / f"A_mitral_frame_1_MD_atrial_{side}_leaflet.vtk")
+    points = [f"A,MD,1,mitral,-{5 * k},0.0,0.25,{'ALC' if k == 2 else ''}" for k in range(9)]
+    head = ",".join(f"AnnulusContour{name}" for name in ("X", "Y", "Z", "Label"))
+    text = "\n".join([f"Filename,Phase,FrameNumber,Valve,{head}", *points])
+    (folder / "AnnulusContourPoints.csv").write_text(f"{text}\n")
+    (folder / "ValveLandmarkPoints.csv").write_text(
+        "Filename,Phase,Valve,FrameNumber,LandmarkLabel,LandmarkR,LandmarkA,LandmarkS\n"
+        "A,MD,mitral,1,A,1.00,2.00,3.00\nA,MD,mitral,1,PMC,-1.50,2.00,3.00\n"
+    )
+
+
 def population(folder: Path) -> None:
     layout = ValveLayout(8, 3)
     x = np.random.default_rng(0).normal(0, 10, (2, layout.size, 3))
@@ -115,6 +134,15 @@ def volume(path: Path) -> object:
     """Times that a format states without a unit are seconds."""
     unit = {"time_unit": "s"} if path.suffix in (".mha", ".mhd") else {}
     return read_volume(path, modality=Modality.ULTRASOUND, **unit)
+
+
+def by_slicerheart(path: Path) -> object:
+    """What is read is no valve; everything before that is found out is tried."""
+    tips = (0.0, 9.0, -20.0, 0.0, -9.0, -20.0)
+    try:
+        return import_slicerheart(path.parent, SlicerheartOptions(tips=tips))
+    except GeometryError as fault:
+        return fault
 
 
 DOORS: dict[str, tuple[Enter, Makers]] = {
@@ -162,6 +190,13 @@ DOORS: dict[str, tuple[Enter, Makers]] = {
     )),
     "markups": (read_markups, of("Markups: 1.0.3, LPS", "Markups: ClosedCurve")),
     "fcsv": (read_markups, of("fcsv: 4.10, 0", "fcsv: 5.0, LPS")),
+    "recording": (lambda path: read_recording(path.parent, **recorded.NAMES), beside(
+        lambda folder: recorded.write(folder, recorded.skirt()),
+        "Skirt/Skirt.inp", "Skirt/Skirt_2.vtu",
+    )),
+    "slicerheart": (by_slicerheart, beside(
+        slicerheart, "AnnulusContourPoints.csv", "ValveLandmarkPoints.csv"
+    )),
     "population": (load_population, beside(population, "valves.npz")),
     "record": (read_record, beside(record, "result.json")),
     "answer": (
