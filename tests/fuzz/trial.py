@@ -70,7 +70,7 @@ def outcome(enter: Enter, path: Path) -> tuple[str, str]:
     except MvestError as error:
         words = str(error)
         short = words.replace(f"{path.parent}{os.sep}", "")
-        named = any(file.name in words for file in path.parent.iterdir())
+        named = words.startswith(f"{path.parent}") or path.name in words
         if of_memory(error):
             return "memory", words
         if not (named and words.isprintable() and len(short) <= MAX_LETTERS):
