@@ -13,7 +13,7 @@ from tests.fuzz.doors import DOORS
 from tests.fuzz.trial import ENDS, FAULTS, Bench
 from tests.places import ROOT
 
-ROUND = 100
+ROUND = 50
 """Inputs of a door before it is the next one's turn."""
 
 
@@ -27,32 +27,28 @@ def main() -> int:
     counts: dict[str, Counter[str]] = {name: Counter() for name in given.door or DOORS}
     with tempfile.TemporaryDirectory() as folder:
         benches = {name: Bench(*DOORS[name], Path(folder) / name) for name in counts}
-        for name, bench in benches.items():
-            if bad := [found for found in bench.whole if found[0] != "read"]:
-                sys.exit(f"{name}: a valid file is not read: {bad[0]}")
         while time.monotonic() < end:
             for name, bench in benches.items():
-                for one in range(seed, seed + ROUND):
-                    if time.monotonic() < end:
-                        _try(name, bench, one, counts[name])
+                counts[name].update(_end(name, bench, one) for one in range(seed, seed + ROUND))
             seed += ROUND
     print(f"seeds {given.seed} to {seed - 1}")
-    print(f"{'door':24}" + "".join(f"{name:>10}" for name in ("inputs", *ENDS)))
+    print(f"{'door':16}" + "".join(f"{name:>10}" for name in ("inputs", *ENDS)))
     for name, count in [*counts.items(), ("all", sum(counts.values(), Counter()))]:
-        print(f"{name:24}{count.total():>10}" + "".join(f"{count[kind]:>10}" for kind in ENDS))
+        print(f"{name:16}{count.total():>10}" + "".join(f"{count[kind]:>10}" for kind in ENDS))
     return int(any(count[kind] for count in counts.values() for kind in FAULTS))
 
 
-def _try(name: str, bench: Bench, seed: int, count: Counter[str]) -> None:
+def _end(name: str, bench: Bench, seed: int) -> str:
+    """How an input ends; what is at fault, or meets the limits of the child, is kept."""
     number, content = bench.damaged(seed)
     kind, words = bench.tried(content, number)
-    count[kind] += 1
-    if kind in (*FAULTS, "stopped"):
+    if kind not in ("read", "refused"):
         suffixes = "".join(bench.paths[number].suffixes)
         place = ROOT / "outputs" / "fuzz" / name / f"{seed}-{number}{suffixes}"
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content)
         print(f"{name} {seed}: {kind}: {words.encode('unicode_escape').decode()[:400]}", flush=True)
+    return kind
 
 
 if __name__ == "__main__":

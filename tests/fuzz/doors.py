@@ -122,12 +122,10 @@ def positions(folder: Path) -> None:
     (folder / "a.csv").write_text("".join(steps))
 
 
-def leaflets(path: Path) -> object:
-    return read_regions(path, {1: "anterior", 2: "posterior"})
-
-
-def one_region(path: Path) -> object:
-    return read_regions(path, {0: "leaflets"})
+def surface(path: Path) -> object:
+    """STL has no place for labels."""
+    labelled = path.suffix != ".stl"
+    return read_regions(path, {1: "anterior", 2: "posterior"} if labelled else {0: "leaflets"})
 
 
 def volume(path: Path) -> object:
@@ -152,46 +150,32 @@ DOORS: dict[str, tuple[Enter, Makers]] = {
         lambda path: read_case(path.parent),
         beside(case, "case.yaml", "chordae.csv", "pressure.csv", "errors.npz", "open.vtp"),
     ),
-    "surface.vtp": (leaflets, of(
+    "surface": (surface, of(
         "VTP: text, plain, UInt32, LittleEndian, Int64",
         "VTP: base64, zlib, UInt64, LittleEndian, Int64",
         "VTP: appended, LZMA, UInt32, BigEndian, Int32",
-    )),
-    "surface.vtu": (leaflets, of(
         "VTU: text, plain, UInt32, LittleEndian, Int64",
-        "VTU: appended, zlib, UInt64, LittleEndian, Int32",
-    )),
-    "surface.vtk": (leaflets, of(
+        "VTU: appended, LZ4, UInt64, LittleEndian, Int32",
         "VTK: 4.2, text, int32, scalars", "VTK: 4.2, binary, uint8, a field",
-        "VTK: 5.1, text, float64, a field", "VTK: 5.1, binary, int64, scalars",
-        "VTK: triangle strips, 4.2, binary",
+        "VTK: 5.1, text, float64, a field", "VTK: triangle strips, 5.1, binary",
+        "STL: VTK text", "STL: VTK binary", "GLB: objects that nodes place",
+        "PLY: labels of points, ascii", "PLY: labels of faces, binary little endian",
+        "OBJ: groups of an object", "OBJ: lines and comments",
     )),
-    "surface.stl": (one_region, of("STL: VTK text", "STL: VTK binary")),
-    "surface.ply": (leaflets, of(
-        "PLY: labels of points, ascii", "PLY: labels of faces, binary little endian"
-    )),
-    "surface.obj": (leaflets, of("OBJ: groups of an object", "OBJ: lines and comments")),
-    "surface.glb": (leaflets, of("GLB: objects that nodes place")),
-    "volume.nrrd": (volume, of(
+    "volume": (volume, of(
         "NRRD by pynrrd: .seq.nrrd, frames first, raw, uint8", "NRRD: milliseconds",
-        "NRRD by pynrrd: .nhdr, frames last, gzip, int16",
-    )),
-    "volume.metaimage": (volume, of(
+        "NRRD by pynrrd: .nhdr, frames last, gzip, int16", "NRRD: slicerio",
         "MetaImage: .mha, 4D, int16, plain", "MetaImage: .mha, 4D, uint8, compressed",
-        "MetaImage: .mhd, 4D, uint8, compressed",
-    )),
-    "volume.nifti": (volume, of(
-        "NIfTI: NIfTI-1, int16, .nii", "NIfTI: NIfTI-1, uint8, .nii.gz",
-        "NIfTI: NIfTI-2, float32, .nii",
-    )),
-    "volume.philips": (volume, of(
-        "Philips Cartesian DICOM: explicit, preamble", "Philips Cartesian DICOM: implicit, bare"
+        "MetaImage: .mhd, 4D, uint8, compressed", "NIfTI: NIfTI-1, int16, .nii",
+        "NIfTI: NIfTI-1, uint8, .nii.gz", "NIfTI: NIfTI-2, float32, .nii",
+        "Philips Cartesian DICOM: explicit, preamble", "Philips Cartesian DICOM: implicit, bare",
     )),
     "labels": (read_labels, of(
         "Slicer segmentation: one layer", "NRRD labels: int16", "NIfTI labels: uint8",
     )),
-    "markups": (read_markups, of("Markups: 1.0.3, LPS", "Markups: ClosedCurve")),
-    "fcsv": (read_markups, of("fcsv: 4.10, 0", "fcsv: 5.0, LPS")),
+    "points": (read_markups, of(
+        "Markups: 1.0.3, LPS", "Markups: ClosedCurve", "fcsv: 4.10, 0", "fcsv: 5.0, LPS"
+    )),
     "recording": (lambda path: read_recording(path.parent, **recorded.NAMES), beside(
         lambda folder: recorded.write(folder, recorded.skirt()),
         "Skirt/Skirt.inp", "Skirt/Skirt_2.vtu",
@@ -205,8 +189,6 @@ DOORS: dict[str, tuple[Enter, Makers]] = {
         lambda path: read_answer(path.parent, REQUEST),
         beside(answer, "response.json", "observation.csv", "jacobian.csv"),
     ),
-    "request": (
-        read_request, beside(lambda folder: write_request(folder, REQUEST), "request.json")
-    ),
+    "request": (read_request, beside(partial(write_request, request=REQUEST), "request.json")),
     "febio": (lambda path: read_positions(path, 3), beside(positions, "a.csv")),
 }  # fmt: skip
