@@ -12,8 +12,6 @@ import zipfile
 import zlib
 from collections.abc import Callable
 
-__all__ = ["changed"]
-
 MAX_BYTES = 10**6
 """Of a damaged file."""
 HEAD = 2048

@@ -14,8 +14,6 @@ from typing import NoReturn
 from mvest.errors import MvestError
 from tests.fuzz.mutation import changed
 
-__all__ = ["ENDS", "FAULTS", "Bench", "Enter", "Makers"]
-
 MAX_SECONDS, MAX_BYTES, MAX_LETTERS = 5, 2**30, 300
 """Of computing in this process; of memory beside what it has; of a message, its folder aside."""
 FAULTS = ("outside", "message", "memory", "slow")
