@@ -23,8 +23,9 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-FLAT_CELLS = range(10)
-"""VTK's numbers of vertices, lines, triangles, strips, polygons and quadrilaterals."""
+LINES, STRIPS, POLYGONS = (3, 4), (6,), (5, 7, 9)
+FLAT = (1, 2, *LINES, *STRIPS, *POLYGONS)
+"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves."""
 
 
 def read_cells(path: Path, suffix: str) -> dict[str, Any]:
@@ -36,89 +37,83 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
         A damaged file, no points, or cells that name points that do not exist.
     """
     data, groups = _READERS[suffix](path)
-    n, cells = data.GetNumberOfPoints(), data.GetNumberOfCells()
-    if not n:
+    if not data.GetNumberOfPoints():
         raise InputError("damaged or empty: no points, expected a surface")
-    flat = data.IsA("vtkPolyData")
-    kinds = ("Verts", "Lines", "Polys", "Strips") if flat else ("Cells",)
-    for part in [getattr(data, f"Get{kind}")() for kind in kinds]:
-        corners = _numpy(part.GetConnectivityArray())
-        if not part.IsValid() or (len(corners) and not 0 <= corners.min() <= corners.max() < n):
-            raise GeometryError("cells name points that do not exist")
-    point_data, cell_data = _arrays(data.GetPointData()), _arrays(data.GetCellData())
-    for kind, rows, arrays in (("points", n, point_data), ("cells", cells, cell_data)):
+    points = _numpy(data.GetPoints().GetData()).astype(np.float64)
+    types, sizes, corners = _cells(data, len(points))
+    triangles, rows = _triangles(points, types, sizes, corners)
+    at_points, at_cells = _arrays(data.GetPointData()), _arrays(data.GetCellData())
+    for what, count, arrays in (
+        ("points", len(points), at_points),
+        ("cells", len(types), at_cells),
+    ):
         for name, values in arrays.items():
-            if len(values) != rows:
-                raise InputError(f"data {name!r} has {len(values)} rows, expected {rows} {kind}")
-    field_data = _arrays(data.GetFieldData())
+            if len(values) != count:
+                raise InputError(f"data {name!r} has {len(values)} rows, expected {count} {what}")
+    line = np.isin(types, LINES)
+    line_ends = np.cumsum(sizes[line])[:-1]
+    numbers, counts = np.unique(types[~np.isin(types, FLAT)], return_counts=True)
     name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
-    types = np.zeros(0, dtype=np.int64)
-    if cells and not flat:
-        types = np.bincount(_numpy(data.GetCellTypesArray()))
-    others = {
-        name_of(number).removeprefix("vtk").lower(): int(count)
-        for number, count in enumerate(types)
-        if count and number not in FLAT_CELLS
-    }
-    none = np.zeros(0, dtype=np.int64)
-    triangles, lines, rows = (none.reshape(0, 3), [], none) if others else _triangulated(data)
+    names = [name_of(number).removeprefix("vtk").lower() for number in numbers.tolist()]
+    field_data = _arrays(data.GetFieldData())
     with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
         words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
     return {
-        "points": _numpy(data.GetPoints().GetData()).astype(np.float64),
+        "points": points,
         "triangles": triangles,
-        "lines": lines,
-        "others": others,
-        "point_data": point_data,
-        "cell_data": {name: values[rows] for name, values in cell_data.items()},
+        "lines": np.split(corners[np.repeat(line, sizes)], line_ends) if line.any() else [],
+        "others": dict(zip(names, counts.tolist(), strict=True)),
+        "point_data": at_points,
+        "cell_data": {name: values[rows] for name, values in at_cells.items()},
         "field_data": field_data,
         "space": words[1].decode() if words else field_data.get("SPACE"),
         "groups": [groups[row] for row in rows.tolist()] if groups else [],
     }
 
 
-def _triangulated(data: Any) -> tuple[IntArray, list[IntArray], IntArray]:
-    """Triangles ``(m, 3)`` of polygons and strips, lines, and each triangle's cell ``(m,)``."""
-    _add(data.GetPointData(), {"number of mvest": np.arange(data.GetNumberOfPoints())})
-    _add(data.GetCellData(), {"number of mvest": np.arange(data.GetNumberOfCells())})
-    if not data.IsA("vtkPolyData"):
-        # Leaves out points without cells, and may number the others anew.
-        data = _output(vtk_module("vtkFiltersGeometry").vtkGeometryFilter(), data)
-    cutter = vtk_module("vtkFiltersCore").vtkTriangleFilter()
-    cutter.PassLinesOff()
-    cutter.PassVertsOff()
-    point, cell = (
-        _numpy(of.GetArray("number of mvest")) for of in (data.GetPointData(), data.GetCellData())
-    )
-    first = data.GetNumberOfVerts() + data.GetNumberOfLines()
-    parts: list[tuple[IntArray, IntArray]] = []
-    for kind in ("Polys", "Strips"):  # apart, as VTK 9.7 makes up the cells of triangles if both
-        part, cells = vtk_module("vtkCommonDataModel").vtkPolyData(), getattr(data, f"Get{kind}")()
-        part.SetPoints(data.GetPoints())
-        getattr(part, f"Set{kind}")(cells)
-        last = first + cells.GetNumberOfCells()
-        _add(part.GetCellData(), {"number of mvest": cell[first:last]})
-        first, cut = last, _output(cutter, part)
-        if not cut.GetNumberOfPolys():
-            continue
-        sizes = np.diff(_numpy(cut.GetPolys().GetOffsetsArray()))
-        corners = _numpy(cut.GetPolys().GetConnectivityArray())[np.repeat(sizes == 3, sizes)]
-        rows = _numpy(cut.GetCellData().GetArray("number of mvest"))[sizes == 3]
-        parts.append((point[corners.reshape(-1, 3)], rows))
-    none = np.zeros(0, dtype=np.int64)
-    corners, rows = map(np.concatenate, zip((none.reshape(0, 3), none), *parts, strict=True))
+def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Types and sizes ``(c,)`` of all cells, and their corners one after another."""
+    if data.IsA("vtkPolyData"):
+        parts = [data.GetVerts(), data.GetLines(), data.GetPolys(), data.GetStrips()]
+        types = np.repeat([2, 4, 7, 6], [part.GetNumberOfCells() for part in parts])
+    else:
+        parts = [data.GetCells()]
+        types = np.zeros(0) if not data.GetNumberOfCells() else _numpy(data.GetCellTypesArray())
+    ends = [_numpy(part.GetOffsetsArray()) for part in parts]
+    corners = np.concatenate([_numpy(part.GetConnectivityArray()) for part in parts])
+    whole = all(part.IsValid() for part in parts)
+    if not whole or (len(corners) and not 0 <= corners.min() <= corners.max() < count):
+        raise GeometryError("cells name points that do not exist")
+    sizes = np.concatenate([np.diff(part) for part in ends])
+    return types.astype(np.int64), sizes.astype(np.int64), corners.astype(np.int64)
+
+
+def _triangles(
+    points: FloatArray, types: IntArray, sizes: IntArray, corners: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Triangles ``(m, 3)`` of polygons and strips, and the number ``(m,)`` of each one's cell.
+
+    VTK cuts polygons, not strips: vtkTriangleFilter 9.7 mistakes the cells of these.
+    """
+    polygon = np.isin(types, POLYGONS) & (sizes > 2)
+    flat, rows = corners[np.repeat(polygon, sizes)], np.flatnonzero(polygon)
+    if (sizes[polygon] != 3).any():
+        cutter = vtk_module("vtkFiltersCore").vtkTriangleFilter()
+        cutter.SetInputData(polydata(points, flat, sizes[polygon], cell_data={"row": rows}))
+        cutter.Update()
+        flat = _numpy(cutter.GetOutput().GetPolys().GetConnectivityArray())
+        rows = _numpy(cutter.GetOutput().GetCellData().GetArray("row"))
+    parts, cells = [flat.reshape(-1, 3)], [rows]
+    ends = np.cumsum(sizes)
+    for cell in np.flatnonzero(np.isin(types, STRIPS)):
+        strip = corners[ends[cell] - sizes[cell] : ends[cell]]
+        part = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
+        part[1::2] = part[1::2][:, [1, 0, 2]]  # every second one faces the other way
+        parts.append(part)
+        cells.append(np.full(len(part), cell))
+    rows = np.concatenate(cells)
     order = np.argsort(rows, kind="stable")
-    triangles = corners[order]
-    lines = data.GetLines()
-    ends = _numpy(lines.GetOffsetsArray())[1:-1].astype(np.int64)
-    curves = np.split(point[_numpy(lines.GetConnectivityArray())], ends)
-    return triangles, [curve for curve in curves if len(curve)], rows[order]
-
-
-def _output(step: Any, data: Any) -> Any:
-    step.SetInputData(data)
-    step.Update()
-    return step.GetOutput()
+    return np.concatenate(parts)[order].astype(np.int64), rows[order]
 
 
 def vtk_module(name: str) -> Any:

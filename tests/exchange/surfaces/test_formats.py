@@ -137,21 +137,22 @@ def test_strips_polygons_and_what_lies_beside_them(tmp_path, sphere):
     path = written(vtkIOXML.vtkXMLPolyDataWriter(), tmp_path / "a.vtp", strips)
     read = read_surface(path)
     np.testing.assert_allclose(read.vertices[read.triangles], corners(strips))
-    # A line, a vertex, a concave polygon and a quadrilateral.
+    # A vertex, a line, a concave polygon, a rectangle, a triangle, and a strip.
     (tmp_path / "b.vtk").write_text(
         "# vtk DataFile Version 4.2\nmade up\nASCII\nDATASET POLYDATA\nPOINTS 6 float\n"
         "0 0 0 2 0 0 2 2 0 1 0.5 0 3 0 0 3 2 0\nVERTICES 1 2\n1 0\nLINES 1 4\n3 0 1 4\n"
-        "POLYGONS 2 10\n4 0 1 2 3\n4 1 4 5 2\nCELL_DATA 4\nSCALARS region int 1\n"
-        "LOOKUP_TABLE default\n8 9 0 1\n"
+        "POLYGONS 3 14\n4 0 1 2 3\n4 1 4 5 2\n3 0 1 2\nTRIANGLE_STRIPS 1 5\n4 1 4 2 5\n"
+        "CELL_DATA 6\nSCALARS region int 1\nLOOKUP_TABLE default\n8 9 0 1 2 3\n"
     )
     mesh = read_mesh(tmp_path / "b.vtk")
     assert [line.tolist() for line in mesh.lines] == [[0, 1, 4]]
-    assert mesh.cell_data["region"].tolist() == [0, 0, 1, 1]
+    region = mesh.cell_data["region"]
+    assert region.tolist() == [0, 0, 1, 1, 2, 3, 3]
     sides = np.diff(mesh.points[mesh.triangles], axis=1)
     areas = np.cross(sides[:, 0], sides[:, 1])[:, 2] / 2
     assert areas.min() > 0
-    # A triangle of area 2 without a notch of 0.5, and a rectangle of 2.
-    assert areas.sum() == pytest.approx((2.0 - 0.5) + 2.0)
+    # A triangle of area 2 without a notch of 0.5; a rectangle; that triangle; the strip.
+    assert np.bincount(region, areas) == pytest.approx([1.5, 2.0, 2.0, 2.0])
 
 
 def test_cells_other_than_triangles_are_named(tmp_path):
