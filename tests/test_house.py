@@ -43,6 +43,9 @@ FILES = (
     "mvest.exchange.surfaces",
     "mvest.exchange.regions",
     "mvest.exchange.volumes",
+    "mvest.exchange._images",
+    "mvest.exchange._nrrd",
+    "mvest.exchange._plausible",
     "mvest.exchange.segmentations",
     "mvest.exchange.markups",
 )

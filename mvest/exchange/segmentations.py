@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
-from mvest.exchange._images import MODALITY_KEY
+from mvest.exchange._nrrd import MODALITY_KEY
 from mvest.files import write_atomically
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray, IntArray

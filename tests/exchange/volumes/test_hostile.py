@@ -152,4 +152,4 @@ def bomb(name: str, path: Path) -> None:
 def test_a_bomb_costs_no_more_than_the_limit(tmp_path: Path, name: str) -> None:
     """The limit is 1 GiB beside three times what the header declares."""
     bomb(name, tmp_path / name)
-    assert "more than 1.0" in attempt(tmp_path / name)[1]
+    assert "needs more than 1 GiB" in attempt(tmp_path / name)[1]

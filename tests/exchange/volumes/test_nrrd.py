@@ -336,7 +336,7 @@ def test_a_frame_that_shows_nothing_is_refused(tmp_path: Path, value: float) -> 
         voxels[2, :10] = 1.0
     fields = v.nrrd_fields() | {"type": "float"}
     path = v.write_nrrd(tmp_path / "a.nrrd", fields, voxels.tobytes(order="F"))
-    with pytest.raises(InputError, match=r"a\.nrrd: data: .* frame 2 are (0|no numbers), expected"):
+    with pytest.raises(InputError, match=r"a\.nrrd: data: .* frame 2 (are 0|that are no)"):
         read(path)
 
 
@@ -352,11 +352,11 @@ def test_what_the_file_states_is_not_contradicted(tmp_path: Path) -> None:
     fields = v.nrrd_fields() | {"mvest.modality=": "ct"}
     path = v.write_nrrd(tmp_path / "a.nrrd", fields)
     assert read_volume(path).modality is Modality.CT
-    with pytest.raises(InputError, match=r"modality: mr, but .*a\.nrrd states ct"):
+    with pytest.raises(InputError, match=r"a\.nrrd: modality: mr, expected ct"):
         read_volume(path, modality=Modality.MR)
-    with pytest.raises(InputError, match=r"frame_interval_s: .*a\.nrrd states its own times"):
+    with pytest.raises(InputError, match=r"a\.nrrd: frame_interval_s: 0\.03, expected none"):
         read_volume(path, frame_interval_s=0.03)
-    with pytest.raises(InputError, match=r"time_unit: 'ms', but .*a\.nrrd states 's'"):
+    with pytest.raises(InputError, match=r"a\.nrrd: time_unit: 'ms', expected 's'"):
         read_volume(path, time_unit="ms")
 
 
