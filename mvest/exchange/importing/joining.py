@@ -12,22 +12,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.cases.chord_layout import LeafletBand
 from mvest.cases.rims import loop_vector_area, two_loops, without_ears
 from mvest.errors import GeometryError
-from mvest.exchange.importing.parts import Leaflet, loop_length
-from mvest.exchange.regions import RegionSurface
+from mvest.exchange.regions import RegionSurface, merged
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.moving_distance import closest_on_loop
+from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.geometry.triangles import areas
+from mvest.valve.geometry.triangles import areas, surface_edges
 
 COINCIDENT = 1e-6
 """mm, below which vertices of both leaflets are one."""
 REGIONS = ("anterior", "posterior")
+MAX_HOLE = 0.2
+"""Of a leaflet's boundary: how long that of a hole may be, which is closed."""
 MAX_GAP = 6.0
 """mm between the leaflets at a commissure, and from a commissure to the leaflets."""
 MAX_MISS = 8.0
@@ -44,6 +48,103 @@ RIM_ROUNDS = 2
 """Of smoothing an edge: over one of its triangles' edges."""
 MAX_SEAM = 0.25
 """Of a free edge, from commissure to commissure: how far it may run beside the other one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaflet:
+    """One leaflet as a disc.
+
+    Attributes
+    ----------
+    vertices, triangles
+        ``(n, 3)`` mm and ``(m, 3)``.
+    loop
+        ``(k,)`` its boundary, in the direction of its triangles.
+    holes : int
+        How many were closed.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    loop: IntArray
+    holes: int
+
+    @classmethod
+    def of(cls, vertices: FloatArray, triangles: IntArray) -> Leaflet:
+        """The largest piece of a surface, with coincident vertices made one and holes closed.
+
+        Raises
+        ------
+        GeometryError
+            It is closed, no manifold, or has a hole that is a second boundary.
+        """
+        nothing = np.zeros(len(triangles), dtype=np.int64)
+        whole = merged(RegionSurface(vertices, triangles, nothing, {}))
+        points, faces = whole.vertices, whole.triangles
+        apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        faces = _largest_piece(points, faces[apart & (areas(points, faces) > 0)])
+        loops = sorted(boundary_loops(faces), key=lambda loop: -loop_length(points[loop]))
+        if not loops:
+            raise GeometryError(
+                "a closed surface, expected one side of a leaflet: an open surface that ends at "
+                "the annulus and at the free edge"
+            )
+        outer, *holes = loops
+        for hole in holes:
+            around = [loop_length(points[loop]) for loop in (outer, hole)]
+            if around[1] > MAX_HOLE * around[0]:
+                raise GeometryError(
+                    f"boundaries of {around[0]:.0f} and {around[1]:.0f} mm, expected one: a "
+                    "leaflet that ends at the annulus and at the free edge"
+                )
+            middle = np.full(len(hole), len(points))
+            faces = np.vstack([faces, np.column_stack([np.roll(hole, -1), hole, middle])])
+            points = np.vstack([points, points[hole].mean(axis=0)])
+        used, inverse = np.unique(faces, return_inverse=True)
+        loop = np.searchsorted(used, outer)
+        return cls(points[used], inverse.reshape(-1, 3), loop, len(holes))
+
+    @property
+    def curve(self) -> FloatArray:
+        """``(k, 3)`` mm, the boundary."""
+        return self.vertices[self.loop]
+
+    def turned(self) -> Leaflet:
+        """The same with its triangles facing the other way."""
+        return Leaflet(self.vertices, self.triangles[:, ::-1], self.loop[::-1], self.holes)
+
+    def arcs(self, first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
+        """The loop from the vertex nearest to a point to that nearest to another, and the rest.
+
+        Both arcs have both ends.
+        """
+        curve = self.curve
+        start, stop = (
+            int(np.argmin(np.linalg.norm(curve - point, axis=1))) for point in (first, second)
+        )
+        if start == stop:
+            raise GeometryError(
+                "both commissures are at the same vertex of a leaflet; are they those of this "
+                "valve, in the same axes?"
+            )
+        turned = np.roll(self.loop, -start)
+        cut = (stop - start) % len(turned)
+        return turned[: cut + 1], np.append(turned[cut:], turned[0])
+
+
+def loop_length(curve: FloatArray) -> float:
+    """Length (mm) of a closed curve ``(k, 3)``."""
+    return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())
+
+
+def _largest_piece(vertices: FloatArray, triangles: IntArray) -> IntArray:
+    edges = surface_edges(triangles)
+    n = len(vertices)
+    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    of_triangle = label[triangles[:, 0]]
+    area = np.bincount(of_triangle, weights=areas(vertices, triangles))
+    return triangles[of_triangle == np.argmax(area)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

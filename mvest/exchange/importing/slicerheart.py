@@ -13,18 +13,26 @@ import yaml
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
+from mvest.cases.chord_layout import FAMILIES
 from mvest.cases.folder import read_case
 from mvest.cases.rims import two_loops
 from mvest.cases.schema import CASE_FILE
-from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.tissue import CHORD_COLUMNS, GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
-from mvest.exchange.importing.joining import REGIONS, Joining, commissures_on, joined
-from mvest.exchange.importing.parts import Leaflet, write_chords
+from mvest.exchange.importing.joining import (
+    REGIONS,
+    Joining,
+    Leaflet,
+    commissures_on,
+    joined,
+)
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.markups import TO_LPS
 from mvest.exchange.regions import RegionSurface
 from mvest.exchange.surfaces import write_surface
+from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.dimensions import ChordLayout
 
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
 """Phases in the order in which they are preferred."""
@@ -36,6 +44,10 @@ CORRELATED_MM = 10.0
 """Along the leaflets over which errors of a segmentation are alike."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
+MARGINAL_MM = 4.0
+"""From the free edge, within which a chord inserts as marginal ones do."""
+MAX_AWAY = 3.0
+"""mm from where a chord begins to its papillary tip."""
 
 
 _Seen: TypeAlias = tuple[SeenPhase, Role]
@@ -352,11 +364,34 @@ def _document(
 
 
 def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, Any]:
+    """Write the table of chordae, if there are any; returns its entry in ``case.yaml``.
+
+    Raises
+    ------
+    InputError
+        Chords begin elsewhere than at the tips.
+    """
     seen, surface = reference.seen, reference.surface
     if not len(seen.chords):
         return {}
     loops = [surface.vertices[k] for k in two_loops(surface.vertices, surface.triangles)]
     edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
-    entry, said = write_chords(folder, (seen.chords, seen.chord_lengths), reference.tips, edge)
-    derived.append(said)
-    return entry
+    away = np.linalg.norm(seen.chords[:, 0, None] - reference.tips, axis=2)
+    if away.min(axis=1).max() > MAX_AWAY:
+        raise InputError("chords begin elsewhere than at the papillary tips; leave out tips=...")
+    layout, insertion = ChordLayout(), seen.chords[:, 1]
+    family = np.where(cKDTree(edge).query(insertion)[0] > MARGINAL_MM, 1, 0)
+    # As stiff together as the template's, of which there may be fewer.
+    marginal = len(layout.marginal_phi) * layout.marginal_stiffness
+    basal = len(layout.basal) * layout.basal_stiffness
+    count = np.bincount(family, minlength=2)
+    each = 2 * np.array([marginal, basal]) / np.maximum(count, 1)
+    names = np.array(FAMILIES)[family]
+    columns = (away.argmin(axis=1), *insertion.T, names, seen.chord_lengths, each[family])
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    write_columns(folder / "chordae.csv", CHORD_COLUMNS, rows)
+    derived.append(
+        f"chordae: {len(family)} of the export, as long as there; the {count[0]} within "
+        f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
+    )
+    return {"chordae": {"file": "chordae.csv", "families": list(FAMILIES)}}

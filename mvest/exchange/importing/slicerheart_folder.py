@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.importing.parts import chord_lines
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, Mesh, read_mesh
 from mvest.reading.text import numbers, one_line, read_columns
@@ -83,6 +82,12 @@ class _File:
         self.words = words_of(found.get("rest", stem))
         named = [name for name, words in LEAFLETS.items() if words & self.words]
         self.leaflet = "" if len(named) != 1 or self.words & NO_LEAFLET else named[0]
+
+    def fits(self, other: _File) -> bool:
+        """Whether it is of the scene, the frame and the phase of a surface, as far as it says."""
+        pairs = ((self.scene, other.scene), (self.frame, other.frame))
+        named = self.valve.lower() in ("", "mitral") and self.phase in ("", other.phase)
+        return named and all(a == b or not a or not b for a, b in pairs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,22 +180,17 @@ def _read_phase(
         notes.append(f"frame {this.frame} taken of frames {', '.join(frames)} of this phase")
     mine = [f for f in mine if f.frame == this.frame]
     surfaces = tuple(_leaflet(folder, mine, name, notes) for name in LEAFLETS)
-    beside = [f for f in models if f.phase == this.phase and not f.leaflet]
-    landmarks: dict[str, FloatArray] = {}
-    curves = []
-    for name in _TABLES:
-        labels, points = _table(name, (this.path.parent, folder, folder.parent), this)
-        curves += [points] if name.startswith("Annulus") else []
-        landmarks |= zip(labels, points, strict=True)
-    curves += [_middle_of_tube(f, notes) for f in beside if f.words & ANNULUS]
+    beside = [f for f in models if f.phase == this.phase and f.fits(this) and not f.leaflet]
+    places = (this.path.parent, folder, folder.parent)
+    labels, contour = _table("AnnulusContourPoints.csv", places, this)
+    named, points = _table("ValveLandmarkPoints.csv", places, this)
+    landmarks = dict(zip((*labels, *named), (*contour, *points), strict=True))
+    curves = [contour]
+    if len(contour) < MIN_CONTOUR:
+        curves += [_middle_of_tube(f, notes) for f in beside if f.words & ANNULUS]
     tips: dict[int, FloatArray] = {}
     # Those of this phase last, so that they stand before those that name no phase.
-    for file in sorted(lists, key=lambda f: bool(f.phase)):
-        if any(
-            getattr(file, key) not in ("", getattr(this, key))
-            for key in ("scene", "valve", "frame", "phase")
-        ):
-            continue
+    for file in sorted((f for f in lists if f.fits(this)), key=lambda f: bool(f.phase)):
         for name, item in read_markups(file.path).items():
             words = file.words | words_of(name)
             found = _tips_in(file.path, words, item) if words & PAPILLARY else {}
@@ -204,7 +204,8 @@ def _read_phase(
                 landmarks |= zip(item.labels, item.points, strict=True)
                 used = True
             if not used and item.labels:
-                notes.append(f"{item.kind} of the points {', '.join(item.labels)} not used")
+                listed = ", ".join(item.labels)
+                notes.append(f"{item.kind} of {len(item.labels)} points ({listed}) not used")
             if item.unplaced:
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
     known = {label.strip().upper(): point for label, point in landmarks.items()}
@@ -301,15 +302,33 @@ def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArr
 
 
 def _chords(files: Sequence[_File], notes: list[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chords ``(c, 2, 3)``, their lengths ``(c,)`` and their tips of models of lines."""
-    segments = []
+    """Chords of models of lines, each from where it begins to where it ends.
+
+    A branch begins where its trunk ends. Returns chords from tip to insertion ``(c, 2, 3)``, their
+    lengths along trunk and branch ``(c,)``, and the tips ``(t, 3)``, mm.
+    """
+    found = [np.zeros((0, 2, 3))]
     for file in files:
         model = _model(file, notes)
         if any(len(line) != 2 for line in model.lines):
             raise InputError(f"{file.path}: lines of other than two points, expected one a chord")
-        ends = np.array(model.lines, dtype=np.int64).reshape(-1, 2)
-        segments.append(model.points[ends])
-    return chord_lines(np.concatenate(segments) if segments else np.zeros((0, 2, 3)))
+        found.append(model.points[np.array(model.lines, dtype=np.int64).reshape(-1, 2)])
+    segments = np.concatenate(found)
+    joints, number = np.unique(np.round(segments.reshape(-1, 3), 3), axis=0, return_inverse=True)
+    begin, end = number.reshape(-1, 2).T
+    length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    trunk = {int(e): k for k, e in enumerate(end)}
+    last = np.flatnonzero(~np.isin(end, begin))
+    first, total = [], []
+    for k in last.tolist():
+        way, root = {k: None}, k
+        while (before := trunk.get(int(begin[root]))) is not None and before not in way:
+            root = before
+            way[root] = None
+        first.append(root)
+        total.append(length[list(way)].sum())
+    chords = np.stack([segments[first, 0], segments[last, 1]], axis=1)
+    return chords, np.array(total), joints[np.unique(begin[first])]
 
 
 def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:

@@ -132,8 +132,14 @@ def test_one_phase_is_an_anatomy(folder):
     assert [frame.role for frame in alone.frames] == [Role.REFERENCE]
 
 
-def test_the_annulus_alone_tells_the_commissures(folder, case):
+@pytest.mark.parametrize("as_model", [False, True])
+def test_the_annulus_alone_tells_the_commissures(folder, case, tmp_path, as_model):
     (folder / "ValveLandmarkPoints.csv").unlink()
+    if as_model:
+        (folder / "AnnulusContourPoints.csv").unlink()
+        for role, stem in ((Role.REFERENCE, "frame_3_MD"), (Role.CLOSED, "frame_12_MS")):
+            fem = fem_export(tmp_path / stem, TRUTH.frame(role), TRUTH.chordae)
+            (fem / "AnnulusContourModel.vtk").rename(folder / f"P001_mitral_{stem}_annulus.vtk")
     found = import_slicerheart(folder, OPTIONS)
     assert "commissures where the leaflet nearer to the annulus changes" in " | ".join(
         found.derived
@@ -206,7 +212,7 @@ def test_points_that_are_not_used_are_said(folder, case):
         table.write("P001,MS,mitral,12,apex,1,2,3\n")
     found = import_slicerheart(folder, OPTIONS)
     assert np.array_equal(found.surface.vertices, case.surface.vertices)
-    assert "MD: Fiducial of the points chord 1 not used" in found.derived
+    assert "MD: Fiducial of 1 points (chord 1) not used" in found.derived
     assert "MS: points chord 1 not placed, so not used" in found.derived
     assert "MS: landmarks APEX not used" in found.derived
 
