@@ -139,27 +139,22 @@ def truss_stiffness(
     """
     if not 0 < strain < MAX_STRAIN:
         raise InputError(f"linearisation strain {strain}, expected between 0 and {MAX_STRAIN}")
-    if np.isnan(area):
-        raise InputError(f"trusses of {one_line(material, 40)} have no cross section")
-    kind = next((name for name in ("ELASTIC", "HYPERELASTIC") if name in law), "")
-    if not kind or (kind == "HYPERELASTIC" and "OGDEN" not in law[kind]["options"]):
-        what = law[kind]["at"] if kind else "no elastic material"
-        raise InputError(f"trusses: {what}, expected *ELASTIC or *HYPERELASTIC, OGDEN")
-    at, options, values = (law[kind][name] for name in ("at", "options", "values"))
-    if kind == "ELASTIC":
-        isotropic = options.get("TYPE", "ISOTROPIC").upper() in ("ISO", "ISOTROPIC")
-        if not isotropic or not len(values) or not values[0] > 0:
-            raise InputError(f"{at}: expected isotropic, with a modulus > 0")
-        return float(area * values[0])
-    terms = options.get("N", "1")
-    count = int(terms) if terms in "123456" and len(terms) == 1 else 0
-    if not count or len(values) < 2 * count or not all(values[1 : 2 * count : 2]):
-        raise InputError(f"{at}: N = {one_line(terms, 20)}, expected 1 to 6 pairs mu, alpha")
-    stretch = 1 + strain
-    stress = sum(
-        2 * mu / alpha * (stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1))
-        for mu, alpha in values[: 2 * count].reshape(-1, 2)
-    )
-    if not 0 < stress < float("inf"):
-        raise InputError(f"{at}: nominal stress {stress:g} at {strain:g}, expected > 0")
+    linear, ogden = law.get("ELASTIC"), law.get("HYPERELASTIC", {"options": {}})
+    what, stress = f"trusses of {one_line(material, 40)}", np.nan
+    if linear is not None and linear["options"].get("TYPE", "ISO").upper()[:3] == "ISO":
+        stress = linear["values"][0] * strain if len(linear["values"]) else np.nan
+    elif "OGDEN" in ogden["options"]:
+        count = 2 * int(ogden["options"].get("N", "1"))
+        if len(ogden["values"]) < count:
+            raise InputError(f"{what}: N = {count // 2}, expected so many pairs mu, alpha")
+        mu, alpha = ogden["values"][:count].reshape(-1, 2).T
+        stretch = 1 + strain
+        with np.errstate(all="ignore"):
+            terms = stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1)
+            stress = sum(2 * mu / alpha * terms)
+    if not 0 < area * stress < float("inf"):
+        raise InputError(
+            f"{what}: {area:g} mm2 and {stress:g} MPa at a strain of {strain:g}, expected a cross "
+            "section and isotropic *ELASTIC or *HYPERELASTIC, OGDEN with a stress > 0"
+        )
     return float(area * (stress / strain))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,10 @@ from mvest.problem.registration import REGISTRATION
 from mvest.reading.documents import read_mapping
 from mvest.valve.mesh.given import GivenValve
 
-GENERIC = {"anterior": (6.23, 6.23 / 2.35), "posterior": (2.09, 2.09 / 1.89)}
+GENERIC = {
+    "E_f": {"anterior": 6.23, "posterior": 2.09},
+    "ratio": {"anterior": 6.23 / 2.35, "posterior": 2.09 / 1.89},
+}
 """E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
 CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
 """Points at which the valve is sampled for patches of chordae and the annulus."""
@@ -114,50 +118,39 @@ def model_of_case(
         raise InputError(
             f"{', '.join(unlike)}: the file has no law for such tissue; export a run without it"
         )
-    fixed = {name: value for name, value in values.items() if "." not in name or _is_valve(name)}
-    settings = {}
-    for k, name in enumerate(names):
-        own = tissue.get(name)
-        generic = GENERIC.get(name, (None, None))
-        modulus = values.get(f"E_f.{name}", generic[0])
-        fixed[f"E_f.{name}"] = _of_region("E_f", options.E_f, k, names, modulus)
-        usual = generic[1] if own is None else own.ratio
-        ratio = _of_region("ratio", options.ratio, k, names, usual)
-        nu, reading = (options.nu, options.reading) if own is None else (own.nu, own.reading)
-        settings[name] = TissueSettings(ratio, nu, reading)
+    # What has another part is an error of a frame's pressure.
+    kinds = ("E_f", "G", "ratio", "chord_stiffness", "chord_rest_length")
+    fixed = {name: values[name] for name in values if name.partition(".")[0] in kinds
+             or "." not in name}  # fmt: skip
+    estimated = {
+        "E_f": {name.removeprefix("E_f."): fixed[name] for name in fixed},
+        "ratio": {name: own.ratio for name, own in tissue.items()},
+    }
+    chosen: dict[str, dict[str, float]] = {}
+    for what, given in (("E_f", options.E_f), ("ratio", options.ratio)):
+        if given is not None and len(given) != len(names):
+            raise InputError(
+                f"{what}: {len(given)} values, expected one of each of {', '.join(names)}"
+            )
+        stated = {} if given is None else dict(zip(names, given, strict=True))
+        chosen[what] = GENERIC[what] | estimated[what] | stated
+        if missing := [name for name in names if name not in chosen[what]]:
+            raise InputError(f"no {what} of leaflet {missing[0]!r}; give {what}=[...]")
+    fixed |= {f"E_f.{name}": chosen["E_f"][name] for name in names}
+    usual = TissueSettings(1.0, options.nu, options.reading)
+    settings = {
+        name: replace(tissue.get(name, usual), ratio=chosen["ratio"][name]) for name in names
+    }
     pressure = options.pressure_mmHg
     if pressure is None:
         if case.closed is None:
             raise InputError(f"case {case.name}: no closed frame; give pressure_mmHg=...")
         pressure = case.closed.pressure_mmHg
-    given = GivenValve(case.valve)
+    valve = GivenValve(case.valve)
     if options.mesh == "structured":
-        mesh = given.layers("hex18", options.columns, options.rows)
+        mesh = valve.layers("hex18", options.columns, options.rows)
     else:
-        mesh = given.tetrahedra(options.edge_length, "tet10", None)
-    contact = given.valve(CONTACT_COLUMNS, CONTACT_ROWS)
+        mesh = valve.tetrahedra(options.edge_length, "tet10", None)
+    contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
     return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)
-
-
-def _is_valve(name: str) -> bool:
-    """Whether a parameter with a part is one of the closure, not an error of a frame's pressure."""
-    return name.partition(".")[0] in ("E_f", "G", "ratio", "chord_stiffness", "chord_rest_length")
-
-
-def _of_region(
-    name: str,
-    given: tuple[float, ...] | None,
-    k: int,
-    regions: tuple[str, ...],
-    default: float | None,
-) -> float:
-    if given is not None:
-        if len(given) != len(regions):
-            raise InputError(
-                f"{name}: {len(given)} values, expected one of each of {', '.join(regions)}"
-            )
-        return given[k]
-    if default is None:
-        raise InputError(f"no {name} of leaflet {regions[k]!r}; give {name}=[...]")
-    return default

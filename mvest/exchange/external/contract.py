@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mvest.errors import ConfigurationError, InputError
+from mvest.errors import ConfigurationError, InputError, message_of
 from mvest.estimation.prediction import Prediction
 from mvest.processes import ending, run
 from mvest.provenance import write_json
@@ -93,7 +93,7 @@ class Command:
     Raises
     ------
     ConfigurationError
-        If there is no such program, or an argument, a variable or the limit is inadmissible.
+        If there is no such program, or the limit is inadmissible.
     """
 
     arguments: tuple[str, ...]
@@ -103,12 +103,6 @@ class Command:
     def __post_init__(self) -> None:
         if not self.arguments or not self.arguments[0]:
             raise ConfigurationError("command is empty, expected a program and its arguments")
-        for text in (*self.arguments, *self.environment, *self.environment.values()):
-            if "\0" in text:
-                raise ConfigurationError(f"command: {text!r} holds a NUL character")
-        wrong = [name for name in self.environment if not name or "=" in name]
-        if wrong:
-            raise ConfigurationError(f"environment: {wrong[0]!r} is no name of a variable")
         if not self.time_limit_s > 0:
             raise ConfigurationError(f"time_limit_s = {self.time_limit_s}, expected > 0")
         program = self._filled(self.arguments[0], Path())
@@ -139,8 +133,8 @@ class Command:
                 )
         except subprocess.TimeoutExpired:
             reason = f"stopped at the time limit of {self.time_limit_s:g} s"
-        except OSError as error:
-            return f"the program could not be started: {error.strerror or error}"
+        except (OSError, ValueError) as error:  # the latter of arguments with a NUL
+            return f"the program could not be started: {message_of(error)}"
         else:
             if not ended.returncode:
                 return ""

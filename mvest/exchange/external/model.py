@@ -92,11 +92,9 @@ class Differences:
         """Derivatives ``(n, p)`` from predictions ``(n,)`` at `neighbours`, in their order."""
         points, values = self.neighbours(m), np.array(predicted)
         p = m.size
-        if self.scheme == "central":
-            # What the parameters really differ by, rounding included.
-            change = np.diagonal(points[:p] - points[p:])
-            return np.asarray(((values[:p] - values[p:]).T) / change)
-        return np.asarray((values - y).T / np.diagonal(points - m))
+        lower, at = (values[p:], points[p:]) if self.scheme == "central" else (y, m)
+        # What the parameters really differ by, rounding included.
+        return np.asarray((values[:p] - lower).T / np.diagonal(points[:p] - at))
 
 
 @dataclass(slots=True, eq=False)

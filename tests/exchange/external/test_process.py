@@ -95,8 +95,6 @@ def test_the_end_of_a_crashed_program_is_told_with_its_last_words(tmp_path):
         ({"arguments": ()}, "command is empty"),
         ({"arguments": ("no-such-program-here",)}, "not found"),
         ({"arguments": ("./solve.sh",)}, "{here}/./solve.sh"),
-        ({"arguments": (sys.executable, "a\0b")}, "NUL"),
-        ({"environment": {"A=B": "1"}}, "no name of a variable"),
         ({"time_limit_s": 0.0}, "time_limit_s"),
         ({"time_limit_s": float("nan")}, "time_limit_s"),
     ],
@@ -114,3 +112,9 @@ def test_a_program_that_is_lost_meanwhile_is_a_reason(tmp_path):
     assert command.run(tmp_path) == ""
     program.unlink()
     assert "could not be started" in command.run(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", [{"arguments": ("a\0b",)}, {"environment": {"A=B": "1"}}])
+def test_what_no_program_can_be_given_is_a_reason(tmp_path, wrong):
+    arguments = (sys.executable, *wrong.pop("arguments", ()))
+    assert "could not be started" in Command(arguments, **wrong).run(tmp_path)

@@ -154,13 +154,12 @@ def test_linear_chordae(tmp_path, recording):
     ("law", "message"),
     [
         ("*Hyperelastic, NEO HOOKE\n1, 2", "expected .*OGDEN"),
-        ("*Hyperelastic, OGDEN, N=3\n1, 2", "N = 3, expected 1 to 6 pairs"),
-        ("*Hyperelastic, OGDEN, N=9\n1, 2", "N = 9, expected 1 to 6 pairs"),
-        ("*Hyperelastic, OGDEN\n1, 0, 0", "expected 1 to 6 pairs"),
-        ("*Hyperelastic, OGDEN\n-1, 2, 0", "expected > 0"),
-        ("*Elastic, TYPE=LAMINA\n1, 2", "expected isotropic"),
-        ("*Elastic\n-1, .3", "with a modulus > 0"),
-        ("*Plastic\n1, .3", "no elastic material"),
+        ("*Hyperelastic, OGDEN, N=3\n1, 2", "N = 3, expected so many pairs"),
+        ("*Hyperelastic, OGDEN\n1, 0, 0", "expected .* a stress > 0"),
+        ("*Hyperelastic, OGDEN\n-1, 2, 0", "-.* MPa at a strain of 0.01"),
+        ("*Elastic, TYPE=LAMINA\n1, 2", "expected .* isotropic"),
+        ("*Elastic\n-1, .3", "-0.01 MPa at a strain of 0.01"),
+        ("*Plastic\n1, .3", "nan MPa"),
     ],
 )
 def test_materials_that_are_no_chordae(tmp_path, law, message):
