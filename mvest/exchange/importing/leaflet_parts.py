@@ -13,7 +13,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.regions import RegionSurface, merged, part_of
 from mvest.exchange.surfaces import SurfaceFile
-from mvest.exchange.volumes import LabelMap
+from mvest.exchange.volumes import LabelMap, Segment
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import STEP_MM, inside_surfaces
@@ -22,12 +22,13 @@ from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 REGIONS = ("anterior", "posterior")
 TERMS = {"anterior": "sh-leaflet-mv-a", "posterior": "sh-leaflet-mv-p"}
 """Codes of SlicerHeart's terminology for the leaflets of the mitral valve."""
-SCALLOPS = {"anterior": {"a1", "a2", "a3"}, "posterior": {"p1", "p2", "p3"}}
-"""Carpentier's names of the segments of a leaflet."""
+SCALLOPS = {"a1", "a2", "a3", "p1", "p2", "p3"}
+"""Carpentier's names of the segments of the leaflets."""
 WORDS = {
-    "anterior": {"anterior", "aml", "amvl"} | SCALLOPS["anterior"],
-    "posterior": {"posterior", "pml", "pmvl"} | SCALLOPS["posterior"],
+    "anterior": {"anterior", "aml", "amvl", "a1", "a2", "a3"},
+    "posterior": {"posterior", "pml", "pmvl", "p1", "p2", "p3"},
 }
+"""In the names of leaflets."""
 OTHERS = {"papillary", "muscle", "commissure", "annulus", "chordae", "tricuspid", "aortic"}
 """Words in the names of what is no mitral leaflet."""
 VALVE_MM = (10.0, 120.0)
@@ -35,29 +36,6 @@ VALVE_MM = (10.0, 120.0)
 Content: TypeAlias = SurfaceFile | LabelMap
 Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Spacing, direction and origin of voxels, as `mvest.exchange.volumes.LabelMap` has them."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """A segment, a label or an object of a source.
-
-    Attributes
-    ----------
-    name, label, tags : str
-        Nameless labels are called by their number.
-    shape : callable
-        Gives its voxels ``(I, J, K)``, or its `SurfaceFile`.
-    """
-
-    name: str
-    label: str
-    tags: str
-    shape: Callable[[], Any]
-
-    @property
-    def words(self) -> set[str]:
-        """The words of its name, in small letters."""
-        return set(re.findall(r"[a-z]+\d*", re.sub(r"([a-z])([A-Z])", r"\1 \2", self.name).lower()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,122 +67,10 @@ class Tissue:
         return np.asarray(origin + (index * spacing) @ direction.T)
 
 
-def parts_of(content: Content, frame: int | None) -> list[Part]:
-    """The parts of a file.
-
-    Parameters
-    ----------
-    content
-    frame
-        Of a label map over time; None for the first one with labels. In a layered segmentation the
-        only layer that is looked at; None for all.
-
-    Raises
-    ------
-    InputError
-        The frame holds no labels.
-    """
-    if isinstance(content, SurfaceFile):
-        names = sorted(set(content.groups))
-        if len(names) < 2:
-            return [Part("".join(names) or "surface", "", "", lambda: content)]
-        return [Part(name, "", "", partial(part_of, content, name)) for name in names]
-    filled = filled_frames(content)
-    if frame not in (None, *filled):
-        raise InputError(f"frame {frame} holds no labels, expected one of {filled}")
-    at = filled[0] if frame is None else frame
-    values = {
-        k: set(np.unique(content.frames[k]).tolist()) - {0}
-        for k in (filled if content.is_layers and frame is None else [at])
-    }
-    own = [
-        (s.name, s.label, s.layer if content.is_layers else at, s.tags) for s in content.segments
-    ]
-    own = own or [(str(value), value, k, "") for k in values for value in sorted(values[k])]
-    return [
-        Part(name, str(label), tags, partial(np.equal, content.frames[layer], label))
-        for name, label, layer, tags in own
-        if label in values.get(layer, ())
-    ]
-
-
 def filled_frames(labels: LabelMap) -> list[int]:
     """Numbers of the frames or layers with labels."""
     filled: list[int] = np.flatnonzero(labels.frames.any(axis=(1, 2, 3))).tolist()
     return filled
-
-
-def chosen_parts(
-    parts: Sequence[Part], given: Mapping[str, Sequence[str]], derived: list[str]
-) -> tuple[list[list[Part]], tuple[str, ...]]:
-    """The parts of both leaflets together or of each, and the names of two that tell nothing.
-
-    Parameters
-    ----------
-    parts
-    given
-        Names or numbers of the parts of the ``anterior`` and of the ``posterior`` leaflet, or of
-        both (``leaflets``). Else terminology and names tell them.
-    derived
-        Gets a sentence for what is used and what is not.
-
-    Raises
-    ------
-    InputError
-        No such part, or parts that are not recognised.
-    """
-    found = {
-        name: [named(parts, word) for word in given.get(name, ())]
-        for name in ("leaflets", *REGIONS)
-    }
-    if found["leaflets"] or (len(parts) == 1 and not any(given.values())):
-        chosen = [found["leaflets"] or list(parts)]
-    else:
-        for region in REGIONS:
-            tagged = [part for part in parts if TERMS[region] in part.tags]
-            called = [p for p in parts if p.words & WORDS[region] and not p.words & OTHERS]
-            found[region] = found[region] or tagged or called
-        chosen = [found[region] for region in REGIONS]
-        joined = all(
-            given.get(region) or len(own) < 2 or all(part.words & SCALLOPS[region] for part in own)
-            for region, own in zip(REGIONS, chosen, strict=True)
-        )
-        if not any(chosen) and len(parts) == 2:
-            return [[part] for part in parts], tuple(f"label {part.name}" for part in parts)
-        if not all(chosen) or not joined or set(chosen[0]) & set(chosen[1]):
-            raise InputError(
-                f"the leaflets are not recognised among {_listed(parts)}: give anterior=N and "
-                "posterior=N (names, numbers, or lists of them), or leaflets=N if one is both"
-            )
-    used = [part for own in chosen for part in own]
-    if len(parts) > 1:
-        names = ("both leaflets",) if len(chosen) == 1 else ("anterior", "posterior")
-        said = [f"{name}: {_listed(own)}" for name, own in zip(names, chosen, strict=True)]
-        rest = [part for part in parts if part not in used]
-        derived += ["; ".join([*said, *([f"not used: {_listed(rest)}"] if rest else [])])]
-    return chosen, ()
-
-
-def named(parts: Sequence[Part], word: str) -> Part:
-    """The part of a name or number.
-
-    Raises
-    ------
-    InputError
-        There is none, or several.
-    """
-    found = [p for p in parts if p.name == word] or [p for p in parts if p.label == word]
-    if len(found) != 1:
-        raise InputError(
-            f"{len(found)} parts of the name or number {one_line(word, 80)}, expected one of "
-            f"{_listed(parts)}"
-        )
-    return found[0]
-
-
-def _listed(parts: Sequence[Part]) -> str:
-    names = [p.name if p.label in ("", p.name) else f"{p.name} ({p.label})" for p in parts]
-    return one_line(", ".join(names), 300)
 
 
 def tissue_of(
@@ -214,38 +80,41 @@ def tissue_of(
     scale: float,
     derived: list[str],
 ) -> Tissue:
-    """The leaflets of a frame in one file, or in one for each leaflet.
-
-    All but a single closed surface become voxels.
+    """The leaflets of a frame; all but a single closed surface become voxels.
 
     Parameters
     ----------
-    contents, frame
-        See `parts_of`.
-    given, derived
-        See `chosen_parts`; of two files all is taken.
+    contents
+        Of one file, or of those of the anterior and of the posterior leaflet.
+    frame
+        Of a label map over time; None for the first one with labels. Of a layered segmentation the
+        only layer that is looked at; None for all.
+    given
+        Names or numbers of the parts of one file that are the ``anterior`` and the ``posterior``
+        leaflet, or both (``leaflets``). Else terminology and names tell them.
     scale
         mm per unit of surfaces.
+    derived
+        Gets a sentence for what is used and what is not.
 
     Raises
     ------
     InputError, GeometryError
         Leaflets that are not recognised, files that do not go together, surfaces in disorder.
     """
-    chosen = [parts_of(content, frame) for content in contents]
+    chosen = [_parts(content, frame) for content in contents]
     nameless: tuple[str, ...] = ()
     if len(contents) == 1:
-        chosen, nameless = chosen_parts(chosen[0], given, derived)
+        chosen, nameless = _chosen(chosen[0], given, derived)
+    else:
+        derived.append("each leaflet from a file of its own")
     maps = [content for content in contents if isinstance(content, LabelMap)]
     if maps:
         grids = [(m.spacing, m.direction, m.origin) for m in maps]
         alike = [np.allclose(a, b, atol=1e-3) for a, b in zip(grids[0], grids[-1], strict=True)]
-        if (
-            len(maps) < len(contents)
-            or maps[0].frames.shape != maps[-1].frames.shape
-            or not all(alike)
-        ):
-            raise InputError("the files of the leaflets have not the same voxels")
+        alike += [len(maps) == len(contents), maps[0].frames.shape == maps[-1].frames.shape]
+        if not all(alike):
+            raise InputError("the two files have not the same voxels")
         masks = [np.asarray(np.any([p.shape() for p in own], axis=0)) for own in chosen]
         return Tissue(tuple(masks), grids[0], None, nameless)
     pieces = [[_outwards(part.shape(), scale) for part in own] for own in chosen]
@@ -262,6 +131,91 @@ def tissue_of(
     parted = np.split(np.array(inside), np.cumsum([len(own) for own in pieces])[:-1])
     masks = [np.asarray(own.any(axis=0)) for own in parted]
     return Tissue(tuple(masks), (np.full(3, STEP_MM), np.eye(3), origin), None, nameless)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """A segment, a label or an object, and what gives its voxels or its surface.
+
+    Nameless labels are called by their number.
+    """
+
+    name: str
+    label: str
+    tags: str
+    shape: Callable[[], Any]
+
+    @property
+    def words(self) -> set[str]:
+        """The words of its name, in small letters."""
+        return set(re.findall(r"[a-z]+\d*", re.sub(r"([a-z])([A-Z])", r"\1 \2", self.name).lower()))
+
+
+def _parts(content: Content, frame: int | None) -> list[_Part]:
+    """The parts of a file that hold anything."""
+    if isinstance(content, SurfaceFile):
+        names = sorted(set(content.groups))
+        if len(names) < 2:
+            return [_Part("".join(names) or "surface", "", "", lambda: content)]
+        return [_Part(name, "", "", partial(part_of, content, name)) for name in names]
+    filled = filled_frames(content)
+    if frame not in (None, *filled):
+        raise InputError(f"frame {frame} holds no labels, expected one of {filled}")
+    at = filled[0] if frame is None else frame
+    values = np.unique(content.frames[at]).tolist()
+    parts = []
+    for one in content.segments or [Segment(str(v), "", v, at) for v in values if v]:
+        layer = one.layer if content.is_layers else at
+        mask = partial(np.equal, content.frames[layer], one.label)
+        if frame in (None, layer) and mask().any():
+            parts.append(_Part(one.name, str(one.label), one.tags, mask))
+    return parts
+
+
+def _chosen(
+    parts: Sequence[_Part], given: Mapping[str, Sequence[str]], derived: list[str]
+) -> tuple[list[list[_Part]], tuple[str, ...]]:
+    """The parts of both leaflets together or of each, and the names of two that tell nothing."""
+    both, *chosen = (
+        [_called(parts, word) for word in given.get(name, ())] for name in ("leaflets", *REGIONS)
+    )
+    for region, own in zip(REGIONS, chosen, strict=True):
+        if not own:
+            own += [part for part in parts if TERMS[region] in part.tags]
+        if not own:
+            own += [p for p in parts if p.words & WORDS[region] and not p.words & OTHERS]
+        if len(own) > 1 and not given.get(region) and not all(p.words & SCALLOPS for p in own):
+            raise InputError(f"{_listed(own)}: which is the {region} leaflet? give {region}=NAME")
+    if both or (len(parts) == 1 and not any(chosen)):
+        chosen = [both or list(parts)]
+    elif len(parts) == 2 and not any(chosen):
+        return [[part] for part in parts], tuple(f"label {part.name}" for part in parts)
+    elif not all(chosen) or set(chosen[0]) & set(chosen[1]):
+        raise InputError(
+            f"the leaflets are not recognised among {_listed(parts)}: give anterior=N and "
+            "posterior=N (names, numbers, or lists of them), or leaflets=N if one is both"
+        )
+    rest = [part for part in parts if not any(part in own for own in chosen)]
+    if len(parts) > 1:
+        names = REGIONS if len(chosen) == 2 else ("both leaflets",)
+        said = [f"{name}: {_listed(own)}" for name, own in zip(names, chosen, strict=True)]
+        derived.append("; ".join(said + [f"not used: {_listed(rest)}"] * bool(rest)))
+    return chosen, ()
+
+
+def _called(parts: Sequence[_Part], word: str) -> _Part:
+    found = [p for p in parts if p.name == word] or [p for p in parts if p.label == word]
+    if len(found) != 1:
+        raise InputError(
+            f"{len(found)} parts of the name or number {one_line(word, 80)}, expected one of "
+            f"{_listed(parts)}"
+        )
+    return found[0]
+
+
+def _listed(parts: Sequence[_Part]) -> str:
+    names = [p.name if p.label in ("", p.name) else f"{p.name} ({p.label})" for p in parts]
+    return one_line(", ".join(names), 300)
 
 
 def _outwards(part: SurfaceFile, scale: float) -> tuple[FloatArray, IntArray]:

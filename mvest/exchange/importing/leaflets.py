@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.checks import LARGEST_THICKNESS
-from mvest.cases.folder import read_case
 from mvest.cases.frames import MM_PER
-from mvest.cases.schema import CASE_FILE
 from mvest.errors import GeometryError, InputError, MvestError
 from mvest.exchange.importing.leaflet_parts import (
     REGIONS,
@@ -26,24 +22,24 @@ from mvest.exchange.importing.leaflet_parts import (
     filled_frames,
     tissue_of,
 )
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface, write_surface
+from mvest.exchange.importing.written import FoundFrame, case_of_frames
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
-from mvest.quantities import EdgeLength, Length
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.papillary import HEAD_MM, TALLER, check_tips_of, papillary_tip
-from mvest.valve.geometry.segmented import BEND_MM, masks_midsurface, segmentation_std
-from mvest.valve.geometry.surface_checks import check_surface
-from mvest.valve.geometry.thickening import thicken
+from mvest.valve.geometry.segmented import (
+    BEND_MM,
+    masks_midsurface,
+    segmentation_std,
+    without_crossings,
+)
 
 OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
 """Standard deviation of where a person or a network draws a leaflet's wall, and over which length
 along the leaflets such errors are alike; those which a case has without any statement."""
 CLOSED_AT = 0.35
 """s after the open frame, in a generic cardiac cycle."""
-REPAIRS_MM = (0.0, 1.0, 2.0, 4.0)
-"""Further smoothing that is tried where leaflets pass through themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +59,7 @@ class LeafletsOptions:
     units : str or None
         Of lengths in surfaces and of the points given here: mm, cm or m. Maps are in mm.
     tips, tips_closed : tuple of float or None
-        Papillary tips, antero-lateral and postero-medial: six numbers, LPS; ``tips_closed`` where
-        they are others in the closed frame.
+        Papillary tips, antero-lateral and postero-medial: six numbers, LPS.
     muscles : list of two names or files
         Papillary muscles in the same order, from whose shape the tips follow.
     commissures, anterior_point : tuple of float or None
@@ -73,16 +68,15 @@ class LeafletsOptions:
     pressure_mmHg : float or None
         Transmitral pressure on the closed valve.
     thickness_mm, thickness_range_mm : tuple of float or None
-        Of the anterior and of the posterior leaflet, instead of that between the walls; the
-        smallest and the largest one that is kept.
+        Thickness of the anterior and of the posterior leaflet instead of that between the walls;
+        the smallest and the largest one that is kept.
     seam_mm : tuple of float or None
         How far down from the annulus the leaflets are one piece at the two commissures, where the
         open frame does not show it.
     edge_mm : float
         Of the triangles of the case.
     blur_voxels, smoothing_mm : float
-        Standard deviation of the smoothing of the voxels' distances, and of that of the midsurface
-        round the valve.
+        Standard deviations of the smoothing of voxels, and of the midsurface round the valve.
     observer_mm : float
         Standard deviation of where the walls were drawn; 0 for a voxelised model.
     mirrored : bool
@@ -104,10 +98,10 @@ class LeafletsOptions:
     thickness_mm: tuple[float, ...] | None = None
     thickness_range_mm: tuple[float, ...] | None = None
     seam_mm: tuple[float, ...] | None = None
-    edge_mm: EdgeLength = 1.2
-    blur_voxels: Length = 0.5
-    smoothing_mm: Length = 0.0
-    observer_mm: Length = OBSERVER_MM
+    edge_mm: float = 1.2
+    blur_voxels: float = 0.5
+    smoothing_mm: float = 0.0
+    observer_mm: float = OBSERVER_MM
     mirrored: bool = False
 
     def __post_init__(self) -> None:
@@ -119,6 +113,10 @@ class LeafletsOptions:
                 len(given) != count or (name != "muscles" and not np.isfinite(given).all())
             ):
                 raise InputError(f"{name}={list(given)}, expected {count} of them")
+        limits = {"edge_mm": (0.3, 5), "blur_voxels": (0, 2), "smoothing_mm": (0, 10)}
+        for name, (low, high) in (limits | {"observer_mm": (0, 5)}).items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name}={getattr(self, name)}, expected {low} to {high}")
 
     def words(self, name: str) -> tuple[str, ...]:
         """Names, numbers or files of an option that is one or a list of them."""
@@ -135,6 +133,11 @@ class Seen:
     files: tuple[Path, ...]
     contents: tuple[Content, ...]
     frame: int | None
+
+    @property
+    def name(self) -> str:
+        """What the frame is called."""
+        return "open" if self.role is Role.REFERENCE else "closed"
 
 
 def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
@@ -155,15 +158,14 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
         recognised, with holes, in pieces, open, that meet nowhere, or without an orifice.
     """
     derived: list[str] = []
-    frames: list[tuple[Role, Midsurface, FloatArray]] = []
+    frames: list[FoundFrame] = []
     with _named(source):
-        seen = _frames(source, options, derived)
+        seen = _seen(source, options, derived)
         scale = _scale(seen[0].contents[0], options)
-    point, commissures = (
-        None if at is None else scale * np.array(at).reshape(-1, 3)
+    anterior, commissures = (
+        None if at is None else scale * np.squeeze(np.reshape(at, (-1, 3)))
         for at in (options.anterior_point, options.commissures)
     )
-    anterior = None if point is None else point[0]
     known: dict[str, Any] = {"commissures": commissures, "edge_mm": options.edge_mm}
     seams: Any = options.seam_mm
     exchanged, voxel = False, 0.0
@@ -171,27 +173,50 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
         with _named(*one.files):
             given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
             tissue = tissue_of(one.contents, one.frame, given, scale, derived)
-            known |= {"tips": _tips(one, tissue, frames, options, scale, derived)}
-            known |= {"anterior": anterior}
+            stated = options.tips_closed if frames else options.tips
+            if stated is not None:
+                tips = scale * np.reshape(stated, (2, 3))
+            else:
+                tips = frames[0].tips if frames else _tips(one, tissue, options, scale, derived)
+            known |= {"tips": tips, "anterior": anterior}
             if tissue.surface is None:
                 voxel = float(np.prod(tissue.grid[0]) ** (1 / 3))
-                blur = options.blur_voxels
-                surface, seams = masks_midsurface(
-                    tissue.masks, tissue.grid, seams=seams, blur=blur, **known
-                )
+                how = {"blur": options.blur_voxels, "seams": seams}
+                surface, seams = masks_midsurface(tissue.masks, tissue.grid, **how, **known)
             else:
                 surface = midsurface(*tissue.surface, **known)
             derived += [line for line in surface.derived if line not in derived]
             if not frames and (tissue.nameless or (anterior is None and len(tissue.masks) < 2)):
                 exchanged = _posterior_first(surface, tissue.nameless, derived)
-            surface = surface.exchanged() if exchanged else surface
-            check_tips_of(surface, known["tips"], handedness=not options.mirrored)
-            surface = _sound(_thick(surface, options, derived), one.role, options, derived)
+            surface = surface.exchanged() if exchanged and tissue.nameless else surface
+            check_tips_of(surface, tips, handedness=not options.mirrored)
+            surface = _thick(surface, options, derived)
+            surface, done = without_crossings(
+                surface, options.smoothing_mm, thickened=one.role is Role.REFERENCE
+            )
+            derived += [f"{one.name} frame: {done}"] * bool(done)
             anterior = surface.vertices[surface.annulus[len(surface.annulus) // 4]]
-            frames.append((one.role, surface, known["tips"]))
+            load = (CLOSED_AT, options.pressure_mmHg or 0.0) if frames else (0.0, 0.0)
+            frames.append(FoundFrame(one.name, one.role, *load, surface, tips, surface.thickness))
+    if len(frames) > 1:
+        derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
+        if options.tips_closed is None:
+            derived.append("papillary tips of the closed frame: where they are in the open one")
+    std = segmentation_std(voxel, options.blur_voxels * voxel, options.observer_mm)
+    correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
+    derived.append(
+        f"observation: {std:.3g} mm by voxels, smoothing and observer_mm={options.observer_mm:g}, "
+        f"alike over {correlated:g} mm"
+    )
+    document = {
+        "name": "segmented valve",  # names of files may be those of patients
+        "regions": list(REGIONS),
+        "thickness": {"point_data": "thickness"},
+        "observation": {"std_mm": std, "correlation_length_mm": correlated},
+        "derived": derived,
+    }
     with _named(source):
-        std = segmentation_std(voxel, options.blur_voxels * voxel, options.observer_mm)
-        return _case(frames, std, options, derived)
+        return case_of_frames(frames, document)
 
 
 @contextmanager
@@ -226,70 +251,63 @@ def _scale(content: Content, options: LeafletsOptions) -> float:
     return MM_PER[options.units or "mm"]
 
 
-def _frames(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Seen]:
+def _seen(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Seen]:
     """The open frame, and the closed one if there is one."""
     anterior, posterior, closed = map(options.words, (*REGIONS, "closed"))
-    if len(posterior) == 1 and Path(posterior[0]).is_file():
+    if len(posterior) == 1 and Path(*posterior).is_file():
         files: tuple[Path, ...] = (Path(*anterior) if anterior else source, Path(*posterior))
     else:
         files = (source,) if anterior or posterior or options.leaflets else _paired(source)
     if closed and options.pressure_mmHg is None:
         raise InputError("no pressure of the closed frame; give pressure_mmHg=...")
     opened = Seen(Role.REFERENCE, files, _read(files), options.open)
-    content = opened.contents[0]
-    number = int(closed[0]) if len(closed) == 1 and closed[0].isdecimal() else None
-    if isinstance(content, LabelMap) and content.is_layers and number is not None:
-        opened = replace(opened, frame=opened.frame or 0)
-    if isinstance(content, LabelMap) and len(content.frames) > 1 and not content.is_layers:
-        filled = filled_frames(content)
-        if opened.frame is None and not closed and len(filled) == 2:
+    content, number = opened.contents[0], None
+    if isinstance(content, LabelMap):
+        number = int(*closed) if len(closed) == 1 and closed[0].isdecimal() else None
+        filled = [0] if content.is_layers else filled_frames(content)
+        if options.open is None and not closed and len(filled) == 2:
             number = filled[1]
             if options.pressure_mmHg is None:
                 raise InputError(
                     f"frames {filled} hold labels: give pressure_mmHg=... of the second, the "
                     f"closed one, or open={filled[0]} for the open one alone"
                 )
-        opened = replace(opened, frame=filled[0] if opened.frame is None else opened.frame)
-        derived.append(
-            f"of the frames with labels, {filled}, {opened.frame} is taken as the open one"
-            + ("" if number is None else f" and {number} as the closed one")
-        )
+        if options.open is None and (number is not None or not content.is_layers):
+            opened = replace(opened, frame=filled[0])
+        if len(content.frames) > 1 and not content.is_layers:
+            derived.append(
+                f"of the frames with labels, {filled}, {opened.frame} is taken as the open one"
+                + ("" if number is None else f" and {number} as the closed one")
+            )
     if number is not None:
         return [opened, replace(opened, role=Role.CLOSED, frame=number)]
     if not closed:
         return [opened]
     files = _paired(Path(*closed)) if len(closed) == 1 else tuple(map(Path, closed))
     with _named(*files):
-        return [opened, Seen(Role.CLOSED, files, _read(files), None)]
+        shut = Seen(Role.CLOSED, files, _read(files), None)
+        if type(shut.contents[0]) is not type(content):
+            raise InputError("a label map beside surfaces, expected both frames of one kind")
+    return [opened, shut]
 
 
 def _tips(
-    seen: Seen,
-    tissue: Tissue,
-    before: Sequence[tuple[Role, Midsurface, FloatArray]],
-    options: LeafletsOptions,
-    scale: float,
-    derived: list[str],
+    seen: Seen, tissue: Tissue, options: LeafletsOptions, scale: float, derived: list[str]
 ) -> FloatArray:
-    """Papillary tips ``(2, 3)`` mm as stated, from the muscles, or as in the open frame."""
-    stated = options.tips_closed if before else options.tips
-    if stated is not None:
-        return scale * np.array(stated).reshape(2, 3)
-    if before:
-        derived.append("papillary tips of the closed frame: where they are in the open one")
-        return before[0][2]
+    """Papillary tips ``(2, 3)`` mm from the muscles."""
     if options.muscles is None:
         raise InputError("no papillary tips; give tips=[x,y,z,x,y,z] in LPS, or muscles=[...]")
     derived.append(
         f"papillary tips: the middle of the last {HEAD_MM:g} mm of each muscle along its axis"
     )
-    muscles = []
+    tips = []
     for word in options.muscles:
-        file, part = Path(word), {"leaflets": (word,)}
-        whole = file.is_file()
-        contents = _read((file,)) if whole else seen.contents[:1]
-        muscles.append(tissue_of(contents, seen.frame, {} if whole else part, scale, []).points)
-    return np.stack([papillary_tip(muscle, tissue.points) for muscle in muscles])
+        own = Path(word).is_file()
+        contents = _read((Path(word),)) if own else seen.contents[:1]
+        named = {} if own else {"leaflets": (word,)}
+        muscle = tissue_of(contents, seen.frame, named, scale, [])
+        tips.append(papillary_tip(muscle.points, tissue.points))
+    return np.stack(tips)
 
 
 def _posterior_first(surface: Midsurface, nameless: Sequence[str], derived: list[str]) -> bool:
@@ -329,88 +347,3 @@ def _thick(surface: Midsurface, options: LeafletsOptions, derived: list[str]) ->
             "leaflets; thickness_range_mm=[LOW,HIGH] keeps it between two"
         )
     return replace(surface, thickness=thickness)
-
-
-def _sound(
-    surface: Midsurface, role: Role, options: LeafletsOptions, derived: list[str]
-) -> Midsurface:
-    """The same smoothed round the valve as given, and further if it passes through itself.
-
-    The open one is thickened to be meshed, and its walls must not pass through each other either.
-    """
-    faults = []
-    for extra in REPAIRS_MM:
-        smooth, moved = surface.smoothed(options.smoothing_mm + extra)
-        try:
-            check_surface(smooth.vertices, smooth.triangles)
-            if role is Role.REFERENCE:
-                fibre = np.tile([0.0, 0.0, 1.0], (len(smooth.vertices), 1))
-                band = smooth.vertices, smooth.triangles, smooth.region, REGIONS
-                thicken(LeafletSurface(*band, fibre, smooth.thickness))
-        except GeometryError as fault:
-            faults.append(fault)
-            continue
-        if moved:
-            derived.append(
-                f"{role.value} frame: smoothed round the valve over "
-                f"{options.smoothing_mm + extra:g} mm, which moves it by at most {moved:.1f} mm"
-                + ("; with less it passes through itself" if extra else "")
-            )
-        return smooth
-    raise faults[0]
-
-
-def _case(
-    done: Sequence[tuple[Role, Midsurface, FloatArray]],
-    std_mm: float,
-    options: LeafletsOptions,
-    derived: list[str],
-) -> ValveCase:
-    """The frames as a folder that is written and read: the checks and rules of every case."""
-    correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
-    derived.append(
-        f"observation: {std_mm:.3g} mm by voxels, smoothing and observer_mm="
-        f"{options.observer_mm:g}, alike over {correlated:g} mm"
-    )
-    if len(done) > 1:
-        derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
-    document: dict[str, Any] = {
-        "version": 1,
-        "name": "segmented valve",  # names of files may be those of patients
-        "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
-        "regions": list(REGIONS),
-        "thickness": {"point_data": "thickness"},
-        "observation": {"std_mm": std_mm, "correlation_length_mm": correlated},
-        "frames": [],
-        "derived": derived,
-    }
-    pressure = float(options.pressure_mmHg or 0.0)
-    closed = {"name": "closed", "time": CLOSED_AT, "pressure": pressure, "corresponds": False}
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        for role, surface, tips in done:
-            file, label = f"{role.value}.vtp", {"region": np.asarray(surface.region)}
-            data = {"thickness": surface.thickness}
-            write_surface(folder / file, surface.vertices, surface.triangles, data, label)
-            document["frames"].append(
-                {"role": role.value, "surface": file, "papillary_tips": tips.tolist()}
-                | (closed if role is Role.CLOSED else {"name": "open", "time": 0, "pressure": 0})
-            )
-        return read_back(folder, document)
-
-
-def read_back(folder: Path, document: dict[str, Any]) -> ValveCase:
-    """Write a case's document beside its files and read it: the checks and rules of every case.
-
-    Raises
-    ------
-    InputError, GeometryError
-        As `mvest.cases.folder.read_case`, without the name of the folder.
-    """
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    (folder / CASE_FILE).write_text(text, encoding="utf-8")
-    try:
-        return replace(read_case(folder), sha256="")
-    except MvestError as fault:
-        said = str(fault).replace(f"{folder / CASE_FILE}: ", "").replace(f"{folder}/", "")
-        raise type(fault)(said) from fault

@@ -277,7 +277,8 @@ def _label_seams(
     known = (share > 0.02) & (share < 0.98)
     if known.mean() < 0.5:
         raise GeometryError(
-            "the labels do not part the leaflets at two commissures, from annulus to free edge"
+            "the labels do not part the leaflets at two commissures, from annulus to free edge; "
+            "give anterior= and posterior=, or leaflets= if one label is both of them"
         )
     ends = []
     for seam in (centre - np.pi * share, centre + np.pi * share):

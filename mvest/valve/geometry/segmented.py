@@ -1,4 +1,4 @@
-"""The midsurface of leaflets that were segmented as voxels, and its error."""
+"""The midsurface of segmented leaflets: from voxels, without crossings, and its error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.leaflet_fields import (
     CLOSED_STEP_MM,
     STEP_MM,
@@ -16,9 +18,13 @@ from mvest.valve.geometry.leaflet_fields import (
     thick_leaflets,
 )
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
+from mvest.valve.geometry.surface_checks import check_surface
+from mvest.valve.geometry.thickening import thicken
 
 BEND_MM = 3.0
 """Radius to which leaflets bend at the commissures."""
+REPAIRS_MM = (0.0, 1.0, 2.0, 4.0)
+"""Further smoothing that is tried where leaflets pass through themselves."""
 
 
 def masks_midsurface(
@@ -73,6 +79,51 @@ def masks_midsurface(
     thickness = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)
     derived = (*solid.derived, *surface.derived)
     return replace(surface, thickness=thickness, derived=derived), solid.seams
+
+
+def without_crossings(
+    surface: Midsurface, smoothing_mm: float, *, thickened: bool
+) -> tuple[Midsurface, str]:
+    """The surface smoothed round the valve, and further if it passes through itself.
+
+    Parameters
+    ----------
+    surface
+    smoothing_mm
+        See `mvest.valve.geometry.midsurface.Midsurface.smoothed`.
+    thickened
+        Whether its two walls must not pass through each other either, as it is to be meshed.
+
+    Returns
+    -------
+    Midsurface
+    str
+        What was done, if anything.
+
+    Raises
+    ------
+    GeometryError
+        It passes through itself however it is smoothed.
+    """
+    faults = []
+    for further in REPAIRS_MM:
+        smooth, moved = surface.smoothed(smoothing_mm + further)
+        try:
+            check_surface(smooth.vertices, smooth.triangles)
+            if thickened:
+                fibre = np.tile([0.0, 0.0, 1.0], (len(smooth.vertices), 1))
+                band = smooth.vertices, smooth.triangles, smooth.region, ("anterior", "posterior")
+                thicken(LeafletSurface(*band, fibre, smooth.thickness))
+        except GeometryError as fault:
+            faults.append(fault)
+            continue
+        done = (
+            f"smoothed round the valve over {smoothing_mm + further:g} mm, which moves it by at "
+            f"most {moved:.1f} mm"
+        )
+        why = "; with less it passes through itself" if further else ""
+        return smooth, done + why if moved else ""
+    raise faults[0]
 
 
 def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> float:

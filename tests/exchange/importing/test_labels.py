@@ -198,6 +198,21 @@ def test_two_labelled_frames_are_the_open_and_the_closed_one(
     assert any("1 is taken as the open one and 4 as the closed" in line for line in both.derived)
 
 
+@pytest.mark.parametrize(
+    ("convention", "words"),
+    [
+        (_annulus, "not recognised among 1, 2, 3: give anterior=N and posterior=N"),
+        (lambda labels: np.minimum(_annulus(labels), 2), "give anterior= and posterior=, or leaf"),
+    ],
+)
+def test_labels_that_are_no_two_leaflets_are_asked_for(
+    small: SimpleITK.Image, tmp_path: Path, convention: Callable[[IntArray], IntArray], words: str
+) -> None:
+    path = _written(small, tmp_path / "valve.nii.gz", convention)
+    with pytest.raises(InputError, match=words):
+        _small(path)
+
+
 def test_exchanged_leaflets_are_called_so(slicer: Path, tips: tuple[float, ...]) -> None:
     swapped = LeafletsOptions(
         anterior="mitral_posterior_leaflet", posterior="1", tips=tips, mirrored=True
@@ -231,6 +246,15 @@ def test_what_is_missing_is_asked_for_by_name(
         import_leaflets(slicer, options)
     assert "\n" not in str(caught.value)
     assert str(slicer) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"edge_mm": 9.0}, {"observer_mm": -1.0}, {"smoothing_mm": 20.0}, {"tips": (1.0, 2.0)}],
+)
+def test_options_that_are_none_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(options))):
+        LeafletsOptions(**options)
 
 
 @pytest.mark.parametrize("names", [("AML", "PML"), ("Anterior", "Posterior"), ("A2", "P2")])

@@ -1,0 +1,72 @@
+"""A case from frames that an importer found: written as a folder and read by the usual rules."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from mvest.cases.case import Role, ValveCase
+from mvest.cases.folder import read_case
+from mvest.cases.schema import CASE_FILE
+from mvest.errors import MvestError
+from mvest.exchange.regions import RegionSurface
+from mvest.exchange.surfaces import write_surface
+from mvest.typing import FloatArray
+from mvest.valve.geometry.midsurface import Midsurface
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundFrame:
+    """A frame, in mm, mmHg and s; see ``frames`` of a case for what its fields mean."""
+
+    name: str
+    role: Role
+    time: float
+    pressure: float
+    surface: Midsurface | RegionSurface
+    tips: FloatArray
+    thickness: FloatArray | None = None
+
+
+def case_of_frames(frames: Sequence[FoundFrame], document: Mapping[str, Any]) -> ValveCase:
+    """The case of frames without common vertices, with the checks and rules of every case.
+
+    Parameters
+    ----------
+    frames
+        The reference and others.
+    document
+        Further fields of ``case.yaml``.
+
+    Raises
+    ------
+    InputError, GeometryError
+        As `mvest.cases.folder.read_case`, without the name of a folder.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, entries = Path(temporary), []
+        for number, one in enumerate(frames):
+            data = {} if one.thickness is None else {"thickness": one.thickness}
+            surface, labels = one.surface, {"region": np.asarray(one.surface.region)}
+            write_surface(
+                folder / f"{number}.vtp", surface.vertices, surface.triangles, data, labels
+            )
+            entry = {"name": one.name, "role": one.role.value, "time": float(one.time)}
+            entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
+            apart = {} if one.role is Role.REFERENCE else {"corresponds": False}
+            entries.append(entry | {"pressure": float(one.pressure)} | apart)
+        units = {"length": "mm", "pressure": "mmHg", "time": "s"}
+        whole = {"version": 1, "units": units, **document, "frames": entries}
+        text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
+        (folder / CASE_FILE).write_text(text, encoding="utf-8")
+        try:
+            return replace(read_case(folder), sha256="")
+        except MvestError as fault:
+            said = str(fault).replace(f"{folder / CASE_FILE}: ", "").replace(f"{folder}/", "")
+            raise type(fault)(said) from fault
