@@ -1,50 +1,38 @@
-"""Points and curves as 3D Slicer's markups (``.mrk.json``), written and read; its ``.fcsv`` read.
+"""Points and curves of 3D Slicer: ``.mrk.json`` written and read, the older ``.fcsv`` read.
 
-The format is the JSON schema ``markups-schema-v1.0.3.json`` of Slicer's module Markups. Positions
-here are always LPS in mm.
+Rules and defaults are those of the JSON schema ``markups-schema-v1.0.3.json`` of Slicer's module
+Markups and of its reader ``vtkMRMLMarkupsJsonStorageNode``. Positions here are always LPS in mm.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from mvest.errors import InputError
-from mvest.exchange.segmentations import checked_path
 from mvest.files import write_atomically
-from mvest.reading.bounded import refusing
-from mvest.reading.text import (
-    MAX_NUMBER,
-    check_words,
-    number,
-    one_line,
-    read_bytes,
-    read_text,
-)
+from mvest.reading.text import MAX_NUMBER, number, one_line, read_bytes
 from mvest.typing import FloatArray
 
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"
     "Schema/markups-schema-v1.0.3.json#"
 )
-KINDS = ("Fiducial", "Curve", "ClosedCurve")
 TO_LPS = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
-FCSV_AXES = {"LPS": "LPS", "RAS": "RAS", "0": "RAS", "1": "LPS"}
+MM_PER = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
+FCSV_AXES = {**TO_LPS, "0": TO_LPS["RAS"], "1": TO_LPS["LPS"]}
 """As numbers before Slicer 4.11."""
-FCSV_COLUMNS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
+FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label"
+DEFAULTS = {"selected": True, "locked": False, "visibility": True, "positionStatus": "defined"}
 MAX_BYTES = 2**24
-
-
-def fault(path: Path, field: str, value: object, expected: str) -> InputError:
-    """What to raise where a file's field is not what it must be."""
-    return InputError(f"{path}: {field}: {one_line(value)}, expected {expected}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,16 +42,19 @@ class PointList:
     Attributes
     ----------
     labels : tuple of str
-        One for each point, all different.
+        One for each point; a user may leave them empty or repeat them.
     points : (n, 3) mm
         LPS.
     kind : str
-        ``"Fiducial"`` (points by themselves), ``"Curve"`` or ``"ClosedCurve"``.
+        ``"Fiducial"`` (points by themselves), ``"Curve"``, ``"ClosedCurve"``, ``"Line"``, ...
+    unplaced : tuple of str
+        Labels of points that were listed, but never placed.
     """
 
     labels: tuple[str, ...]
     points: FloatArray
     kind: str = "Fiducial"
+    unplaced: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if np.shape(self.points) != (len(self.labels), 3) or not np.isfinite(self.points).all():
@@ -71,23 +62,11 @@ class PointList:
                 f"points of shape {np.shape(self.points)}, expected {len(self.labels)} x 3 finite "
                 "numbers, as there are labels"
             )
-        if len(set(self.labels)) < len(self.labels) or not all(self.labels):
-            raise InputError(
-                f"labels {', '.join(self.labels)}, expected different ones, none empty"
-            )
-        if self.kind not in KINDS:
-            raise InputError(f"kind {self.kind!r}, expected {', '.join(KINDS)}")
 
     @classmethod
     def numbered(cls, name: str, points: FloatArray, kind: str = "Fiducial") -> PointList:
         """Points ``(n, 3)`` labelled ``name-1``, ``name-2``, ..."""
         return cls(tuple(f"{name}-{i + 1}" for i in range(len(points))), points, kind)
-
-    def point(self, label: str) -> FloatArray:
-        """Position ``(3,)`` of the point with a label."""
-        if label not in self.labels:
-            raise InputError(f"no point {label!r}, found {', '.join(self.labels)}")
-        return self.points[self.labels.index(label)]
 
 
 def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
@@ -105,150 +84,125 @@ def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
     InputError
         Another extension, nothing to write, or a file that cannot be written.
     """
-    target = checked_path(path, ".mrk.json")
-    if not lists:
-        raise InputError(f"{target}: no lists of points, expected at least one")
-    content = {
-        "@schema": SCHEMA,
-        "markups": [
-            {
-                "type": item.kind,
-                "name": name,
-                "coordinateSystem": "LPS",
-                "coordinateUnits": "mm",
-                "locked": False,
-                "labelFormat": "%N-%d",
-                "controlPoints": [
-                    {
-                        "id": str(number + 1),
-                        "label": label,
-                        "position": [float(x) for x in point],
-                        "selected": True,
-                        "locked": False,
-                        "visibility": True,
-                        "positionStatus": "defined",
-                    }
-                    for number, (label, point) in enumerate(
-                        zip(item.labels, item.points, strict=True)
-                    )
-                ],
-            }
-            for name, item in lists.items()
-        ],
-    }
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    return write_atomically(target, text)
+    target = Path(path)
+    if not target.name.endswith(".mrk.json") or not lists:
+        raise InputError(f"{target}: expected a name that ends in .mrk.json, and at least one list")
+    markups = [
+        {
+            "type": item.kind,
+            "name": name,
+            "coordinateSystem": "LPS",
+            "coordinateUnits": "mm",
+            "locked": False,
+            "labelFormat": "%N-%d",
+            "controlPoints": [
+                {"id": str(k + 1), "label": label, "position": point.tolist(), **DEFAULTS}
+                for k, (label, point) in enumerate(zip(item.labels, item.points, strict=True))
+            ],
+        }
+        for name, item in lists.items()
+    ]
+    text = json.dumps({"@schema": SCHEMA, "markups": markups}, indent=1)
+    return write_atomically(target, text + "\n")
 
 
 def read_markups(path: Path | str) -> dict[str, PointList]:
-    """Read lists of points and curves by their names, as Slicer or `write_markups` wrote them.
+    """Read lists of points, lines and curves by their names, in the order of the file.
+
+    A list without a name is called after the file, as in Slicer. Lists may be empty. Points without
+    a position are left out and named in `PointList.unplaced`.
+
+    Parameters
+    ----------
+    path
+        ``.fcsv``, or JSON of Slicer's schema.
 
     Raises
     ------
     InputError
-        No such file, no JSON of this schema; a list of another kind, with a name that another one
-        has, in an unknown system or unit; a point without label or position, or not placed.
+        No such file, neither format; an unknown system or unit of length; a placed point whose
+        position is not three numbers.
     """
     source = Path(path)
-    if not source.is_file():
-        raise InputError(f"{source}: no such file")
-    with refusing(source, "markups"):
-        return _read(source)
-
-
-def read_fcsv(path: Path | str) -> list[tuple[str, FloatArray]]:
-    """Read the labels and positions ``(3,)`` (LPS, mm) of Slicer's older lists of points.
-
-    Raises
-    ------
-    InputError
-        No such file, unknown axes, a row without position.
-    """
-    source = Path(path)
-    with refusing(source, "list of points"):
-        axes, columns, rows = "RAS", list(FCSV_COLUMNS), []
-        for line in csv.reader(io.StringIO(read_text(source, MAX_BYTES), newline=""), strict=True):
-            key, _, value = ",".join(line).removeprefix("#").strip().partition("=")
-            match key.strip():
-                case "CoordinateSystem" if line[0].startswith("#"):
-                    if value.strip() not in FCSV_AXES:
-                        raise fault(source, "CoordinateSystem", repr(value.strip()), "LPS or RAS")
-                    axes = FCSV_AXES[value.strip()]
-                case "columns" if line[0].startswith("#"):
-                    columns = [name.strip() for name in value.split(",")]
-                case _ if line and not line[0].startswith("#"):
-                    rows.append(line)
-        if not {"x", "y", "z", "label"} <= set(columns):
-            raise fault(source, "columns", ",".join(columns), "x, y, z and label")
-        at = [columns.index(name) for name in ("x", "y", "z", "label")]
-        result = []
-        for row, cells in enumerate(rows):
-            if len(cells) <= max(at):
-                raise fault(source, f"row {row}", f"{len(cells)} cells", f"{len(columns)}")
-            position = np.array([number(cells[k]) for k in at[:3]]) * TO_LPS[axes]
-            result.append((check_words(cells[at[3]]).strip(), position))
-        return result
-
-
-def _read(source: Path) -> dict[str, PointList]:
+    if source.suffix.lower() == ".fcsv":
+        return {source.stem: _read_fcsv(source)}
     try:
-        content = json.loads(read_bytes(source, MAX_BYTES))
+        content = _File.model_validate(json.loads(read_bytes(source, MAX_BYTES)))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field, found = ".".join(map(str, first["loc"])), one_line(repr(first["input"]), 60)
+        raise InputError(f"{source}: {field}: {found}, expected: {first['msg']}") from error
     except (ValueError, RecursionError) as error:
-        raise fault(source, "content", error, "JSON as Slicer writes it") from error
-    content = _member(source, "content", content, dict)
-    schema = _member(source, "@schema", content.get("@schema"), str)
-    if "/markups-schema-v1." not in schema:
-        raise fault(source, "@schema", repr(schema), "markups-schema-v1.0.3.json or alike")
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{source}: no JSON as Slicer writes it: {one_line(error, 99)}") from error
     result: dict[str, PointList] = {}
-    for index, item in enumerate(_member(source, "markups", content.get("markups"), list)):
-        where = f"markups[{index}]"
-        name, points = _read_list(source, where, _member(source, where, item, dict), index)
-        if name in result:
-            raise fault(source, f"{where}.name", repr(name), "another name in every list")
-        result[name] = points
-    if not result:
-        raise fault(source, "markups", "nothing", "at least one list of points")
+    for item in content.markups:
+        name = item.name or source.name.removesuffix(".json").removesuffix(".mrk")
+        while name in result:
+            name = f"{name}_{len(result)}"
+        result[name] = item.points()
     return result
 
 
-def _member(path: Path, field: str, value: object, kind: type) -> Any:
-    if not isinstance(value, kind) or isinstance(value, bool):
-        words = {"dict": "an object", "list": "a list", "str": "text"}[kind.__name__]
-        raise fault(path, field, "missing" if value is None else repr(value), words)
-    return value
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER, le=MAX_NUMBER)]
 
 
-def _read_list(path: Path, where: str, item: Any, number: int) -> tuple[str, PointList]:
-    kind = item.get("type")
-    if kind not in KINDS:
-        raise fault(path, f"{where}.type", repr(kind), ", ".join(KINDS))
-    system = item.get("coordinateSystem")
-    if system not in TO_LPS:
-        raise fault(path, f"{where}.coordinateSystem", repr(system), "LPS or RAS")
-    unit = item.get("coordinateUnits", "mm")  # the schema's own default, before version 1.0.1
-    if unit != "mm" and (not isinstance(unit, list) or unit[:2] != ["mm", "UCUM"]):
-        raise fault(path, f"{where}.coordinateUnits", repr(unit), "mm")
+class _Point(BaseModel):
+    """A control point; of one that was not placed Slicer writes an empty text as position."""
+
+    label: str = ""
+    position: Annotated[
+        Annotated[list[Number], Field(min_length=3, max_length=3)] | None,
+        BeforeValidator(lambda given: None if given == "" else given),
+    ] = None
+    status: Literal["undefined", "preview", "defined"] = Field("defined", alias="positionStatus")
+
+    @property
+    def placed(self) -> bool:
+        return self.position is not None and self.status == "defined"
+
+
+def _code(unit: Any) -> Any:
+    """The code of a unit that may be ``[code, "UCUM", meaning]``."""
+    return unit[0] if isinstance(unit, list) and unit[1:2] == ["UCUM"] else unit
+
+
+class _Markup(BaseModel):
+    type: str
+    name: str = ""
+    system: Literal["LPS", "RAS"] = Field("LPS", alias="coordinateSystem")
+    unit: Annotated[Literal["um", "mm", "cm", "m"], BeforeValidator(_code)] = Field(
+        "mm", alias="coordinateUnits"
+    )
+    listed: list[_Point] = Field([], alias="controlPoints")
+
+    def points(self) -> PointList:
+        scale = MM_PER[self.unit] * np.array(TO_LPS[self.system])
+        placed = [p for p in self.listed if p.placed]
+        points = np.array([p.position for p in placed], dtype=np.float64).reshape(-1, 3)
+        labels = tuple(one_line(p.label, 80) for p in placed)
+        unplaced = tuple(one_line(p.label, 80) for p in self.listed if not p.placed)
+        return PointList(labels, points * scale, one_line(self.type, 80), unplaced)
+
+
+class _File(BaseModel):
+    address: str = Field(alias="@schema", pattern=r"(?i)markups-schema-v1\.\d+\.\d+\.json#*$")
+    markups: list[_Markup] = Field(min_length=1)
+
+
+def _read_fcsv(source: Path) -> PointList:
+    text = read_bytes(source, MAX_BYTES).decode("utf-8-sig", "replace")
+    head = dict(re.findall(r"(?m)^#[ \t]*(\w+)[ \t]*=(.*)$", text))
+    if (axes := head.get("CoordinateSystem", "RAS").strip()) not in FCSV_AXES:
+        raise InputError(f"{source}: CoordinateSystem: {one_line(axes, 40)}, expected LPS or RAS")
+    columns = [name.strip() for name in head.get("columns", FCSV_COLUMNS).split(",")]
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     labels, points = [], []
-    for index, point in enumerate(
-        _member(path, f"{where}.controlPoints", item.get("controlPoints"), list)
-    ):
-        field = f"{where}.controlPoints[{index}]"
-        point = _member(path, field, point, dict)
-        label = _member(path, f"{field}.label", point.get("label"), str)
-        status = point.get("positionStatus", "defined")
-        if status != "defined":
-            raise fault(path, f"{field}.positionStatus", repr(status), "a point that was placed")
-        position = _member(path, f"{field}.position", point.get("position"), list)
-        # Compared as they are: Python's whole numbers have no largest one, and NumPy's do.
-        numbers = [x for x in position if type(x) in (int, float) and abs(x) <= MAX_NUMBER]
-        if len(numbers) != 3 or len(position) != 3:
-            raise fault(path, f"{field}.position", repr(position), "three numbers")
-        if not label or label in labels:
-            raise fault(path, f"{field}.label", repr(label), "a label that no other point has")
-        labels.append(label)
-        points.append(numbers)
-    if not labels:
-        raise fault(path, f"{where}.controlPoints", "nothing", "at least one point")
-    name = _member(path, f"{where}.name", item.get("name", f"list {number + 1}"), str)
-    array = np.array(points, dtype=np.float64) * TO_LPS[system]
-    return name, PointList(tuple(labels), array, kind)
+    try:
+        for row in csv.DictReader(lines, columns):
+            points.append([number(row.get(axis) or "") for axis in "xyz"])
+            labels.append(one_line(row.get("label") or "", 80))
+    except (InputError, csv.Error) as error:
+        raise InputError(f"{source}: position of point {len(points) + 1}: {error}") from error
+    return PointList(tuple(labels), np.reshape(points, (-1, 3)) * FCSV_AXES[axes])
