@@ -46,7 +46,7 @@ FURTHER = {
     "itk4d.nrrd": (
         "NRRD by ITK: .nrrd, 4D, float32, plain", "NRRD by ITK: .nhdr, 4D, int16, compressed"
     ),
-    "slicer_text_index.seq.nrrd": ("NRRD: phases as text", "NRRD: slicerio, phases as text"),
+    "slicer_text_index.seq.nrrd": ("NRRD: phases as text", "NRRD: slicerio with phases as text"),
     "rec.dcm": (
         "Philips Cartesian DICOM: explicit, preamble", "Philips Cartesian DICOM: implicit, bare"
     ),

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tests.exchange.markup_variants import markup_variants
 from tests.exchange.surface_variants import surface_variants
 from tests.exchange.variant import Variant
@@ -20,14 +18,18 @@ MARKUPS = tuple(markup_variants())
 PAGE = ROOT / "docs" / "formats.md"
 HEAD = """# Formats that are read
 
-Each line stands for files that the tests make with the libraries that other programs write them
-with (VTK, trimesh, meshio, SimpleITK, nibabel, pynrrd, slicerio) and that mvest reads as they were
-written. A dot separates what can be combined. What a file does not state (units, times, which
-leaflet is which) is asked for in one line. Each library that reads a file runs in a process whose
-memory and time are bounded, so a damaged file costs one line.
+The tests make each of these files with the libraries that other programs use (VTK, trimesh, meshio,
+SimpleITK, nibabel, pynrrd, pydicom, slicerio), read it, and compare it with what was written. A dot
+separates options that are combined.
 
-| format | variants | files tested |
+| format | variants | files |
 |---|---|---|
+"""
+FOOT = """
+[Folders of SlicerHeart](slicer.md), [Abaqus decks](own_valve.md) and [FEBio](febio.md) have pages
+of their own. What a file does not state (units, times, which leaflet is which) is asked for in one
+line. Every file is read by a child process whose memory and time are bounded; a damaged one costs
+one line. This page is made by `python -m tests.exchange.variants`.
 """
 
 
@@ -40,7 +42,7 @@ def page() -> str:
         f"| {form} | {_options(variants)} | {len(variants)} |"
         for (form, _), variants in rows.items()
     ]
-    return HEAD + "\n".join(lines) + "\n"
+    return HEAD + "\n".join(lines) + "\n" + FOOT
 
 
 def _options(variants: list[Variant]) -> str:
@@ -49,4 +51,4 @@ def _options(variants: list[Variant]) -> str:
 
 
 if __name__ == "__main__":
-    Path(PAGE).write_text(page(), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8")

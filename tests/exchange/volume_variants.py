@@ -84,7 +84,7 @@ def directions(axis: int | None) -> np.ndarray:
     return rows if axis is None else np.insert(rows, axis, np.nan, axis=0)
 
 
-TEXT_INDEX = ("phases as text", "slicerio, phases as text")
+TEXT_INDEX = ("phases as text", "slicerio with phases as text")
 
 
 def header(axis: int | None, encoding: str = "gzip") -> dict[str, Any]:
@@ -131,7 +131,7 @@ def more_nrrd(path: Path, what: str) -> None:
     elif what.startswith("slicerio"):
         made = [{"voxels": frame, "ijkToLPS": AFFINE} for frame in values]
         times: dict[str, Any] = {"index_values": list(map(str, TIMES))}
-        if what == "slicerio, phases as text":
+        if what == "slicerio with phases as text":
             times = {"index_values": ["ED", "mid", "ES"], "index_type": "text", "index_unit": ""}
         slicerio.write_volume(str(path), slicerio.create_sequence(made, **times))
         return
