@@ -22,8 +22,6 @@ MAX_LENGTH_OF_NOTHING = 1_000_000
 """Of a dimension of an array without elements."""
 KINDS = "biufSU"
 """Of numbers and text."""
-NAMES = {"b": "booleans", "i": "integers", "f": "finite numbers", "U": "text"}
-"""What is asked for by a letter; integers and numbers of every width."""
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -121,42 +119,3 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, where: str) -> NDAr
         if ((codes > 0x10FFFF) | (codes >> 11 == 0x1B)).any():  # 0x1B << 11: surrogates
             raise InputError(f"{where}: characters that are no Unicode")
     return array.astype(dtype.newbyteorder("="), copy=False)
-
-
-def check_array(
-    array: NDArray[Any], where: str, kind: str, shape: Sequence[int | None]
-) -> NDArray[Any]:
-    """An array as 64-bit numbers, booleans or text, if it is of its kind and shape.
-
-    Parameters
-    ----------
-    array : ndarray
-    where : str
-        File and name, for an error.
-    kind : {"f", "i", "b", "U"}
-        Finite real numbers, integers, booleans, text.
-    shape : sequence of int or None
-        None: any length.
-
-    Raises
-    ------
-    InputError
-    """
-    fits = array.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, array.shape, strict=True)
-    )
-    if not fits or array.dtype.kind not in {"i": "iu"}.get(kind, kind):
-        wanted = tuple("any" if want is None else want for want in shape)
-        raise InputError(
-            f"{where} is {array.dtype} of shape {array.shape}, expected {NAMES[kind]} of shape "
-            f"{wanted}".replace("'any'", "any")
-        )
-    if kind == "f":
-        if not np.isfinite(array).all():
-            raise InputError(f"{where} has values that are not finite")
-        return array.astype(np.float64)
-    if kind == "i":
-        if array.size and int(array.max()) > np.iinfo(np.int64).max:
-            raise InputError(f"{where}: {array.max()}, expected integers of 64 bits with a sign")
-        return array.astype(np.int64)
-    return array

@@ -9,7 +9,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.reading import npz
-from mvest.reading.npz import check_array, read_npz
+from mvest.reading.npz import read_npz
 
 
 def npy(descr="'<f8'", shape="(2,)", data=bytes(16), version=b"\x01\x00"):
@@ -174,24 +174,3 @@ def test_a_stream_is_read_as_a_file(tmp_path):
     assert read_npz(io.BytesIO(content), where="it")["a"].tolist() == [0, 0]
     with pytest.raises(InputError, match=r"^it: cannot be read"):
         read_npz(io.BytesIO(content[:9]), where="it")
-
-
-@pytest.mark.parametrize(
-    ("array", "kind", "shape", "words"),
-    [
-        (np.zeros(3), "f", (2,), r"x is float64 of shape \(3,\), expected finite numbers"),
-        (np.zeros(3, int), "f", (3,), "int64"),
-        (np.array([1.0, np.nan]), "f", (2,), "x has values that are not finite"),
-        (np.array([2**63], np.uint64), "i", (1,), "64 bits"),
-        (np.array(["a"]), "i", (1,), "expected integers"),
-        (np.zeros((1, 2)), "f", (None,), r"\(any,\)"),
-    ],
-)
-def test_what_an_array_must_be(array, kind, shape, words):
-    with pytest.raises(InputError, match=words):
-        check_array(array, "x", kind, shape)
-
-
-def test_numbers_are_of_64_bits():
-    assert check_array(np.zeros((0, 2), ">f4"), "x", "f", (None, 2)).dtype == np.float64
-    assert check_array(np.array([3], np.uint8), "x", "i", (1,)).dtype == np.int64
