@@ -39,6 +39,8 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     data, groups = _READERS[suffix](path)
     if not data.GetNumberOfPoints():
         raise InputError("damaged or empty: no points, expected a surface")
+    if not data.GetNumberOfCells():
+        raise GeometryError("no triangles or other cells; expected a triangulated surface")
     points = _numpy(data.GetPoints().GetData()).astype(np.float64)
     types, sizes, corners = _cells(data, len(points))
     triangles, rows = _triangles(points, types, sizes, corners)
@@ -58,6 +60,7 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     field_data = _arrays(data.GetFieldData())
     with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
         words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
+    space = words[1].decode() if words else str(field_data.get("SPACE"))
     return {
         "points": points,
         "triangles": triangles,
@@ -66,7 +69,7 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},
         "field_data": field_data,
-        "space": words[1].decode() if words else field_data.get("SPACE"),
+        "space": space if space in ("LPS", "RAS") else None,
         "groups": [groups[row] for row in rows.tolist()] if groups else [],
     }
 
@@ -78,13 +81,12 @@ def _cells(data: Any, count: int) -> tuple[IntArray, IntArray, IntArray]:
         types = np.repeat([2, 4, 7, 6], [part.GetNumberOfCells() for part in parts])
     else:
         parts = [data.GetCells()]
-        types = np.zeros(0) if not data.GetNumberOfCells() else _numpy(data.GetCellTypesArray())
-    ends = [_numpy(part.GetOffsetsArray()) for part in parts]
+        types = _numpy(data.GetCellTypesArray())
     corners = np.concatenate([_numpy(part.GetConnectivityArray()) for part in parts])
     whole = all(part.IsValid() for part in parts)
     if not whole or (len(corners) and not 0 <= corners.min() <= corners.max() < count):
         raise GeometryError("cells name points that do not exist")
-    sizes = np.concatenate([np.diff(part) for part in ends])
+    sizes = np.concatenate([np.diff(_numpy(part.GetOffsetsArray())) for part in parts])
     return types.astype(np.int64), sizes.astype(np.int64), corners.astype(np.int64)
 
 
@@ -276,10 +278,10 @@ def _ply(path: Path) -> tuple[Any, list[str]]:
     """A PLY file with the properties of its vertices and faces."""
     head, mark, body = path.read_bytes().partition(b"end_header")
     lines = [line.split() for line in head.decode("latin-1").splitlines()]
-    if not mark or lines[:1] != [["ply"]]:
-        raise InputError("damaged or no PLY file: no header from 'ply' to 'end_header'")
+    form = next((words[1] for words in lines if words[:1] == ["format"]), "none")
+    if not mark or lines[:1] != [["ply"]] or form not in _PLY_ORDER:
+        raise InputError(f"damaged or no PLY file: format {form}, expected {', '.join(_PLY_ORDER)}")
     body = body.partition(b"\n")[2]
-    form = next(words[1] for words in lines if words[:1] == ["format"])
     if form == "ascii":  # every number takes eight bytes then
         body = np.array(body.split(), dtype="f8").tobytes()
     elements: dict[str, tuple[int, list[tuple[str, list[np.dtype[Any]]]]]] = {}

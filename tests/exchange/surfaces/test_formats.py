@@ -155,6 +155,17 @@ def test_strips_polygons_and_what_lies_beside_them(tmp_path, sphere):
     assert np.bincount(region, areas) == pytest.approx([1.5, 2.0, 2.0, 2.0])
 
 
+def test_triangles_and_a_strip_keep_their_data(tmp_path):
+    (tmp_path / "a.vtk").write_text(
+        "# vtk DataFile Version 4.2\nmade up\nASCII\nDATASET POLYDATA\nPOINTS 4 float\n"
+        "0 0 0 1 0 0 0 1 0 1 1 0\nPOLYGONS 2 8\n3 0 1 2\n3 1 3 2\nTRIANGLE_STRIPS 1 5\n4 0 1 2 3\n"
+        "CELL_DATA 3\nSCALARS region int 1\nLOOKUP_TABLE default\n5 6 7\n"
+    )
+    read = read_surface(tmp_path / "a.vtk")
+    assert read.triangles.tolist() == [[0, 1, 2], [1, 3, 2], [0, 1, 2], [2, 1, 3]]
+    assert read.cell_data["region"].tolist() == [5, 6, 7, 7]
+
+
 def test_cells_other_than_triangles_are_named(tmp_path):
     (tmp_path / "a.vtk").write_text(
         "# vtk DataFile Version 4.2\nmade up\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 5 float\n"

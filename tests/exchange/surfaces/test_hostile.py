@@ -59,7 +59,7 @@ ENTITIES = '<!DOCTYPE l [<!ENTITY a "{}">{}]>'.format(
     "9 " * 1000,
     "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 20}">' for k in range(8)),
 )
-OUTSIDE = '<!DOCTYPE l [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
+OUTSIDE = '<!DOCTYPE l [<!ENTITY x SYSTEM "next.vtp">]>'
 VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 ASCII_PLY = ply("ascii", TRIANGLES.tolist()).decode()
 
@@ -83,6 +83,7 @@ ASCII_PLY = ply("ascii", TRIANGLES.tolist()).decode()
         ("a.vtk", THREE + "POLYGONS 1 4\n3 0 1 2\nCELL_DATA 1\nFIELD f 1\nregion 1 3 int\n1 2 3\n",
          "'region' has 3 rows, expected 1 cells"),
         ("a.vtk", THREE + "LINES 1 3\n2 0 1\n", "no triangles"),
+        ("a.vtk", THREE.replace("POLYDATA", "UNSTRUCTURED_GRID"), "no triangles"),
         ("a.vtk", "# vtk DataFile Version 4.2\nx\nASCII\nDATASET STRUCTURED_POINTS\n"
          "DIMENSIONS 9000 9000 9000\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 729000000000\n"
          "SCALARS a double 1\nLOOKUP_TABLE default\n1\n", "a.vtk: "),
@@ -107,7 +108,8 @@ ASCII_PLY = ply("ascii", TRIANGLES.tolist()).decode()
         ("a.stl", STL[:-12], "9 corners, expected three of each facet and endsolid"),
         ("a.stl", STL.replace("e+00 ", " ", 1).replace("vertex", "vertex x", 1), "damaged"),
         ("a.ply", "nonsense", "damaged or no PLY"),
-        ("a.ply", ASCII_PLY.replace("end_header", ""), "no header from 'ply' to 'end_header'"),
+        ("a.ply", ASCII_PLY.replace("ascii", "EBCDIC"), "format EBCDIC, expected ascii, binary_"),
+        ("a.ply", ASCII_PLY.replace("end_header", ""), "damaged or no PLY file"),
         ("a.ply", ASCII_PLY.replace("vertex 6", f"vertex {2**31}"), "rows too early"),
         ("a.ply", ASCII_PLY.replace("vertex 6", "vertex -6"), "damaged"),
         ("a.ply", ASCII_PLY.replace("float x", "float w"), "no element vertex with x, y and z"),
@@ -181,7 +183,7 @@ def spoilt(change):
     ("change", "message"),
     [
         (lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs KHR_draco"),
-        (lambda d: d["buffers"][0].update(uri="file:///etc/passwd"), "damaged"),
+        (lambda d: d["buffers"][0].update(uri="a.bin"), "damaged"),
         (lambda d: d["accessors"][0].update(count=7), "damaged"),
         (lambda d: d["accessors"][0].update(count=2**40), "damaged"),
         (lambda d: d["accessors"][0].pop("bufferView"), "needs sparse or compressed arrays"),
