@@ -58,6 +58,8 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
     lines: list[str] = []
     for line in head[: end.start() if end else None].decode(errors="replace").split("\n"):
         name, colon, value = line.partition(":")
+        if name.lower() == "space":
+            value = f" {SHORT.get(value.strip().lower(), value.strip().lower())}"
         lines.append(line if value.startswith("=") or not lines else name.lower() + colon + value)
     try:
         fields = nrrd.read_header(list(dict.fromkeys(lines)))  # old writers repeat "space"
@@ -121,8 +123,7 @@ def _place(fields: dict[str, Any]) -> tuple[int | None, FloatArray, FloatArray]:
     """The axis of frames, steps ``(3, 3)`` and origin ``(3,)`` in LPS, mm."""
     if fields.get("space dimension") == 4:
         fields.setdefault("space", "left-posterior-superior-time")
-    space = str(required(fields, "space", f"one of {', '.join(TO_LPS)}")).lower()
-    space = SHORT.get(space, space)
+    space = str(required(fields, "space", f"one of {', '.join(TO_LPS)}"))
     name, n, width = space.removesuffix("-time"), fields["dimension"], 3 + space.endswith("-time")
     vectors = required(fields, "space directions", "a vector in mm for each axis of space")
     origin = required(fields, "space origin", "the centre of the first voxel in mm")

@@ -74,6 +74,23 @@ def test_layers_of_a_segmentation(tmp_path: Path) -> None:
     )
 
 
+def test_layers_as_slicerio_writes_them(tmp_path: Path) -> None:
+    slicerio = pytest.importorskip("slicerio")
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = v.MIRRORED * v.SPACING, v.ORIGIN
+    segments = [
+        {"id": f"s{layer}", "name": f"leaflet {layer}", "labelValue": label, "layer": layer}
+        for layer, label in ((0, 1), (2, 2))
+    ]
+    made = {"voxels": labels(), "ijkToLPS": place, "segments": segments}
+    slicerio.write_segmentation(str(tmp_path / "a.seg.nrrd"), made)
+    found = read_labels(tmp_path / "a.seg.nrrd")
+    np.testing.assert_array_equal(found.frames, labels())
+    assert_placed(found, v.MIRRORED)
+    assert found.is_layers
+    assert found.segments == (Segment("leaflet 0", "|", 1, 0), Segment("leaflet 2", "|", 2, 2))
+
+
 def test_layers_of_slicer_before_4_11(tmp_path: Path) -> None:
     """It wrote neither layer nor label: each segment has a layer of its own, and the label 1."""
     names = {f"Segment{n}_Name": f"part {n}" for n in range(3)}

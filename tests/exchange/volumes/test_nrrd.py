@@ -64,8 +64,8 @@ def test_spaces_become_lps(tmp_path: Path, space: str, signs: tuple[int, int, in
     v.assert_same(read(v.write_nrrd(tmp_path / "a.nrrd", fields)), v.sequence())
 
 
-def test_a_line_that_stands_twice(tmp_path: Path) -> None:
-    extra = "space: left-posterior-superior\n"
+@pytest.mark.parametrize("extra", ["space: left-posterior-superior\n", "space: LPS\n"])
+def test_space_stated_twice_with_one_meaning(tmp_path: Path, extra: str) -> None:
     path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields(), extra=extra)
     v.assert_same(read(path), v.sequence())
 
