@@ -21,14 +21,14 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mvest.errors import ConfigurationError, InputError, message_of
 from mvest.estimation.prediction import Prediction
-from mvest.processes import ending, run
+from mvest.processes import Program, ending
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line, read_numbers, write_columns
@@ -114,31 +114,36 @@ class Command:
         if shutil.which(program) is None:
             raise ConfigurationError(f"program {program!r} is not found or not executable")
 
-    def run(self, folder: Path) -> str:
+    def run(self, folder: Path, started: Callable[[Program], object] | None = None) -> str:
         """Run the program in ``folder``; why it failed, empty where it did not.
 
         All that it has started is stopped with it: at the time limit, when it ends, and when this
-        process does.
+        process does. Whoever gets it as it has ``started`` may end it before.
         """
         try:
-            with (folder / OUTPUT).open("wb") as output, (folder / ERRORS).open("wb") as errors:
-                ended = run(
+            with (
+                (folder / OUTPUT).open("wb") as output,
+                (folder / ERRORS).open("wb") as errors,
+                Program(
                     [self._filled(text, folder.resolve()) for text in self.arguments],
-                    timeout=self.time_limit_s,
                     cwd=folder,
                     env={**os.environ, **self.environment},
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=errors,
-                )
+                ) as program,
+            ):
+                if started is not None:
+                    started(program)
+                code = program.process.wait(self.time_limit_s)
         except subprocess.TimeoutExpired:
             reason = f"stopped at the time limit of {self.time_limit_s:g} s"
         except (OSError, ValueError) as error:  # the latter of arguments with a NUL
             return f"the program could not be started: {message_of(error)}"
         else:
-            if not ended.returncode:
+            if not code:
                 return ""
-            reason = ending(ended.returncode)
+            reason = ending(code)
         with (folder / ERRORS).open("rb") as stream:
             stream.seek(max(0, stream.seek(0, os.SEEK_END) - 4096))
             said = stream.read().decode(errors="replace").splitlines()

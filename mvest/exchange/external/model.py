@@ -5,7 +5,9 @@ Where the program gives no derivatives, they are differences of its predictions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from mvest.exchange.external.contract import (
 )
 from mvest.files import require_writable, sha256_of
 from mvest.kept import Entry
-from mvest.processes import side_by_side
+from mvest.processes import Program
 from mvest.provenance import config_hash
 from mvest.typing import FloatArray
 
@@ -212,15 +214,34 @@ class ProcessModel:
         return RunRequest(names, units, values, self.count, jacobian, dict(self.settings or {}))
 
     def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Prediction]:
-        """Answers at all points, several at a time."""
-        requests = [(self._request(m, jacobian),) for m in points]
-        processes = self.differences.processes if self.differences and len(requests) > 1 else 1
-        answers, how = zip(*side_by_side(self._run, requests, processes), strict=True)
+        """Answers at all points, several at a time; none goes on where one is interrupted."""
+        requests = [self._request(m, jacobian) for m in points]
+        programs: list[Program] = []
+        stopped = threading.Event()
+
+        def started(program: Program) -> None:
+            programs.append(program)
+            if stopped.is_set():
+                program.end()
+
+        processes = 1 if self.differences is None else self.differences.processes
+        with ThreadPoolExecutor(processes) as pool:
+            try:
+                runs = list(pool.map(lambda request: self._run(request, started), requests))
+            except BaseException:
+                stopped.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                for program in [*programs]:
+                    program.end()
+                raise
+        answers, how = zip(*runs, strict=True)
         self.runs += how.count("run")
         self.reused += how.count("reused")
         return list(answers)
 
-    def _run(self, request: RunRequest) -> tuple[Prediction, str]:
+    def _run(
+        self, request: RunRequest, started: Callable[[Program], object]
+    ) -> tuple[Prediction, str]:
         """An answer, and whether it was ``run`` for, ``reused``, or neither."""
         folder, how = self._place(request), ""
         answer = Entry(folder / "answer", lambda path: read_answer(path, request))
@@ -233,7 +254,7 @@ class ProcessModel:
                     # An old answer is not to be taken for that of a program that writes none.
                     (folder / name).unlink(missing_ok=True)
                 write_request(folder, request, self.points)
-                reason, how = self.command.run(folder), "run"
+                reason, how = self.command.run(folder, started), "run"
                 reason = self._refused(folder, request, reason)
                 if not reason:
                     return answer.keep(folder, _move_answer), how

@@ -1,6 +1,10 @@
 """A program behind the filters: its derivatives, its failures, its finished runs."""
 
+import os
+import signal
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -46,6 +50,37 @@ def test_differences_are_of_their_order(tmp_path, processes):
     # 1 + 4 runs, then upper neighbours of the forward scheme are finished already.
     assert program.runs + program.reused == 3
     assert (program.runs, ran(tmp_path)) == (0, 5)
+
+
+def test_programs_side_by_side_find_what_lies_beside_them(tmp_path):
+    (tmp_path / "helper.py").write_text("HEIGHT = 1\n")
+    command = Command((sys.executable, str(tmp_path / "solve.py"), "{request}", "{folder}"))
+    (tmp_path / "solve.py").write_text("import helper\n" + SPRINGS)
+    differences = Differences(processes=2)
+    program = ProcessModel(command, tmp_path / "runs", NAMES, 2, differences=differences)
+    assert program(M).converged, program(M).reason
+
+
+def test_an_interrupted_study_stops_its_programs(tmp_path):
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    sleep = f"open({str(begun)!r} + '/' + str(os.getpid()), 'w'); time.sleep(60)"
+    slow = f"import os\nif not data['jacobian']: {sleep}\n"
+    source = SPRINGS.replace("folder = pathlib", slow + "folder = pathlib", 1)
+    program = model(tmp_path, source=source, limit=60, differences=Differences(processes=2))
+
+    def interrupt():
+        while len([*begun.iterdir()]) < 2:
+            time.sleep(0.02)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        program(M)
+    assert len([*begun.iterdir()]) == 2
+    for path in begun.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.name), 0)
 
 
 def test_without_derivatives_and_differences_there_is_no_prediction(tmp_path):
