@@ -193,7 +193,7 @@ def _chosen(
     elif not all(chosen) or set(chosen[0]) & set(chosen[1]):
         raise InputError(
             f"the leaflets are not recognised among {_listed(parts)}: give anterior=N and "
-            "posterior=N (names, numbers, or lists of them), or leaflets=N if one is both"
+            "posterior=N (names, numbers, lists of them, or a file), or leaflets=N if one is both"
         )
     rest = [part for part in parts if not any(part in own for own in chosen)]
     if len(parts) > 1:

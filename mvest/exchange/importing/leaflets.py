@@ -134,11 +134,6 @@ class Seen:
     contents: tuple[Content, ...]
     frame: int | None
 
-    @property
-    def name(self) -> str:
-        """What the frame is called."""
-        return "open" if self.role is Role.REFERENCE else "closed"
-
 
 def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     """Make a case of the leaflets of an open valve, or of an open and a closed one.
@@ -194,10 +189,11 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
             surface, done = without_crossings(
                 surface, options.smoothing_mm, thickened=one.role is Role.REFERENCE
             )
-            derived += [f"{one.name} frame: {done}"] * bool(done)
+            name = "closed" if frames else "open"
+            derived += [f"{name} frame: {done}"] * bool(done)
             anterior = surface.vertices[surface.annulus[len(surface.annulus) // 4]]
             load = (CLOSED_AT, options.pressure_mmHg or 0.0) if frames else (0.0, 0.0)
-            frames.append(FoundFrame(one.name, one.role, *load, surface, tips, surface.thickness))
+            frames.append(FoundFrame(name, one.role, *load, surface, tips, surface.thickness))
     if len(frames) > 1:
         derived.append(f"time of the closed frame: {CLOSED_AT:g} s of a generic cardiac cycle")
         if options.tips_closed is None:

@@ -57,6 +57,16 @@ def test_one_surface_for_all(valve: Valve, whole: Path, options: LeafletsOptions
     assert any("1 mm by voxels, smoothing and observer_mm=1" in line for line in case.derived)
 
 
+def test_a_closed_frame_has_the_leaflets_of_the_open_one(
+    whole: Path, options: LeafletsOptions
+) -> None:
+    both = replace(options, closed=str(whole), pressure_mmHg=100.0, edge_mm=2.5)
+    opened, closed = import_leaflets(whole, both).frames
+    np.testing.assert_array_equal(closed.region, opened.region)
+    np.testing.assert_allclose(closed.vertices, opened.vertices, atol=0.3)
+    assert (closed.pressure_mmHg, closed.corresponds) == (100.0, False)
+
+
 def test_lengths_in_metres(whole: Path, options: LeafletsOptions, tmp_path: Path) -> None:
     surface = read_surface(whole)
     path = tmp_path / "valve.ply"
