@@ -73,7 +73,7 @@ def outcome(enter: Enter, path: Path) -> tuple[str, str]:
             return "memory", words
         if not (named and words.isprintable() and len(short) <= MAX_LETTERS):
             return "message", words
-        return ("stopped" if "reading it took" in words else "refused"), words
+        return ("stopped" if "(limits " in words else "refused"), words
     except Late:
         return "slow", f"more than {MAX_SECONDS} s"
     except Exception as error:
