@@ -19,6 +19,7 @@ from mvest.files import write_atomically
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping
+from mvest.reading.text import one_line
 
 SWEEPS = "sweeps"
 """Folder of the published sweeps within the results."""
@@ -146,7 +147,7 @@ class Sweep(Frozen):
             raise InputError(f"{where} is no collected sweep: {error}") from error
         except ValidationError as error:
             first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
+            place = one_line(".".join(map(str, first["loc"])), 80)
             raise InputError(f"{where} is no collected sweep: {place}: {first['msg']}") from error
         require_sealed(data, where)
         return sweep

@@ -64,6 +64,8 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
     try:
         fields = nrrd.read_header(list(dict.fromkeys(lines)))  # old writers repeat "space"
         kind = {key: fields[key] for key in ("type", "endian") if key in fields}
+        if fields["encoding"].lower() in ("ascii", "text", "txt"):
+            kind["endian"] = "little"  # text has no order of bytes
         empty = {**kind, "encoding": "raw", "dimension": 1, "sizes": np.zeros(1, dtype=int)}
         dtype = nrrd.read_data(empty, io.BytesIO()).dtype
     except Exception as error:  # pynrrd fails in many ways on a damaged header

@@ -22,8 +22,7 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.surfaces import SurfaceFile, read_surface
-from mvest.reading.bounded import refusing
-from mvest.reading.text import one_line
+from mvest.reading.text import one_line, refusing
 from mvest.typing import FloatArray, IntArray
 
 MERGE_TOLERANCE = 1e-5

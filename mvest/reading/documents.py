@@ -1,9 +1,7 @@
 """JSON and YAML files as plain data: mappings, lists, text, numbers, and nothing else.
 
-Both are of bounded size and depth, with finite numbers and each key once.
-
-Of YAML nothing is built but from the events of the parser, each looked at first. Tags (which ask
-for objects), aliases (with which a short text can grow without bound), repeated keys and endless
+Both are of bounded size, with finite numbers and each key once. Of YAML, tags (which ask for
+objects), aliases (with which a short text can grow without bound), repeated keys and endless
 nesting are refused, and so are numbers that only YAML reads as such: hexadecimal, octal,
 sexagesimal, with underscores.
 """
@@ -21,35 +19,35 @@ import yaml
 from mvest.errors import InputError
 from mvest.reading.text import MAX_TEXT, check_words, number, one_line, read_bytes, read_text
 
-MAX_JSON_DEPTH = 50
 MAX_INTEGER = 2**64
 """Beyond any seed, count or size; no array of NumPy holds a larger one."""
 MAX_REAL = 1.8e308
 
 
-def read_json(path: Path, max_size: int = MAX_TEXT, where: str = "") -> Any:
-    """What a file of JSON holds; an error calls it ``where`` or by its path.
+def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[str, Any]:
+    """The mapping that a file of JSON holds; an error calls it ``where`` or by its path.
 
     Raises
     ------
     InputError
-        If it cannot be read or is larger than ``max_size`` bytes, is no JSON, nests too deeply,
-        repeats a key, or holds NaN, an infinity, an integer of more than 64 bits, or half of a
-        surrogate pair.
+        If it cannot be read, is larger than ``max_size`` bytes, holds something else, or is
+        refused by `parse_json`.
     """
-    return parse_json(read_bytes(path, max_size, where), where or str(path))
-
-
-def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[str, Any]:
-    """The mapping that a file of JSON holds: see `read_json`."""
-    data = read_json(path, max_size, where)
+    data = parse_json(read_bytes(path, max_size, where), where or str(path))
     if not isinstance(data, dict):
         raise InputError(f"{where or path}: holds a {type(data).__name__}, expected a mapping")
     return data
 
 
 def parse_json(content: bytes | str, where: str) -> Any:
-    """What a text of JSON says; ``where`` names it in an error. See `read_json`."""
+    """What a text of JSON says; ``where`` names it in an error.
+
+    Raises
+    ------
+    InputError
+        If it is no JSON, repeats a key, or holds NaN, an infinity, an integer of more than 64 bits,
+        or half of a surrogate pair.
+    """
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
         data = json.loads(
@@ -59,27 +57,12 @@ def parse_json(content: bytes | str, where: str) -> Any:
             parse_float=_real,
             object_pairs_hook=_mapping,
         )
-        _check_depth(data)
         if "\\u" in text:
             # Halves of surrogate pairs come from escapes only.
             json.dumps(data, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as fault:
         raise InputError(f"{where} is not JSON: {one_line(fault, 120)}") from fault
     return data
-
-
-def _check_depth(data: Any) -> None:
-    level = [data]
-    for _ in range(MAX_JSON_DEPTH):
-        level = [
-            item
-            for holder in level
-            if isinstance(holder, dict | list)
-            for item in (holder.values() if isinstance(holder, dict) else holder)
-        ]
-        if not level:
-            return
-    raise ValueError(f"nested more than {MAX_JSON_DEPTH} deep")
 
 
 def _refuse(constant: str) -> NoReturn:
@@ -106,14 +89,12 @@ def _mapping(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 MAX_FILE_SIZE = 1_000_000
 """Bytes; a description of a case is a few thousand."""
-MAX_YAML_DEPTH = 20
+MAX_DEPTH = 20
 MAX_VALUES = 50_000
 """Of lists and mappings together; numbers of all vertices of a dozen rims are a few thousand."""
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """That of libyaml is fifty times as fast, and not everywhere."""
-_RESOLVER = yaml.resolver.Resolver()
-_KIND = "tag:yaml.org,2002:"
 _INTEGER = re.compile(r"[+-]?(?:0|[1-9][0-9]*)", re.ASCII)
 
 
@@ -128,99 +109,79 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     text = read_text(path, MAX_FILE_SIZE)
     try:
-        data = _Document(path, yaml.parse(text, Loader=_LOADER)).read()
+        _check_events(path, yaml.parse(text, Loader=_LOADER))
+        node = yaml.compose(text, Loader=_LOADER)
     except (yaml.YAMLError, ValueError) as fault:
         # The parser reads escapes of characters that there are not.
         if isinstance(fault, InputError):
             raise
         raise InputError(f"{path}: no valid YAML: {one_line(fault, 160)}") from fault
+    data = None if node is None else _plain(path, node, ())
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds a {type(data).__name__}, expected a mapping of fields")
     return data
 
 
-class _Document:
-    """The one document of a file, from its events."""
-
-    def __init__(self, path: Path, events: Iterator[yaml.Event]) -> None:
-        self._path, self._events = path, events
-        self._values = 0
-
-    def read(self) -> Any:
-        """Its plain data; None if there is none."""
-        event = self._next()
-        while isinstance(event, yaml.StreamStartEvent | yaml.DocumentStartEvent):
-            event = self._next()
-        if isinstance(event, yaml.StreamEndEvent):
-            return None
-        data = self._value(event, "", 0)
-        self._next()
-        event = self._next()
-        if not isinstance(event, yaml.StreamEndEvent):
-            raise self._wrong(event, "a second document; expected one")
-        return data
-
-    def _next(self) -> Any:
-        event = next(self._events)
+def _check_events(path: Path, events: Iterator[Any]) -> None:
+    """Refuse, before anything is built, what can grow without bound or asks for objects."""
+    depth = 0
+    for count, event in enumerate(events):
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise self._wrong(event, "anchors and aliases are not used here; write the value out")
-        tag = getattr(event, "tag", None)
-        if tag is not None:
-            raise self._wrong(
-                event, f"tag {tag[:40]!r} asks for an object; expected plain values only"
-            )
-        return event
+            wrong = "anchors and aliases are not used here; write the value out"
+        elif getattr(event, "tag", None) is not None:
+            wrong = f"tag {event.tag[:40]!r} asks for an object; expected plain values only"
+        elif count > MAX_VALUES:
+            wrong = f"more than {MAX_VALUES} values"
+        elif depth > MAX_DEPTH:
+            wrong = f"nested more than {MAX_DEPTH} deep"
+        else:
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            continue
+        raise InputError(f"{path}: line {event.start_mark.line + 1}: {one_line(wrong, 120)}")
 
-    def _value(self, event: Any, field: str, depth: int) -> Any:
-        self._values += 1
-        if self._values > MAX_VALUES:
-            raise self._wrong(event, f"more than {MAX_VALUES} values")
-        if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event, field)
-        if depth >= MAX_YAML_DEPTH:
-            raise self._wrong(event, f"nested more than {MAX_YAML_DEPTH} deep")
-        inner = f"{field}." if field else ""
-        if isinstance(event, yaml.SequenceStartEvent):
-            items: list[Any] = []
-            while not isinstance(event := self._next(), yaml.SequenceEndEvent):
-                items.append(self._value(event, f"{inner}{len(items)}", depth + 1))
-            return items
-        mapping: dict[Any, Any] = {}
-        while not isinstance(event := self._next(), yaml.MappingEndEvent):
-            if not isinstance(event, yaml.ScalarEvent):
-                raise self._wrong(event, "a key is no single word or number")
-            key, name = self._scalar(event, inner + event.value), inner + event.value
-            if key in mapping:
-                line = event.start_mark.line + 1
-                raise InputError(
-                    f"{self._path}: {one_line(name, 80)}: occurs twice (again in line {line}); "
-                    "keep one"
-                )
-            mapping[key] = self._value(self._next(), name, depth + 1)
-        return mapping
 
-    def _scalar(self, event: yaml.ScalarEvent, field: str) -> str | int | float | bool | None:
-        text = event.value
-        tag = _RESOLVER.resolve(yaml.ScalarNode, text, event.implicit).removeprefix(_KIND)
+def _plain(path: Path, node: Any, place: tuple[str, ...]) -> Any:
+    """Plain data of a node; ``place`` are the keys that lead to it."""
+    where = f"{path}: {one_line('.'.join(place), 80)}"
+    line = node.start_mark.line + 1
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(path, item, (*place, str(k))) for k, item in enumerate(node.value)]
+    if isinstance(node, yaml.ScalarNode):
         try:
-            if tag == "null":
-                return None
-            if tag == "bool":
-                return bool(yaml.SafeLoader.bool_values[text.lower()])
-            if tag == "int":
-                if not _INTEGER.fullmatch(text):
-                    raise InputError(f"{one_line(repr(text), 40)}, expected a decimal number")
-                return int(number(text))
-            if tag == "merge":
-                raise InputError("a merge key; write its fields out")
-            if tag == "timestamp":
-                raise InputError(f"{text!r} is a date; put text in quotes")
-            return number(text) if tag == "float" else check_words(text)
+            return _scalar(node.tag.rpartition(":")[2], node.value)
         except InputError as fault:
-            line = event.start_mark.line + 1
+            raise InputError(f"{where}: found {fault} (line {line})") from fault
+    mapping: dict[Any, Any] = {}
+    for name, value in node.value:
+        if not isinstance(name, yaml.ScalarNode):
+            raise InputError(f"{path}: line {line}: a key is no single word or number")
+        inner = (*place, name.value)
+        key = _plain(path, name, inner)
+        if key in mapping:
+            line = name.start_mark.line + 1
             raise InputError(
-                f"{self._path}: {one_line(field, 80)}: found {fault} (line {line})"
-            ) from fault
+                f"{path}: {one_line('.'.join(inner), 80)}: occurs twice (again in line {line}); "
+                "keep one"
+            )
+        mapping[key] = _plain(path, value, inner)
+    return mapping
 
-    def _wrong(self, event: Any, what: str) -> InputError:
-        return InputError(f"{self._path}: line {event.start_mark.line + 1}: {what}")
+
+def _scalar(kind: str, text: str) -> str | int | float | bool | None:
+    match kind:
+        case "null":
+            return None
+        case "bool":
+            return bool(yaml.SafeLoader.bool_values[text.lower()])
+        case "int" if not _INTEGER.fullmatch(text):
+            raise InputError(f"{one_line(repr(text), 40)}, expected a decimal number")
+        case "int":
+            return int(number(text))
+        case "float":
+            return number(text)
+        case "merge":
+            raise InputError("a merge key; write its fields out")
+        case "timestamp":
+            raise InputError(f"{text!r} is a date; put text in quotes")
+    return check_words(text)

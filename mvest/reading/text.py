@@ -10,13 +10,13 @@ import io
 import math
 import re
 import stat
-from collections.abc import Iterable, Sequence
-from itertools import islice
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError, MvestError, cannot_write
 from mvest.typing import FloatArray, IntArray
 
 MAX_TEXT = 2**26
@@ -114,63 +114,62 @@ def one_line(text: object, max_length: int = MAX_LINE) -> str:
     return line if len(line) <= max_length else line[: max_length - 3] + "..."
 
 
-def read_columns(
-    file: Path,
-    names: Sequence[str],
-    *,
-    strict: bool = False,
-    count: int | None = None,
-    where: str = "",
-) -> dict[str, list[str]]:
-    """Columns of a table by their names, as text.
+@contextmanager
+def refusing(path: Path, what: str) -> Iterator[None]:
+    """Let nothing out but errors of this package, in one line that names the file.
+
+    Raises
+    ------
+    MvestError
+        As raised within, cut to `MAX_LINE` characters; an `InputError` for everything else.
+    """
+    try:
+        yield
+    except Exception as error:
+        known = isinstance(error, MvestError)
+        kind = type(error) if known else InputError
+        words = str(error).removeprefix(f"{path}: ") or type(error).__name__
+        words = words if known else f"damaged or no {what}: {words}"
+        raise kind(f"{path}: {one_line(words, MAX_LINE - len(path.name) - 2)}") from error
+
+
+def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str, list[str]]:
+    """Columns of a table by their names, as text; they come in any order.
 
     Parameters
     ----------
     file : Path
     names : sequence of str
         Of all columns.
-    strict : bool
-        Whether they come in this order, with no space around them and without empty rows.
-    count : int, optional
-        Of rows; no more are looked at.
     where : str
         What an error calls the file; its path without.
 
     Raises
     ------
     InputError
-        The file cannot be read, its header or the number of its rows is another, a row is too short
-        or too long, or a cell is no text.
+        The file cannot be read or is no text, its header is another, it has no rows, or a row is
+        too short or too long.
     """
     where = where or str(file)
-    stream = io.StringIO(read_text(file, where=where), newline="")
+    text = read_text(file, where=where)
     try:
-        rows = csv.reader(stream, strict=True)
-        stripped = ([cell.strip() for cell in row] for row in rows)
-        filled = rows if strict else filter(any, stripped)
-        header = next(filled, [])
-        if header != list(names) if strict else sorted(header) != sorted(names):
-            raise InputError(
-                f"{where}: columns {one_line(','.join(header), 80) or 'none'}, expected "
-                f"{one_line(','.join(names), 120)}"
-            )
-        found = list(islice(filled, None if count is None else count + 1))
-    except csv.Error as fault:
+        check_words(text, MAX_TEXT)
+        cells = csv.reader(io.StringIO(text, newline=""), strict=True)
+        rows = [row for row in ([cell.strip() for cell in row] for row in cells) if any(row)]
+    except (InputError, csv.Error) as fault:
         raise InputError(f"{where}: no comma-separated text: {fault}") from fault
-    for row, cells in enumerate(found[:count]):
-        if len(cells) != len(header):
-            raise InputError(f"{where}: row {row} has {len(cells)} cells, expected {len(header)}")
-    if not found or (count is not None and len(found) != count):
-        shown = f"more than the {count}" if count and len(found) > count else f"{len(found)}"
-        raise InputError(f"{where}: {shown} rows, expected {count or 'some below the header'}")
-    for row, cells in enumerate(found):
-        for name, cell in zip(header, cells, strict=True):
-            try:
-                check_words(cell)
-            except InputError as fault:
-                raise InputError(f"{where}: {name} of row {row}: {fault}") from fault
-    columns = zip(*found, strict=True)
-    return {name: list(column) for name, column in zip(header, columns, strict=True)}
+    header = rows[0] if rows else []
+    if sorted(header) != sorted(names):
+        raise InputError(
+            f"{where}: columns {one_line(','.join(header), 80) or 'none'}, expected "
+            f"{one_line(','.join(names), 120)}"
+        )
+    for number, row in enumerate(rows[1:]):
+        if len(row) != len(header):
+            raise InputError(f"{where}: row {number} has {len(row)} cells, expected {len(header)}")
+    if len(rows) < 2:
+        raise InputError(f"{where}: no rows, expected some below the header")
+    return dict(zip(header, map(list, zip(*rows[1:], strict=True)), strict=True))
 
 
 def numbers(
@@ -195,16 +194,10 @@ def indices(file: Path, name: str, cells: Sequence[str]) -> IntArray:
 
 
 def read_numbers(
-    file: Path,
-    names: Sequence[str],
-    *,
-    strict: bool = False,
-    count: int | None = None,
-    max_abs: float = MAX_NUMBER,
-    where: str = "",
+    file: Path, names: Sequence[str], max_abs: float = MAX_NUMBER, where: str = ""
 ) -> FloatArray:
     """A table of finite numbers, ``(rows, columns)`` in the order of ``names``: `read_columns`."""
-    columns = read_columns(file, names, strict=strict, count=count, where=where)
+    columns = read_columns(file, names, where)
     where = where or str(file)
     return np.column_stack([numbers(where, name, columns[name], max_abs) for name in names])
 

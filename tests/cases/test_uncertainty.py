@@ -150,7 +150,7 @@ GOOD = {
     [
         ({"frames": np.array(["closed", "open"])}, r"frames \['closed', 'open'\], expected"),
         ({"frames": np.array([0, 1])}, "frames an array of int64"),
-        ({"frames": np.array(NAMES, dtype=object)}, "without pickles"),
+        ({"frames": np.array(NAMES, dtype=object)}, "plain arrays"),
         ({"more": np.zeros(1)}, "holds arrays more"),
         ({"vertices": np.zeros((5, 2, 81, 3))}, "vertices of 2 frames of 81 points"),
     ],

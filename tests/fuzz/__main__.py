@@ -1,4 +1,4 @@
-"""Damaged files for all readers for a while, and a table of how they ended."""
+"""Damaged files at all doors for a while, and a table of how they ended."""
 
 from __future__ import annotations
 
@@ -9,66 +9,46 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.fuzz.child import Child
-from tests.fuzz.readers import READERS
-from tests.fuzz.trial import Bench
+from tests.fuzz.doors import DOORS
+from tests.fuzz.trial import ENDS, FAULTS, Bench
 from tests.places import ROOT
 
-ROUND = 200
-"""Inputs of a reader before it is the next one's turn."""
-COLUMNS = ("read", "refused", "outside", "message", "memory", "slow", "died")
+ROUND = 50
+"""Inputs of a door before it is the next one's turn."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--seed", type=int, default=0, help="of the first input")
-    parser.add_argument("--reader", action="append", choices=sorted(READERS), default=None)
-    parser.add_argument("--failed", type=Path, default=ROOT / "outputs" / "fuzz")
+    parser.add_argument("--door", action="append", choices=sorted(DOORS), default=None)
     given = parser.parse_args()
-    end = time.monotonic() + given.seconds
-    counts: dict[str, Counter[str]] = {}
-    with tempfile.TemporaryDirectory() as folder, Child() as child:
-        benches = [
-            Bench(READERS[name], Path(folder), child) for name in given.reader or sorted(READERS)
-        ]
-        for bench in benches:
-            bad = [found.words for found in bench.whole if found.kind != "read"]
-            if bad:
-                sys.exit(f"{bench.reader.name}: a valid file is refused: {bad[0]}")
-            counts[bench.reader.name] = Counter()
-        seed = given.seed
+    end, seed = time.monotonic() + given.seconds, given.seed
+    counts: dict[str, Counter[str]] = {name: Counter() for name in given.door or DOORS}
+    with tempfile.TemporaryDirectory() as folder:
+        benches = {name: Bench(*DOORS[name], Path(folder) / name) for name in counts}
         while time.monotonic() < end:
-            for bench in benches:
-                for one in range(seed, seed + ROUND):
-                    if time.monotonic() >= end:
-                        break
-                    _try(bench, one, counts[bench.reader.name], given.failed)
+            for name, bench in benches.items():
+                counts[name].update(_end(name, bench, one) for one in range(seed, seed + ROUND))
             seed += ROUND
-    _print_table(counts, given.seed, seed)
-    return int(any(count[kind] for count in counts.values() for kind in COLUMNS[2:]))
+    print(f"seeds {given.seed} to {seed - 1}")
+    print(f"{'door':16}" + "".join(f"{name:>10}" for name in ("inputs", *ENDS)))
+    for name, count in [*counts.items(), ("all", sum(counts.values(), Counter()))]:
+        print(f"{name:16}{count.total():>10}" + "".join(f"{count[kind]:>10}" for kind in ENDS))
+    return int(any(count[kind] for count in counts.values() for kind in FAULTS))
 
 
-def _try(bench: Bench, seed: int, count: Counter[str], failed: Path) -> None:
-    number, changes, content = bench.drawn(seed)
-    found = bench.tried(content, number)
-    count[found.kind] += 1
-    if found.faulty:
-        path = bench.paths[number]
-        place = failed / bench.reader.name / f"{seed}-{number}{''.join(path.suffixes)}"
+def _end(name: str, bench: Bench, seed: int) -> str:
+    """How an input ends; what is at fault, or meets the limits of the child, is kept."""
+    number, content = bench.damaged(seed)
+    kind, words = bench.tried(content, number)
+    if kind not in ("read", "refused"):
+        suffixes = "".join(bench.paths[number].suffixes)
+        place = ROOT / "outputs" / "fuzz" / name / f"{seed}-{number}{suffixes}"
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content)
-        names = " ".join(change.name for change in changes)
-        words = found.words.encode("unicode_escape").decode()
-        print(f"{bench.reader.name} {seed} ({names}): {found.kind}: {words[:400]}", flush=True)
-
-
-def _print_table(counts: dict[str, Counter[str]], first: int, end: int) -> None:
-    print(f"seeds {first} to {end - 1}")
-    print(f"{'reader':24}{'inputs':>10}" + "".join(f"{name:>10}" for name in COLUMNS))
-    total: Counter[str] = sum(counts.values(), Counter())
-    for name, count in [*counts.items(), ("all", total)]:
-        print(f"{name:24}{count.total():>10}" + "".join(f"{count[k]:>10}" for k in COLUMNS))
+        print(f"{name} {seed}: {kind}: {words.encode('unicode_escape').decode()[:400]}", flush=True)
+    return kind
 
 
 if __name__ == "__main__":

@@ -1,68 +1,108 @@
-"""Examples of a reader, made once, and inputs made of them one after another."""
+"""How a door ends on a file, within limits of memory and of computing."""
 
 from __future__ import annotations
 
+import os
 import random
-from collections.abc import Callable
-from dataclasses import dataclass
+import resource
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
-from tests.fuzz.child import Child, Outcome
-from tests.fuzz.mutation import Change, changed, random_changes
+from mvest.errors import MvestError
+from tests.fuzz.mutation import changed
 
-__all__ = ["Bench", "Reader"]
+MAX_SECONDS, MAX_BYTES, MAX_LETTERS = 5, 2**30, 300
+"""Of computing in this process; of memory beside what it has; of a message, its folder aside."""
+FAULTS = ("outside", "message", "memory", "slow")
+ENDS = ("read", "refused", "stopped", *FAULTS)
 
-Maker = Callable[[Path], Path]
+
+Enter = Callable[[Path], object]
+"""Takes a file, or the folder that it is in; what it returns does not matter."""
+Makers = tuple[Callable[[Path], Path], ...]
+"""Each writes valid files into an empty folder, and returns the one that is damaged."""
 
 
-@dataclass(frozen=True)
-class Reader:
-    """An entry of the table of readers.
-
-    Attributes
-    ----------
-    name
-        ``ROOM.KIND``, also the folder of its stored inputs.
-    read
-        Reads a file, or the folder that it is in; what it returns does not matter.
-    makers
-        Write valid files into an empty folder; each returns the one that is damaged.
-    """
-
-    name: str
-    read: Callable[[Path], object]
-    makers: tuple[Maker, ...]
+class Late(BaseException):
+    """More than `MAX_SECONDS` of computing."""
 
 
 class Bench:
-    """The examples of one reader in a folder, each written over by what is made of it."""
+    """The valid files of a door in a folder, each written over by what is made of it."""
 
-    def __init__(self, reader: Reader, folder: Path, child: Child) -> None:
-        self.reader, self.child = reader, child
-        self.paths: list[Path] = []
-        self.contents: list[bytes] = []
-        for number, maker in enumerate(reader.makers):
-            place = folder / f"{reader.name}-{number}"
-            place.mkdir(parents=True)
-            path = maker(place)
-            self.paths.append(path)
-            self.contents.append(path.read_bytes())
-        self.whole = [self.child.read(reader.name, path, limited=False) for path in self.paths]
-        """How the valid files are read, which also loads what the reader needs."""
+    def __init__(self, enter: Enter, makers: Makers, folder: Path) -> None:
+        self.enter, self.paths = enter, list[Path]()
+        for number, maker in enumerate(makers):
+            (folder / str(number)).mkdir(parents=True)
+            self.paths.append(maker(folder / str(number)))
+        self.contents = [path.read_bytes() for path in self.paths]
+        self.whole = [outcome(self.enter, path) for path in self.paths]
+        """How the valid files are read, which also loads what the door needs."""
 
-    def tried(self, content: bytes, number: int = 0) -> Outcome:
-        """How the reader ends on bytes in the place of an example."""
+    def damaged(self, seed: int) -> tuple[int, bytes]:
+        """The number of a valid file, and bytes made of it; both follow from a number."""
+        draw = random.Random(seed)
+        number = draw.randrange(len(self.paths))
+        return number, changed(self.contents[number], draw)
+
+    def tried(self, content: bytes, number: int = 0) -> tuple[str, str]:
+        """How the door ends on bytes in the place of a valid file, and in which words."""
         path = self.paths[number]
         path.write_bytes(content)
-        found = self.child.read(self.reader.name, path)
-        if found.kind in ("slow", "died"):
-            # The new process has to load first what the reader needs.
+        with limited():
+            found = outcome(self.enter, path)
+        if found[0] == "stopped":
+            # The next child is started here, as it would have the limits of this process.
             path.write_bytes(self.contents[number])
-            self.child.read(self.reader.name, path, limited=False)
+            outcome(self.enter, path)
         return found
 
-    def drawn(self, seed: int) -> tuple[int, list[Change], bytes]:
-        """Number of an example, and its changes, that follow from a number."""
-        draw = random.Random(seed)
-        number, changes = draw.randrange(len(self.paths)), random_changes(draw)
-        return number, changes, changed(self.contents[number], changes)
+
+def outcome(enter: Enter, path: Path) -> tuple[str, str]:
+    """One of `ENDS`, and the message."""
+    try:
+        enter(path)
+    except MvestError as error:
+        words = str(error)
+        short = words.replace(f"{path.parent}{os.sep}", "")
+        named = words.startswith(f"{path.parent}") or path.name in words
+        if of_memory(error):
+            return "memory", words
+        if not (named and words.isprintable() and len(short) <= MAX_LETTERS):
+            return "message", words
+        return ("stopped" if "(limits " in words else "refused"), words
+    except Late:
+        return "slow", f"more than {MAX_SECONDS} s"
+    except Exception as error:
+        return ("memory" if of_memory(error) else "outside"), f"{type(error).__name__}: {error}"
+    return "read", ""
+
+
+def of_memory(error: BaseException | None) -> bool:
+    """Whether there was too little memory, whatever it was made into."""
+    while error is not None and not isinstance(error, MemoryError):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+@contextmanager
+def limited() -> Iterator[None]:
+    """At most so much more than has been used."""
+
+    def late(number: int, frame: object) -> NoReturn:
+        raise Late
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    handler = signal.signal(signal.SIGPROF, late)
+    resource.setrlimit(resource.RLIMIT_AS, (taken + MAX_BYTES, before[1]))
+    signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        signal.signal(signal.SIGPROF, handler)

@@ -1,7 +1,6 @@
-"""Arrays of others: declared sizes against the file's, and every damage one line."""
+"""Arrays of others: stated sizes against the file's, and every damage one line."""
 
 import io
-import time
 import tracemalloc
 import zipfile
 
@@ -9,8 +8,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.reading import bounded
-from mvest.reading.npz import check_array, read_npz
+from mvest.reading import npz
+from mvest.reading.npz import read_npz
 
 
 def npy(descr="'<f8'", shape="(2,)", data=bytes(16), version=b"\x01\x00"):
@@ -54,7 +53,6 @@ def test_arrays_are_those_that_were_written(tmp_path):
         (npy(shape="(1000000000000, 0)", data=b""), "does not fit"),
         (npy(shape="(-1,)"), "shape"),
         (npy(shape="(2, -1, -1)"), "shape"),
-        (npy(shape="(" + "1," * 40 + ")", data=bytes(8)), "shape"),
         (npy("'|O'"), "plain arrays"),
         (npy("[('a', '<f8')]"), "plain arrays"),
         (npy("'<U2000000000'", "()", b""), "cannot be read"),
@@ -100,11 +98,6 @@ def unknown_method(path):
     path.write_bytes(content)
 
 
-def twice(path):
-    with pytest.warns(UserWarning, match="Duplicate"):
-        packed(path, npy(), names=("a.npy", "a.npy"))
-
-
 def damaged_stream(path):
     packed(path, npy(data=bytes(range(16))), zipfile.ZIP_DEFLATED)
     content = bytearray(path.read_bytes())
@@ -132,9 +125,17 @@ def nothing(_path):
 
 @pytest.mark.parametrize(
     "make",
-    [encrypted, other_method, unknown_method, twice, damaged_stream, wrong_checksum, cut_off,
-     a_folder, nothing],
-)  # fmt: skip
+    [
+        encrypted,
+        other_method,
+        unknown_method,
+        damaged_stream,
+        wrong_checksum,
+        cut_off,
+        a_folder,
+        nothing,
+    ],
+)
 def test_a_damaged_archive_is_one_line(tmp_path, make):
     path = tmp_path / "a.npz"
     make(path)
@@ -145,18 +146,15 @@ def test_a_damaged_archive_is_one_line(tmp_path, make):
 
 
 def test_a_small_file_makes_no_large_array(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded, "MAX_UNASKED", 10**6)
+    monkeypatch.setattr(npz, "MAX_BYTES", 10**6)
     content = npy(shape="(4000000,)", data=bytes(32_000_000))
     path = packed(tmp_path / "a.npz", content, zipfile.ZIP_DEFLATED)
-    assert path.stat().st_size < 40_000
-    start = time.process_time()
     tracemalloc.start()
     with pytest.raises(InputError, match="bytes of arrays, expected at most"):
         read_npz(path)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 10**6
-    assert time.process_time() - start < 1
     # What is not asked for is not made either.
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("b.npy", npy())
@@ -176,24 +174,3 @@ def test_a_stream_is_read_as_a_file(tmp_path):
     assert read_npz(io.BytesIO(content), where="it")["a"].tolist() == [0, 0]
     with pytest.raises(InputError, match=r"^it: cannot be read"):
         read_npz(io.BytesIO(content[:9]), where="it")
-
-
-@pytest.mark.parametrize(
-    ("array", "kind", "shape", "words"),
-    [
-        (np.zeros(3), "f", (2,), r"x is float64 of shape \(3,\), expected finite numbers"),
-        (np.zeros(3, int), "f", (3,), "int64"),
-        (np.array([1.0, np.nan]), "f", (2,), "x has values that are not finite"),
-        (np.array([2**63], np.uint64), "i", (1,), "64 bits"),
-        (np.array(["a"]), "i", (1,), "expected integers"),
-        (np.zeros((1, 2)), "f", (None,), r"\(any,\)"),
-    ],
-)
-def test_what_an_array_must_be(array, kind, shape, words):
-    with pytest.raises(InputError, match=words):
-        check_array(array, "x", kind, shape)
-
-
-def test_numbers_are_of_64_bits():
-    assert check_array(np.zeros((0, 2), ">f4"), "x", "f", (None, 2)).dtype == np.float64
-    assert check_array(np.array([3], np.uint8), "x", "i", (1,)).dtype == np.int64

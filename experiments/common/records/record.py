@@ -20,6 +20,7 @@ from mvest.files import PREFIX, sha256_of, write_atomically
 from mvest.problem.record import EstimateRecord
 from mvest.provenance import provenance, require_sealed, sealed, write_json
 from mvest.reading.documents import read_mapping
+from mvest.reading.text import one_line
 from mvest.reporting.tables import Table
 
 if TYPE_CHECKING:
@@ -368,7 +369,7 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
         record = Record.model_validate(known)
     except ValidationError as error:
         first = error.errors()[0]
-        field = ".".join(map(str, first["loc"])) or "it"
+        field = one_line(".".join(map(str, first["loc"])) or "it", 80)
         raise InputError(f"{where} is no record of a run: {field}: {first['msg']}") from error
     require_sealed(data, where)
     if arrays is not None and data.get(ARRAYS) != (sha256_of(arrays) if arrays.is_file() else None):

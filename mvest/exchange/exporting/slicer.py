@@ -21,8 +21,8 @@ from mvest.files import write_atomically
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.volume import VolumeSequence
 from mvest.problem.fields import CaseFields, read_case_fields
-from mvest.reading.bounded import refusing
 from mvest.reading.npz import read_npz
+from mvest.reading.text import refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import principal_stretches
 

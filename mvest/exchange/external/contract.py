@@ -325,8 +325,11 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _read_table(file: Path, header: Sequence[str], count: int | None) -> FloatArray:
-    """Finite numbers ``(count, columns)`` below a header; nothing is read beyond what is asked."""
-    return read_numbers(file, header, strict=True, count=count, max_abs=math.inf, where=file.name)
+    """Finite numbers ``(count, columns)`` below a header."""
+    table = read_numbers(file, header, max_abs=math.inf, where=file.name)
+    if count is not None and len(table) != count:
+        raise InputError(f"{file.name}: {len(table)} rows, expected {count}")
+    return table
 
 
 def _write_table(file: Path, header: Sequence[str], rows: FloatArray) -> None:

@@ -1,0 +1,215 @@
+"""Files that grow to gigabytes, or claim to: refused in one line, by the readers and by command."""
+
+import base64
+import gzip
+import struct
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import cli
+from mvest.cases.folder import read_case
+from mvest.errors import MvestError
+from mvest.exchange.markups import read_markups
+from mvest.exchange.surfaces import read_surface
+from mvest.exchange.volumes import read_volume
+from mvest.imaging.volume import Modality
+from tests.cases import folders
+from tests.exchange.variants import MARKUPS, SURFACES, VOLUMES
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits are those of Linux")
+
+MIB = 2**20
+LONG = b"1" + 400 * b"0"
+VARIANTS = {str(variant): variant for variant in (*SURFACES, *VOLUMES, *MARKUPS)}
+VTP = "VTP: text, plain, UInt64, LittleEndian, Int64"
+VTU = "VTU: text, plain, UInt64, LittleEndian, Int64"
+NRRD = "NRRD by pynrrd: .seq.nrrd, frames last, gzip, uint8"
+META = "MetaImage: .mha, 4D, uint8, compressed"
+DICOM = "Philips Cartesian DICOM: explicit, preamble"
+Change = Callable[[bytes], bytes]
+
+
+def zeros(mib: int) -> bytes:
+    """Zeros as zlib packs them, soon: each MiB but the first is packed alike after a full flush."""
+    stream = zlib.compressobj(9)
+    first, again = (stream.compress(bytes(MIB)) + stream.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
+    return first + again * (mib - 1) + stream.flush()
+
+
+def gzip_of_zeros(mib: int) -> bytes:
+    return gzip.compress(b"")[:10] + zeros(mib)[2:]
+
+
+def replaced(old: bytes, new: bytes) -> Change:
+    def change(whole: bytes) -> bytes:
+        assert old in whole
+        return whole.replace(old, new, 1)
+
+    return change
+
+
+def vtk_bomb(whole: bytes, appended: bool = False, mib: int = 4096) -> bytes:
+    """Points that are one compressed block of zeros."""
+    packed = zeros(mib)
+    head = struct.pack("<4Q", 1, mib * MIB, 0, len(packed))
+    whole = whole.replace(b"<VTKFile ", b'<VTKFile compressor="vtkZLibDataCompressor" ')
+    start = whole.index(b'format="ascii"', whole.index(b'Name="Points"'))
+    end = whole.index(b"</DataArray>", start)
+    if not appended:
+        text = base64.b64encode(head) + base64.b64encode(packed)
+        return whole[:start] + b'format="binary">' + text + whole[end:]
+    tail = b'<AppendedData encoding="raw">_' + head + packed + b"</AppendedData></VTKFile>"
+    rest = whole[end:].replace(b"</VTKFile>", tail)
+    return whole[:start] + b'format="appended" offset="0">' + rest
+
+
+def billion_laughs(whole: bytes) -> bytes:
+    """Entities of entities: a few bytes of XML that stand for gigabytes of text."""
+    rows = [b'<!ENTITY a0 "0 0 0 0 0 0 0 0 0 0 ">']
+    rows += [b'<!ENTITY a%d "%s">' % (k, b"&a%d;" % (k - 1) * 10) for k in range(1, 10)]
+    start = whole.index(b">", whole.index(b'Name="Points"')) + 1
+    body = whole[:start] + b"&a9;" + whole[whole.index(b"</DataArray>", start) :]
+    return b'<?xml version="1.0"?><!DOCTYPE VTKFile [' + b"".join(rows) + b"]>" + body
+
+
+def nrrd_bomb(whole: bytes) -> bytes:
+    """Voxels of 17 kB by their header, which inflate to 4 GiB."""
+    return whole[: whole.index(b"\n\n") + 2] + gzip_of_zeros(4096)
+
+
+def nifti_bomb(whole: bytes) -> bytes:
+    return gzip.compress(gzip.decompress(whole)[:352]) + gzip_of_zeros(4096)
+
+
+def meta_bomb(whole: bytes) -> bytes:
+    return whole[: whole.index(b"LOCAL\n") + 6] + zeros(4096)
+
+
+def dicom_long(whole: bytes) -> bytes:
+    """Voxels whose length is said to be almost 4 GiB."""
+    at = whole.index(b"\xe0\x7f\x10\x00OB\0\0") + 8
+    return whole[:at] + struct.pack("<I", 0xFFFFFFF0) + whole[at + 4 :]
+
+
+HOSTILE: dict[str, tuple[str, Change]] = {
+    "VTP inflates to 4 GiB": (VTP, vtk_bomb),
+    "appended VTP inflates to 4 GiB": (VTP, lambda whole: vtk_bomb(whole, True)),
+    "VTU inflates to 4 GiB": (VTU, vtk_bomb),
+    "VTP of entities of entities": (VTP, billion_laughs),
+    "VTP of 2^40 points": (VTP, replaced(b'NumberOfPoints="5"', b'NumberOfPoints="1099511627776"')),
+    "VTP of an index without end": (VTP, replaced(b"0 1 2", b"0 1 " + LONG)),
+    "VTP of an index that is not there": (VTP, replaced(b"0 1 2", b"0 1 5")),
+    "VTP of an index below 0": (VTP, replaced(b"0 1 2", b"0 1 -1")),
+    "VTP of offsets that fall": (VTP, replaced(b"3 6 9", b"6 3 9")),
+    "VTU of offsets that fall": (VTU, replaced(b"3 6 9", b"6 3 9")),
+    "VTP in an unknown encoding": (
+        VTP, lambda whole: b'<?xml version="1.0" encoding="x"?>' + whole
+    ),
+    "VTK of 2^31 points": (
+        "VTK: 4.2, binary, int32, scalars", replaced(b"POINTS 5", b"POINTS 2147483647")
+    ),
+    "VTK of points that are no numbers": (
+        "VTK: 4.2, text, int32, scalars", replaced(b"20 0 0 ", b"nan 0 0 ")
+    ),
+    "STL of 2^32 triangles": (
+        "STL: VTK binary", lambda whole: whole[:80] + b"\xff" * 4 + whole[84:]
+    ),
+    "STL cut off": ("STL: VTK binary", lambda whole: whole[:-60]),
+    "PLY of 10^12 vertices": (
+        "PLY: binary little endian, float, uchar", replaced(b"vertex 5", b"vertex 1000000000000")
+    ),
+    "PLY of an index that is not there": ("PLY: ascii, float, uchar", replaced(b"0 1 2", b"0 1 9")),
+    "OBJ of an index without end": ("OBJ: groups", replaced(b"f 1 2 3", b"f 1 2 " + LONG)),
+    "OBJ in another encoding": ("OBJ: groups", lambda whole: whole.decode().encode("utf-16")),
+    "GLB of 2^40 rows": ("GLB: one mesh", replaced(b'"count":5', b'"count":1099511627776')),
+    "NRRD inflates to 4 GiB": (NRRD, nrrd_bomb),
+    "NRRD of 9000^3 voxels": (NRRD, replaced(b"16 17 21 3", b"9000 9000 9000 3")),
+    "NRRD skips 10^9 lines": (NRRD, replaced(b"encoding", b"line skip: 1000000000\nencoding")),
+    "NRRD skips 10^30 bytes": (NRRD, replaced(b"encoding", b"byte skip: 1" + LONG + b"\nencoding")),
+    "NRRD cut off": (NRRD, lambda whole: whole[:-3000]),
+    "NIfTI inflates to 4 GiB": ("NIfTI: NIfTI-1, uint8, .nii.gz", nifti_bomb),
+    "MetaImage inflates to 4 GiB": (META, meta_bomb),
+    "MetaImage of 10^400 voxels": (META, replaced(b"16 17 21 3", b"16 17 21 " + LONG)),
+    "MetaImage in another folder": (
+        META, lambda whole: whole[: whole.index(b"LOCAL")] + b"/dev/zero\n"
+    ),
+    "DICOM with a value of 4 GiB": (DICOM, dicom_long),
+    "markups of a number without end": ("Markups: 1.0.3, LPS", replaced(b"-6.25", LONG)),
+    "markups of 5000 digits": ("Markups: 1.0.3, LPS", replaced(b"-6.25", b"1" * 5000)),
+    "nested markups": ("Markups: 1.0.3, LPS", lambda _: b"[" * 10**6),
+}  # fmt: skip
+
+
+def read(path: Path) -> object:
+    if path.suffix == ".json":
+        return read_markups(path)
+    if path.suffix in (".nrrd", ".gz", ".mha", ".dcm"):
+        unit = {"time_unit": "s"} if path.suffix == ".mha" else {}
+        return read_volume(path, modality=Modality.ULTRASOUND, **unit)
+    return read_surface(path)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_it_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    variant, change = VARIANTS[HOSTILE[name][0]], HOSTILE[name][1]
+    path = tmp_path / variant.file
+    variant.write(path)
+    read(path)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(MvestError) as caught:
+        read(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert message.isprintable()
+    assert len(message) < 400 + len(str(path))
+
+
+def zip_bomb(path: Path, mib: int = 4096) -> None:
+    """4 GiB of zeros as each array of a ``.npz``, 12 MB large."""
+    text = f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({mib * MIB},), }}".encode()
+    head = np.lib.format.magic(1, 0) + struct.pack("<H", 118) + text.ljust(117) + b"\n"
+    stream = zlib.compressobj(9, wbits=-zlib.MAX_WBITS)
+    packed = stream.compress(head) + stream.flush(zlib.Z_FULL_FLUSH) + zeros(mib)[2:-4]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("frames", "vertices", "tips"):
+            archive.writestr(f"{name}.npy", packed)
+        # The directory at the end, which is what counts, says that they are compressed.
+        for member in archive.infolist():
+            member.compress_type, member.file_size = zipfile.ZIP_DEFLATED, len(head) + mib * MIB
+
+
+def test_a_zip_bomb_in_a_case(tmp_path: Path) -> None:
+    document = folders.plain_folder(tmp_path / "case")
+    document["observation"] = {
+        "std_mm": 0.7, "correlation_length_mm": 10, "error_samples": "errors.npz"
+    }  # fmt: skip
+    folders.save(tmp_path / "case", document)
+    zip_bomb(tmp_path / "case" / "errors.npz")
+    with pytest.raises(MvestError, match=r"errors\.npz: \d+ bytes of arrays"):
+        read_case(tmp_path / "case")
+
+
+@pytest.mark.parametrize("name", ["gzip", "zlib in XML", "entities of XML", "zip"])
+def test_a_bomb_is_one_line_of_the_command(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / {"gzip": "a.nii.gz", "zip": "a.nii.gz"}.get(name, "a.vtp")
+    if name == "zip":
+        zip_bomb(path)
+    else:
+        wanted = "NIfTI: NIfTI-1, uint8, .nii.gz" if name == "gzip" else VTP
+        bomb = {"gzip": nifti_bomb, "zlib in XML": vtk_bomb}.get(name, billion_laughs)
+        VARIANTS[wanted].write(path)
+        path.write_bytes(bomb(path.read_bytes()))
+    given = ["tips=[-16,0,-25,16,0,-25]"]
+    assert cli.main(["import", "leaflets", str(path), str(tmp_path / "case"), *given]) == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1
+    assert path.name in said.err
+    assert not (tmp_path / "case").exists()

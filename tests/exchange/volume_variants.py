@@ -1,0 +1,262 @@
+"""Volumes and label maps in the variants that SimpleITK, nibabel, pynrrd and slicerio write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import nrrd
+import numpy as np
+import pydicom
+import SimpleITK
+import slicerio
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
+from scipy.spatial.transform import Rotation
+
+from tests.exchange.variant import Variant
+
+SHAPE = (3, 16, 17, 21)
+SPACING = np.array([1.5, 1.25, 1.0])
+ORIGIN = np.array([-12.5, 4.0, 30.25])
+DIRECTION = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
+TIMES = np.array([0.0, 0.04, 0.08])
+"""s"""
+RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+AFFINE = np.eye(4)
+"""LPS"""
+AFFINE[:3, :3], AFFINE[:3, 3] = DIRECTION * SPACING, ORIGIN
+
+
+def frames(dtype: str = "uint8") -> np.ndarray:
+    """Voxels ``(T, I, J, K)``, different wherever axes are swapped."""
+    return np.random.default_rng(7).integers(0, 100, SHAPE).astype(dtype)
+
+
+def label_map() -> np.ndarray:
+    """Voxels ``(I, J, K)`` of an anterior (1) and a posterior leaflet (2)."""
+    result = np.zeros(SHAPE[1:], dtype=np.uint8)
+    result[3:8, 4:12, 5:15], result[8:14, 4:12, 5:15] = 1, 2
+    return result
+
+
+def itk(values: np.ndarray, step: float = 0.04) -> SimpleITK.Image:
+    """An image of three or, with time as the last, of four axes."""
+    image = SimpleITK.GetImageFromArray(
+        np.ascontiguousarray(values.transpose(*range(values.ndim - 3), -1, -2, -3)), isVector=False
+    )
+    more, size = values.ndim - 3, values.ndim
+    direction = np.eye(size)
+    direction[:3, :3] = DIRECTION
+    image.SetSpacing([*SPACING, *[step] * more])
+    image.SetOrigin([*ORIGIN, *[0.0] * more])
+    image.SetDirection(direction.ravel().tolist())
+    return image
+
+
+def by_itk(path: Path, what: str, dtype: str, packed: str) -> None:
+    values = frames(dtype)
+    image = itk(values if what == "4D" else values[0])
+    SimpleITK.WriteImage(image, str(path), packed == "compressed")
+
+
+def nifti(path: Path, version: str, dtype: str, more: str = "") -> None:
+    values = frames(dtype)
+    values = values[0] if more == "3D" else np.moveaxis(values, 0, 3)
+    kind = nibabel.Nifti2Image if version == "NIfTI-2" else nibabel.Nifti1Image
+    image = kind(values * 1.0 if more == "scaled" else values, RAS @ AFFINE)
+    if more in ("sform only", "qform only"):
+        image.set_sform(RAS @ AFFINE, code=int(more == "sform only"))
+        image.set_qform(RAS @ AFFINE, code=int(more == "qform only"))
+    image.set_data_dtype(dtype)
+    image.header.set_xyzt_units("mm", "sec" if more == "seconds" else "msec")
+    if more != "3D":
+        image.header["pixdim"][4] = 0.04 if more == "seconds" else 40
+    nibabel.save(image, path)
+
+
+def directions(axis: int | None) -> np.ndarray:
+    """Rows of ``space directions``: none for the axis of frames."""
+    rows = (DIRECTION * SPACING).T
+    return rows if axis is None else np.insert(rows, axis, np.nan, axis=0)
+
+
+TEXT_INDEX = ("phases as text", "slicerio with phases as text")
+
+
+def header(axis: int | None, encoding: str = "gzip") -> dict[str, Any]:
+    """As 3D Slicer writes it, with the frames along an axis or without frames."""
+    result: dict[str, Any] = {
+        "space": "left-posterior-superior",
+        "space directions": directions(axis),
+        "kinds": ["domain"] * 3,
+        "space origin": ORIGIN,
+        "encoding": encoding,
+    }
+    if axis is not None:
+        result["kinds"].insert(axis, "list")
+        for name, word in (("labels", "time"), ("units", "s")):
+            result[name] = [word if n == axis else "" for n in range(4)]
+        result[f"axis {axis} index type"] = "numeric"
+        result[f"axis {axis} index values"] = " ".join(map(str, TIMES))
+    return result
+
+
+def by_pynrrd(path: Path, frames_first: str, encoding: str, dtype: str) -> None:
+    axis = 0 if frames_first == "frames first" else 3
+    nrrd.write(str(path), np.moveaxis(frames(dtype), 0, axis), header(axis, encoding))
+
+
+def more_nrrd(path: Path, what: str) -> None:
+    """Conventions of Slicer's versions and of ITK."""
+    fields, values = header(0), frames()
+    if what == "RAS":
+        fields["space"] = "right-anterior-superior"
+        fields["space directions"] = directions(0) * [-1, -1, 1]
+        fields["space origin"] = ORIGIN * [-1, -1, 1]
+    elif what == "milliseconds":
+        fields["units"] = ["ms", "", "", ""]
+        fields["axis 0 index values"] = "0 40 80"
+    elif what == "multivolume":
+        for name in ("labels", "units", "axis 0 index type", "axis 0 index values"):
+            del fields[name]
+        fields["MultiVolume.FrameLabels"] = "0,40,80"
+        fields["MultiVolume.FrameIdentifyingDICOMTagUnits"] = "ms"
+    elif what == "phases as text":
+        del fields["units"]
+        fields |= {"axis 0 index type": "text", "axis 0 index values": "ED mid%20systole ES"}
+    elif what.startswith("slicerio"):
+        made = [{"voxels": frame, "ijkToLPS": AFFINE} for frame in values]
+        times: dict[str, Any] = {"index_values": list(map(str, TIMES))}
+        if what == "slicerio with phases as text":
+            times = {"index_values": ["ED", "mid", "ES"], "index_type": "text", "index_unit": ""}
+        slicerio.write_volume(str(path), slicerio.create_sequence(made, **times))
+        return
+    elif what == "3D":
+        fields, values = header(None), values[0]
+    nrrd.write(str(path), values, fields)
+
+
+def segments(path: Path, what: str) -> None:
+    """A segmentation by slicerio, as Slicer has it since 4.11, or without its keys as before."""
+    made = slicerio.create_segmentation(SHAPE[1:], AFFINE)
+    for label, name in ((1, "mitral_anterior_leaflet"), (2, "mitral_posterior_leaflet")):
+        mask = label_map() == label
+        if what == "overlapping layers":
+            mask = np.roll(mask, 2 * (label == 1), axis=0)
+        slicerio.add_segment(made, mask, {"id": f"Segment_{label}", "name": name})
+    if what == "an empty layer":
+        made["voxels"] = np.stack([made["voxels"], np.zeros_like(made["voxels"])])
+        made["segments"].append({"id": "Segment_3", "name": "annulus", "labelValue": 1, "layer": 1})
+    slicerio.write_segmentation(str(path), made)
+    if what == "before 4.11":
+        values, fields = nrrd.read(str(path))
+        kept = {k: v for k, v in fields.items() if not k.endswith(("LabelValue", "Layer"))}
+        both = np.stack([values == label for label in (1, 2)]).astype(np.uint8)
+        kept |= {"kinds": ["list", *["domain"] * 3], "space directions": directions(0)}
+        nrrd.write(str(path), both, kept)
+
+
+def map_of_labels(path: Path, what: str) -> None:
+    """Labels 1 and 2 in a plain image, or among empty frames."""
+    values = label_map()
+    if what in ("int16", "int64", "float32", "float64"):
+        values = values.astype(what)
+    if what in ("4D in ms", "4D without a unit"):
+        image = nibabel.Nifti1Image(np.stack([values * 0, values, values * 0], 3), RAS @ AFFINE)
+        if what == "4D in ms":
+            image.header.set_xyzt_units("mm", "msec")
+            image.header["pixdim"][4] = 40
+        nibabel.save(image, path)
+    elif path.suffix == ".gz":
+        nibabel.save(nibabel.Nifti1Image(values, RAS @ AFFINE, dtype=values.dtype), path)
+    else:
+        SimpleITK.WriteImage(itk(values), str(path))
+
+
+PHILIPS = "1.2.840.113543.6.6.1.3.10002"
+"""Class of Philips Cartesian DICOM: 3D echo over time in private fields, lengths in cm."""
+
+
+def philips(path: Path, syntax: str, start: str) -> None:
+    """As QLAB exports it; voxels of the class have no direction but their own axes."""
+    values = frames()
+    count, i, j, k = values.shape
+    data = Dataset()
+    data.SOPClassUID, data.Modality, data.FrameTime = PHILIPS, "US", "40"
+    data.PhysicalUnitsXDirection = data.PhysicalUnitsYDirection = 3
+    data.PhysicalDeltaX, data.PhysicalDeltaY, _ = SPACING / 10
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.NumberOfFrames, data.Rows, data.Columns = count, j, i
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
+    data.add_new((0x3001, 0x0010), "LO", "Philips3D")
+    for element, kind, value in ((1, "UL", k), (2, "US", 3), (3, "FD", SPACING[2] / 10)):
+        data.add_new((0x3001, 0x1000 + element), kind, value)
+    voxels = values.transpose(0, 3, 2, 1).tobytes()
+    data.add_new((0x7FE0, 0x0010), "OB", voxels + b"\0" * (len(voxels) % 2))
+    if start == "bare":
+        pydicom.dcmwrite(path, data, implicit_vr=syntax == "implicit", little_endian=True)
+        return
+    data.file_meta = FileMetaDataset()
+    data.file_meta.MediaStorageSOPClassUID = PHILIPS
+    data.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
+    data.file_meta.TransferSyntaxUID = (
+        ImplicitVRLittleEndian if syntax == "implicit" else ExplicitVRLittleEndian
+    )
+    pydicom.dcmwrite(path, data, enforce_file_format=True)
+
+
+def volume_variants() -> Iterator[Variant]:
+    """Images, their times in s, in ms or without unit."""
+    for options in product(("NIfTI-1", "NIfTI-2"), ("uint8", "int16", "float32")):
+        for name in ("a.nii", "a.nii.gz"):
+            yield Variant("NIfTI", (*options, name[1:]), name, lambda p, o=options: nifti(p, *o))
+    for what in ("sform only", "qform only", "scaled", "seconds", "3D"):
+        yield Variant(
+            "NIfTI", (what,), "a.nii.gz", lambda p, w=what: nifti(p, "NIfTI-1", "int16", w)
+        )
+    for name, *options in product(
+        ("a.mha", "a.mhd"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
+    ):
+        yield Variant(
+            "MetaImage", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
+            given={"time_unit": "s"} if "4D" in options else {},
+        )  # fmt: skip
+    for name, *options in product(
+        ("a.nrrd", "a.nhdr"), ("3D", "4D"), ("uint8", "int16", "float32"), ("plain", "compressed")
+    ):
+        yield Variant(
+            "NRRD by ITK", (name[1:], *options), name, lambda p, o=options: by_itk(p, *o),
+            given={"time_unit": "s"} if "4D" in options else {},
+        )  # fmt: skip
+    for name, *options in product(
+        ("a.seq.nrrd", "a.nhdr"), ("frames first", "frames last"), ("raw", "gzip", "bzip2", "text"),
+        ("uint8", "int16", "float32"),
+    ):  # fmt: skip
+        yield Variant(
+            "NRRD by pynrrd", (name[1:], *options), name, lambda p, o=options: by_pynrrd(p, *o)
+        )
+    for what in ("RAS", "milliseconds", "multivolume", "3D", "slicerio", *TEXT_INDEX):
+        yield Variant(
+            "NRRD", (what,), "a.seq.nrrd", lambda p, w=what: more_nrrd(p, w),
+            given={"frame_interval_s": 0.04} if what in TEXT_INDEX else {},
+        )  # fmt: skip
+    for options in product(("explicit", "implicit"), ("preamble", "bare")):
+        yield Variant(
+            "Philips Cartesian DICOM", options, "a.dcm", lambda p, o=options: philips(p, *o)
+        )
+
+
+def label_variants() -> Iterator[Variant]:
+    """Label maps of one frame, or of one that is not empty."""
+    for what in ("one layer", "overlapping layers", "an empty layer", "before 4.11"):
+        yield Variant(
+            "Slicer segmentation", (what,), "a.seg.nrrd", lambda p, w=what: segments(p, w)
+        )
+    kinds = ("uint8", "int16", "int64", "float32", "float64")
+    for form, name in (("NRRD", "a.nrrd"), ("MetaImage", "a.mha"), ("NIfTI", "a.nii.gz")):
+        for what in (*kinds, *(("4D in ms", "4D without a unit") if form == "NIfTI" else ())):
+            yield Variant(f"{form} labels", (what,), name, lambda p, w=what: map_of_labels(p, w))
