@@ -26,6 +26,9 @@ MAX_BYTES = 4 * 2**30
 
 Twenty frames of CT, 512 x 512 x 300 voxels of two bytes, have 2.9 GiB.
 """
+MAX_UNASKED, MAX_RATIO = 2**28, 1000
+"""Bytes that any compressed file may hold, and how many times its own size beyond that: images of
+the heart have 1.5 to 20 times, label maps some hundred."""
 COPIES = 3
 """Of the voxels, that a reader may hold for a while beside 1 GiB."""
 BYTES_PER_SECOND = 2**25
@@ -160,6 +163,12 @@ def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
     """What a file states, its voxels, and the SHA-256 of all of its bytes."""
     found: dict[str, Any] = in_child(_plausible.about, path, labels, *options)
     size, files = found.pop("bytes"), _files(path, found.pop("data_file"))
+    stored = sum(file.stat().st_size for file in files)
+    if size > max(MAX_UNASKED, MAX_RATIO * stored):
+        raise InputError(
+            f"{path}: data: {size} bytes compressed to {stored}, expected at most {MAX_RATIO} "
+            "times as many; save it without compression"
+        )
     memory_gb = round(COPIES * size / 2**30 + 1, 1)
     limits = {"memory_gb": memory_gb, "seconds": 60 + size // BYTES_PER_SECOND}
     digest = hashlib.sha256()

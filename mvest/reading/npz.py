@@ -96,6 +96,28 @@ def read_npz(
         ) from fault
 
 
+def check_array(
+    array: NDArray[Any], where: str, kind: str, shape: Sequence[int | None]
+) -> NDArray[Any]:
+    """An array as text (kind U), or as 64-bit integers (i) or finite numbers (f), of a shape.
+
+    A length of None fits any. ``where`` names the array in an error.
+
+    Raises
+    ------
+    InputError
+        It is of another kind or shape, or holds numbers that are not finite.
+    """
+    sizes = zip(shape, array.shape, strict=False)
+    fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)
+    if not fits or array.dtype.kind not in {"i": "iu"}.get(kind, kind):
+        wanted = {"i": "integers", "f": "finite numbers", "U": "text"}[kind]
+        raise InputError(f"{where} is {array.dtype} of shape {array.shape}, expected {wanted}")
+    if kind == "f" and not np.isfinite(array).all():
+        raise InputError(f"{where} has values that are not finite")
+    return array if kind == "U" else array.astype({"f": np.float64, "i": np.int64}[kind])
+
+
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, where: str) -> NDArray[Any]:
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise InputError(f"{where}: compressed otherwise than NumPy does")

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mvest.errors import GeometryError, InputError, require_numbers
 from mvest.files import write_atomically
@@ -26,7 +25,7 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.processes import side_by_side
 from mvest.provenance import config_hash
 from mvest.quantities import Factor, Length, Logarithm, Modulus
-from mvest.reading.npz import read_npz
+from mvest.reading.npz import check_array, read_npz
 from mvest.simulation.motion import MotionSettings, RefusedError, close_in_motion
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
@@ -271,20 +270,6 @@ def save_population(path: Path, population: Population) -> None:
     write_atomically(path, partial(np.savez_compressed, **arrays))
 
 
-def _checked(
-    array: NDArray[Any], where: str, kind: str, shape: tuple[int | None, ...]
-) -> NDArray[Any]:
-    """An array as text (kind U) or as 64-bit integers (i) or finite numbers (f) of a shape."""
-    sizes = zip(shape, array.shape, strict=False)
-    fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)
-    if not fits or array.dtype.kind not in {"i": "iu"}.get(kind, kind):
-        wanted = {"i": "integers", "f": "finite numbers", "U": "text"}[kind]
-        raise InputError(f"{where} is {array.dtype} of shape {array.shape}, expected {wanted}")
-    if kind == "f" and not np.isfinite(array).all():
-        raise InputError(f"{where} has values that are not finite")
-    return array if kind == "U" else array.astype({"f": np.float64, "i": np.int64}[kind])
-
-
 def load_population(path: Path) -> Population:
     """Read what :func:`save_population` wrote.
 
@@ -295,7 +280,7 @@ def load_population(path: Path) -> Population:
     """
     stored = read_npz(path, list(ARRAYS), exact=True)
     arrays: dict[str, Any] = {
-        name: _checked(stored[name], f"{path}, {name}", kind, shape)
+        name: check_array(stored[name], f"{path}, {name}", kind, shape)
         for name, (kind, shape) in ARRAYS.items()
     }
     if arrays["version"] != VERSION:

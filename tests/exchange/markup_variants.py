@@ -57,7 +57,7 @@ def fcsv(path: Path, version: str, system: str) -> None:
     lines = [f"# Markups fiducial file version = {version}", f"# CoordinateSystem = {system}"]
     if version == "2":
         first, columns = "label", "x,y,z,sel,vis"
-        lines = ["# Fiducial List file /tmp/F.fcsv", "# version = 2", "# name = F"]
+        lines = ["# Fiducial List file F.fcsv", "# version = 2", "# name = F"]
     lines.append(f"# columns = {first},{columns}")
     for k, (label, position) in enumerate(zip(LABELS, POSITIONS, strict=True)):
         x, y, z = position if system in ("LPS", "1") else position * [-1, -1, 1]

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-import yaml
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.chord_layout import FAMILIES
-from mvest.cases.folder import read_case
 from mvest.cases.rims import two_loops
-from mvest.cases.schema import CASE_FILE
-from mvest.cases.tissue import CHORD_COLUMNS, GENERIC_THICKNESS
+from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
 from mvest.exchange.importing.joining import (
     REGIONS,
@@ -27,10 +23,9 @@ from mvest.exchange.importing.joining import (
     joined,
 )
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
+from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.exchange.markups import TO_LPS
 from mvest.exchange.regions import RegionSurface
-from mvest.exchange.surfaces import write_surface
-from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 
@@ -153,12 +148,11 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     try:
         chosen = _chosen(source, options, derived)
         phases = _placed(chosen, options, derived)
-        case = _as_case(phases, options, derived)
+        return _as_case(phases, options, derived)
     except MvestError as fault:
         words = str(fault)
         start = "" if words.startswith(str(source)) else f"{source}: "
         raise type(fault)(f"{start}{words}") from fault
-    return replace(case, sha256="")
 
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
@@ -311,25 +305,6 @@ def _rms(points: FloatArray, edges: FloatArray) -> float:
 def _as_case(
     phases: Sequence[_Phase], options: SlicerheartOptions, derived: list[str]
 ) -> ValveCase:
-    """Write the frames as a folder and read it: the checks and rules of every case."""
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        document = _document(folder, phases, options, derived)
-        text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-        (folder / CASE_FILE).write_text(text, encoding="utf-8")
-        try:
-            return read_case(folder)
-        except MvestError as fault:
-            words = str(fault).replace(f"{folder / CASE_FILE}: ", "").replace(str(folder), "")
-            raise type(fault)(words) from fault
-
-
-def _document(
-    folder: Path,
-    phases: Sequence[_Phase],
-    options: SlicerheartOptions,
-    derived: list[str],
-) -> dict[str, Any]:
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
     if len(phases) > 1:
         derived.append("times: by the order of the phases in a generic cardiac cycle")
@@ -338,33 +313,27 @@ def _document(
                 f"pressure: {pressure:g} mmHg on the closed valve assumed, none on the open one; "
                 "pressure_mmHg=... states it"
             )
-    frames: list[dict[str, Any]] = []
-    for number, phase in enumerate(phases):
-        file = f"{number}.vtp"
-        surface, labels = phase.surface, {"region": np.asarray(phase.surface.region)}
-        write_surface(folder / file, surface.vertices, surface.triangles, {}, labels)
-        frame = {"name": phase.name, "role": phase.role.value, "surface": file}
-        frames.append(frame | {"papillary_tips": phase.tips.tolist(), "time": 0.0, "pressure": 0.0})
-        if phase.role is not Role.REFERENCE:
-            time = max(frames[-2]["time"] + 0.01, TIMES.get(phase.seen.phase, 0.6))
-            frames[-1] |= {"time": time, "pressure": float(pressure), "corresponds": False}
+    frames: list[FoundFrame] = []
+    for one in phases:
+        at, load = 0.0, 0.0
+        if one.role is not Role.REFERENCE:
+            at, load = max(frames[-1].time + 0.01, TIMES.get(one.seen.phase, 0.6)), pressure
+        frames.append(FoundFrame(one.name, one.role, at, load, one.surface, one.tips))
+    chordae = _chordae(phases[0], derived)
     stated = {"std_mm": options.std_mm, "correlation_length_mm": CORRELATED_MM}
-    return {
-        "version": 1,
+    document = {
         "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
         "source": "SlicerHeart",
-        "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
         "regions": list(REGIONS),
         "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
-        "frames": frames,
-        **_chordae(folder, phases[0], derived),
         **({} if options.std_mm is None else {"observation": stated}),
         "derived": derived,
     }
+    return case_of_frames(frames, document, chordae)
 
 
-def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, Any]:
-    """Write the table of chordae, if there are any; returns its entry in ``case.yaml``.
+def _chordae(reference: _Phase, derived: list[str]) -> list[tuple[object, ...]]:
+    """Rows of the table of chordae; none if the export has none.
 
     Raises
     ------
@@ -373,7 +342,7 @@ def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, A
     """
     seen, surface = reference.seen, reference.surface
     if not len(seen.chords):
-        return {}
+        return []
     loops = [surface.vertices[k] for k in two_loops(surface.vertices, surface.triangles)]
     edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
     away = np.linalg.norm(seen.chords[:, 0, None] - reference.tips, axis=2)
@@ -388,10 +357,8 @@ def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, A
     each = 2 * np.array([marginal, basal]) / np.maximum(count, 1)
     names = np.array(FAMILIES)[family]
     columns = (away.argmin(axis=1), *insertion.T, names, seen.chord_lengths, each[family])
-    rows = zip(*(column.tolist() for column in columns), strict=True)
-    write_columns(folder / "chordae.csv", CHORD_COLUMNS, rows)
     derived.append(
         f"chordae: {len(family)} of the export, as long as there; the {count[0]} within "
         f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
     )
-    return {"chordae": {"file": "chordae.csv", "families": list(FAMILIES)}}
+    return list(zip(*(column.tolist() for column in columns), strict=True))

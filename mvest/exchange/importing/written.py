@@ -12,11 +12,14 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Role, ValveCase
+from mvest.cases.chord_layout import FAMILIES
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
+from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import MvestError
 from mvest.exchange.regions import RegionSurface
 from mvest.exchange.surfaces import write_surface
+from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
 
@@ -34,7 +37,11 @@ class FoundFrame:
     thickness: FloatArray | None = None
 
 
-def case_of_frames(frames: Sequence[FoundFrame], document: Mapping[str, Any]) -> ValveCase:
+def case_of_frames(
+    frames: Sequence[FoundFrame],
+    document: Mapping[str, Any],
+    chordae: Sequence[Sequence[object]] = (),
+) -> ValveCase:
     """The case of frames without common vertices, with the checks and rules of every case.
 
     Parameters
@@ -43,6 +50,8 @@ def case_of_frames(frames: Sequence[FoundFrame], document: Mapping[str, Any]) ->
         The reference and others.
     document
         Further fields of ``case.yaml``.
+    chordae
+        Rows of a table with `CHORD_COLUMNS`, if the chordae are known.
 
     Raises
     ------
@@ -61,6 +70,10 @@ def case_of_frames(frames: Sequence[FoundFrame], document: Mapping[str, Any]) ->
             entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
             apart = {} if one.role is Role.REFERENCE else {"corresponds": False}
             entries.append(entry | {"pressure": float(one.pressure)} | apart)
+        if chordae:
+            write_columns(folder / "chordae.csv", CHORD_COLUMNS, chordae)
+            known = {"chordae": {"file": "chordae.csv", "families": list(FAMILIES)}}
+            document = {**document, **known}
         units = {"length": "mm", "pressure": "mmHg", "time": "s"}
         whole = {"version": 1, "units": units, **document, "frames": entries}
         text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)
