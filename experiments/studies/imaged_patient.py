@@ -227,7 +227,7 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     (place / TRUTH).mkdir(parents=True)
     # The source of what is simulated names the patient; a file has its name alone.
     write_sequence_nrrd(place / VOLUME, volume)
-    frames = CaseFrames(0, made.closed, float(made.pressure_mmHg[made.closed]))
+    frames = CaseFrames(0, made.closed, made.pressure_mmHg)
     true = true_sequence(made.valve, probe)
     write_case(place / HIDDEN / KNOWN, _known_case(true, frames, patient))
     segmented = _segmented_case(
@@ -237,7 +237,7 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     write_json(
         place / TRUTH / REVEALED,
         {
-            "values": dict(made.hidden.values),
+            "values": dict(made.values),
             "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
             "made_from": dict(described),
             "anatomies_drawn": draws,

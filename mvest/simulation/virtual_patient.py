@@ -78,11 +78,12 @@ class Deviations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hidden:
-    """What the case of a virtual patient does not say.
+class VirtualPatient:
+    """A simulated case, and what it does not say.
 
     Attributes
     ----------
+    case : ValveCase
     values : mapping
         Parameter -> true value: the moduli in MPa, factors on what the case states, and the
         displacement of the leaflets as they were seen.
@@ -91,16 +92,9 @@ class Hidden:
         the displacement included.
     """
 
+    case: ValveCase
     values: Mapping[str, float]
     positions: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VirtualPatient:
-    """A simulated case, and what it hides."""
-
-    case: ValveCase
-    hidden: Hidden
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +242,7 @@ def simulate_patient(
         for frame, vertices in close_patient(name, model, values, simulation).items()
     }
     case = _case(name, description, seen, true, simulation, mechanics, rng)
-    return VirtualPatient(case, Hidden(dict(values), {REFERENCE: seen.surface.vertices, **true}))
+    return VirtualPatient(case, dict(values), {REFERENCE: seen.surface.vertices, **true})
 
 
 def patient_model(

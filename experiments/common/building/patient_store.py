@@ -97,8 +97,8 @@ def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> N
     folder = root / "hidden"
     folder.mkdir(parents=True)
     write_case(root / "case", made.case)
-    arrays: dict[str, Any] = dict(made.hidden.positions)
+    arrays: dict[str, Any] = dict(made.positions)
     np.savez_compressed(folder / POSITIONS, **arrays)
-    values = dict(made.hidden.values)
+    values = dict(made.values)
     about = {"values": values, "made_from": dict(described), "anatomies_drawn": draws}
     write_json(folder / HIDDEN, about)
