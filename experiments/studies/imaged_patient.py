@@ -56,7 +56,6 @@ from mvest.simulation.drawn_patient import (
     PatientSettings,
     draw_patient_values,
     first_that_closes,
-    require_patient,
 )
 from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion import MotionSettings
@@ -175,11 +174,8 @@ def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
 
 
 # -- the patient ----------------------------------------------------------------------------------
-def make_imaged_patient(
-    values: Values, patient: PatientSettings | None, echo: EchoSettings
-) -> Path:
+def make_imaged_patient(values: Values, patient: PatientSettings, echo: EchoSettings) -> Path:
     """Simulate and image the configured patient, unless that was done: the folder where it lies."""
-    patient = require_patient(patient)
     described = {
         "patient": {
             key: values["patient"][key]

@@ -30,7 +30,6 @@ from mvest.simulation.virtual_patient import (
     PatientSimulation,
     close_patient,
     held_states,
-    patient_model,
 )
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
@@ -132,8 +131,7 @@ def simulate_imaged_patient(
     contact = with_tip_motion(
         template.valve(simulation.contact_columns, simulation.contact_rows), shift
     )
-    model = patient_model(template, seen, contact, own, simulation, mechanics)
-    later = close_patient(name, model, own, simulation)
+    later = close_patient(name, template, seen, contact, own, simulation, mechanics)
     tips = [state.papillary_tips for state in held_states(simulation, contact).values()]
     shapes = [seen.surface.vertices, *closing.vertices[1:-1], *later.values()]
     closed = len(closing.vertices) - 1

@@ -14,7 +14,7 @@ from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.problem.registration import REGISTRATION
 from mvest.simulation import imaged_patient as patients
-from mvest.simulation import motion, population
+from mvest.simulation import motion, population, virtual_patient
 from mvest.simulation.imaged_patient import simulate_imaged_patient
 from mvest.simulation.motion import (
     ClosingFrames,
@@ -519,7 +519,7 @@ def made(monkeypatch):
         return closure
 
     monkeypatch.setattr(patients, "closing_frames", close)
-    monkeypatch.setattr(patients, "patient_model", model)
+    monkeypatch.setattr(virtual_patient, "_model", model)
     wide = MotionLimits(2.0, 50.0, 50.0, 10.0, 100_000)
     displaced = dict.fromkeys(REGISTRATION, 3.0)
     simulation = replace(SIMULATION, contact_columns=32, contact_rows=9)
