@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import REGISTRATION
@@ -93,7 +92,7 @@ def simulate_imaged_patient(
     simulation: PatientSimulation,
     settings: MotionSettings,
     mechanics: MechanicsSettings,
-    tip_motion: FloatArray | None = None,
+    tip_motion: FloatArray,
 ) -> ImagedPatient:
     """Close a template as a patient's valve.
 
@@ -110,7 +109,7 @@ def simulate_imaged_patient(
         left out for those of ``simulation``.
     mechanics : MechanicsSettings
         Its pressure is what is stated.
-    tip_motion : ndarray, optional
+    tip_motion : ndarray
         ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
 
     Raises
@@ -119,17 +118,15 @@ def simulate_imaged_patient(
         If the valve does not close, or not as a valve does.
     """
     own = {parameter: v for parameter, v in values.items() if parameter not in REGISTRATION}
-    shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
-    layout = ValveLayout(settings.columns, settings.rows)
     if not mechanics.protocol.equilibrium:
         raise InputError(
             "mechanics protocol equilibrium = False, expected True for a patient who is imaged"
         )
     # The coarse closure first: it is soon refused.
-    closing = closing_frames(name, template, own, settings, mechanics, shift)
-    seen = with_tip_motion(template.valve(layout.columns, layout.rows), shift)
+    closing = closing_frames(name, template, own, settings, mechanics, tip_motion)
+    seen = with_tip_motion(template.valve(settings.columns, settings.rows), tip_motion)
     contact = with_tip_motion(
-        template.valve(simulation.contact_columns, simulation.contact_rows), shift
+        template.valve(simulation.contact_columns, simulation.contact_rows), tip_motion
     )
     later = close_patient(name, template, seen, contact, own, simulation, mechanics)
     tips = [state.papillary_tips for state in held_states(simulation, contact).values()]

@@ -569,4 +569,4 @@ def test_chord_ratios_are_true_lengths_over_what_they_span_in_the_closed_valve(m
 def test_an_imaged_patient_is_in_equilibrium():
     moving = replace(MECHANICS, protocol=replace(MECHANICS.protocol, equilibrium=False))
     with pytest.raises(InputError, match="equilibrium = False, expected True"):
-        simulate_imaged_patient("p", TEMPLATE, HIDDEN, SIMULATION, SMALL, moving)
+        simulate_imaged_patient("p", TEMPLATE, HIDDEN, SIMULATION, SMALL, moving, TIP_MOTION)
