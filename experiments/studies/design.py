@@ -344,7 +344,7 @@ def _tried(
     fit = personalise(patient.case, replace(wanted, unknowns=unknowns, pressures=pressures))
     record = record_of(fit.result, seed=values["seed"], case=name, simulated=True)
     stated = StatedErrors(corner.factor, corner.offset_mmHg, corner.each_mmHg)
-    kept = record.without_details().with_truth(patient.hidden.values)
+    kept = record.without_details().with_truth(patient.values)
     return kept, designs.left(corner.frames, stated)
 
 

@@ -56,7 +56,6 @@ from mvest.simulation.drawn_patient import (
     PatientSettings,
     draw_patient_values,
     first_that_closes,
-    require_patient,
 )
 from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion import MotionSettings
@@ -175,11 +174,8 @@ def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
 
 
 # -- the patient ----------------------------------------------------------------------------------
-def make_imaged_patient(
-    values: Values, patient: PatientSettings | None, echo: EchoSettings
-) -> Path:
+def make_imaged_patient(values: Values, patient: PatientSettings, echo: EchoSettings) -> Path:
     """Simulate and image the configured patient, unless that was done: the folder where it lies."""
-    patient = require_patient(patient)
     described = {
         "patient": {
             key: values["patient"][key]
@@ -227,7 +223,7 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     (place / TRUTH).mkdir(parents=True)
     # The source of what is simulated names the patient; a file has its name alone.
     write_sequence_nrrd(place / VOLUME, volume)
-    frames = CaseFrames(0, made.closed, float(made.pressure_mmHg[made.closed]))
+    frames = CaseFrames(0, made.closed, made.pressure_mmHg)
     true = true_sequence(made.valve, probe)
     write_case(place / HIDDEN / KNOWN, _known_case(true, frames, patient))
     segmented = _segmented_case(
@@ -237,7 +233,7 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     write_json(
         place / TRUTH / REVEALED,
         {
-            "values": dict(made.hidden.values),
+            "values": dict(made.values),
             "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
             "made_from": dict(described),
             "anatomies_drawn": draws,

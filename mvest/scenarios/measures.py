@@ -13,7 +13,6 @@ include the enhanced strain of solid-shells, which no displacement has.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,11 +22,11 @@ from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.scenarios.scenario import plane_of
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.thickening import thicken
-from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
+from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import (
     coaptation_area,
     coaptation_length,
@@ -39,51 +38,12 @@ from mvest.valve.measure.passing_ball import largest_passing_ball
 from mvest.valve.mesh.solid_mesh import embed, jacobian_determinants
 
 
-@dataclass(frozen=True, slots=True)
-class StepMeasures:
-    """State of the valve after one step.
-
-    Attributes
-    ----------
-    time : float
-        s.
-    pressure_mmhg : float
-    orifice_mm2 : float
-        Opening seen along the best annulus normal, between the thick leaflets.
-    passing_ball_mm : float
-        Diameter of the largest ball that passes between the thick leaflets.
-    coaptation_mm : float
-        Height in the middle of the valve over which the midsurfaces of opposing leaflets are within
-        the contact distance.
-    intersections : int
-        Pairs of intersecting triangles of the leaflets' faces (both sides and rims).
-    chord_strain : float
-        Largest strain of a chord.
-    chord_force_n : float
-        Largest force of a chord, N.
-    smallest_jacobian : float
-        Smallest determinant of the deformation gradient at the quadrature points.
-    newton_iterations : int
-    """
-
-    time: float
-    pressure_mmhg: float
-    orifice_mm2: float
-    passing_ball_mm: float
-    coaptation_mm: float
-    intersections: int
-    chord_strain: float
-    chord_force_n: float
-    smallest_jacobian: float
-    newton_iterations: int
-
-
 def measure_steps(
     model: ClosureModel,
     result: ClosureResult,
     contact_distance: float,
     normals: FloatArray | None = None,
-) -> tuple[StepMeasures, ...]:
+) -> list[dict[str, float]]:
     """Measure every stored step of a closure.
 
     Parameters
@@ -95,6 +55,17 @@ def measure_steps(
         mm between midsurfaces up to which leaflets count as coapting.
     normals : ndarray, optional
         ``(n, 3)`` directions of the thickness at the observed vertices.
+
+    Returns
+    -------
+    list of dict
+        Of each step ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening seen along
+        the best annulus normal, and ``passing ball`` (mm), the diameter of the largest ball that
+        passes, both between the thick leaflets; ``coaptation`` (mm), the height in the middle of
+        the valve over which the midsurfaces of opposing leaflets are within the contact distance;
+        ``intersections``, pairs of intersecting triangles of the leaflets' faces (both sides and
+        rims); the largest ``chord strain`` and ``chord force`` (N); ``smallest det F``, the
+        determinant of the deformation gradient at the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
     surface = valve.surface
@@ -112,21 +83,23 @@ def measure_steps(
         loads = loading(time)
         strain, force = _chordae(system, x, loads.tips)
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
+        length = coaptation_length(middle, one, other, plane, contact_distance).length
+        ball = largest_passing_ball(outer, closed_surface.triangles, annulus, plane).diameter
         measures.append(
-            StepMeasures(
-                float(time),
-                float(mpa_to_mmhg(loads.pressure)),
-                orifice_area(outer, closed_surface.triangles, annulus, plane),
-                largest_passing_ball(outer, closed_surface.triangles, annulus, plane).diameter,
-                coaptation_length(middle, one, other, plane, contact_distance).length,
-                len(intersecting_triangles(outer, closed_surface.triangles)),
-                strain,
-                force,
-                _smallest_jacobian(model, x),
-                iterations,
-            )
+            {
+                "time": float(time),
+                "pressure": float(mpa_to_mmhg(loads.pressure)),
+                "orifice": orifice_area(outer, closed_surface.triangles, annulus, plane),
+                "passing ball": ball,
+                "coaptation": length,
+                "intersections": len(intersecting_triangles(outer, closed_surface.triangles)),
+                "chord strain": strain,
+                "chord force": force,
+                "smallest det F": _smallest_jacobian(model, x),
+                "Newton iterations": iterations,
+            }
         )
-    return tuple(measures)
+    return measures
 
 
 def _chordae(system: System, x: FloatArray, tips: FloatArray) -> tuple[float, float]:
@@ -151,24 +124,6 @@ _PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
 """Of tensor components in a six-vector 11, 22, 33, 23, 13, 12."""
 
 
-@dataclass(frozen=True, slots=True)
-class PeakStress:
-    """Largest first principal Cauchy stress of one region, MPa.
-
-    Attributes
-    ----------
-    p95, p99 : float
-        Below which 95 and 99 % of the region's volume lies.
-    largest : float
-        At any quadrature point. It belongs to the insertion of a chord or to the hinge, where the
-        stress grows as the mesh is refined; the percentiles do so much less.
-    """
-
-    p95: float
-    p99: float
-    largest: float
-
-
 def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
     """Largest principal Cauchy stress (MPa).
 
@@ -188,9 +143,12 @@ def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
 
 
 def peak_stress(
-    system: System, x: FloatArray, changes: dict[Parameter, float] | None = None
-) -> dict[str, PeakStress]:
-    """Region -> its peak stress in equilibrium, weighted by volume in the reference frame.
+    system: System, x: FloatArray, changes: Mapping[Parameter, float] | None = None
+) -> Measured:
+    """Peak stress of each region in equilibrium, as `Measured` names it; volumes are at rest.
+
+    The largest belongs to the insertion of a chord or to the hinge, where the stress grows as the
+    mesh is refined; the percentiles do so much less.
 
     Parameters
     ----------
@@ -198,7 +156,7 @@ def peak_stress(
         Set to its parameters.
     x : ndarray
         ``(n, 3)`` mm nodal positions.
-    changes : dict, optional
+    changes : mapping, optional
         Parameter -> by how much it differs from the system's; to first order.
 
     Raises
@@ -216,11 +174,13 @@ def peak_stress(
     if not np.isfinite(values).all():
         raise InputError("the stress is not finite: an element is turned inside out")
     mesh = solid.mesh
-    peaks = {}
-    for number, name in enumerate(mesh.region_names):
-        own = mesh.region == number
-        peaks[name] = _peaks(values[own].ravel(), solid.volumes[own].ravel())
-    return peaks
+    return {
+        f"stress_{kind}_{name}_mpa": peak
+        for number, name in enumerate(mesh.region_names)
+        for kind, peak in _peaks(
+            values[mesh.region == number].ravel(), solid.volumes[mesh.region == number].ravel()
+        ).items()
+    }
 
 
 def nodal_stress(system: System, x: FloatArray) -> FloatArray:
@@ -257,11 +217,11 @@ def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatAr
     return contact.rest, force / contact.areas
 
 
-def _peaks(values: FloatArray, volumes: FloatArray) -> PeakStress:
+def _peaks(values: FloatArray, volumes: FloatArray) -> Measured:
     order = np.argsort(values)
     below = np.cumsum(volumes[order]) / volumes.sum()
     p95, p99 = (float(values[order][np.searchsorted(below, q)]) for q in (0.95, 0.99))
-    return PeakStress(p95, p99, float(values.max()))
+    return {"p95": p95, "p99": p99, "max": float(values.max())}
 
 
 Measured = dict[str, float]
@@ -289,14 +249,6 @@ NEVER_NEGATIVE = ("gap_", "coaptation_", "ap_diameter_", "annulus_", "stress_")
 tension of a leaflet that is under pressure."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Shape:
-    vertices: FloatArray
-    triangles: tuple[IntArray, IntArray]
-    annulus: FloatArray
-    plane: AnnulusPlane
-
-
 def measure_closed(
     model: ClosureModel,
     system: System,
@@ -320,27 +272,17 @@ def measure_closed(
     valve, surface = model.valve, model.valve.surface
     vertices = model.observed(x)
     annulus = vertices[valve.annulus]
+    plane, reach = plane_of(valve, annulus), model.contact_reach_mm
     pair = surface.triangles[surface.region == 0], surface.triangles[surface.region == 1]
-    shape = _Shape(vertices, pair, annulus, plane_of(valve, annulus))
-    measures = _closure(shape, model.contact_reach_mm)
-    tenting = measure_tenting(vertices, surface.triangles, annulus, shape.plane)
+    measures = {
+        "gap_mm2": find_gap(vertices, np.concatenate(pair), annulus, plane, reach).area,
+        "coaptation_length_mm": coaptation_length(vertices, *pair, plane, reach).length,
+        "coaptation_area_mm2": coaptation_area(vertices, *pair, reach),
+    }
+    tenting = measure_tenting(vertices, surface.triangles, annulus, plane)
     measures |= {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
-    size = measure_annulus(annulus, shape.plane)
+    size = measure_annulus(annulus, plane)
     measures["coaptation_height_mm"] = measures["coaptation_area_mm2"] / size.commissural_diameter
     measures["ap_diameter_mm"] = size.anteroposterior_diameter
     measures["annulus_circumference_mm"] = size.circumference
-    for region, peak in peak_stress(system, x, dict(changes or {})).items():
-        measures[f"stress_p95_{region}_mpa"] = peak.p95
-        measures[f"stress_p99_{region}_mpa"] = peak.p99
-        measures[f"stress_max_{region}_mpa"] = peak.largest
-    return measures
-
-
-def _closure(shape: _Shape, reach: float) -> Measured:
-    both = np.concatenate(shape.triangles)
-    length = coaptation_length(shape.vertices, *shape.triangles, shape.plane, reach).length
-    return {
-        "gap_mm2": find_gap(shape.vertices, both, shape.annulus, shape.plane, reach).area,
-        "coaptation_length_mm": length,
-        "coaptation_area_mm2": coaptation_area(shape.vertices, *shape.triangles, reach),
-    }
+    return measures | peak_stress(system, x, changes)

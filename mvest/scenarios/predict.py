@@ -18,28 +18,6 @@ from mvest.scenarios.measures import NEVER_NEGATIVE, Measured, measure_closed
 from mvest.typing import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class SampleSummary:
-    """Mean, standard deviation and central 95 % interval of a sampled number.
-
-    Attributes
-    ----------
-    mean, std : float
-        NaN where there are too few samples.
-    low, high : float
-        2.5 and 97.5 % quantiles, unbiased for the median (Hyndman and Fan 1996, Am. Stat. 50:361,
-        type 8); with fewer than 40 samples they lie close to the extremes.
-    count : int
-        Samples that gave a number.
-    """
-
-    mean: float
-    std: float
-    low: float
-    high: float
-    count: int
-
-
 def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     """Parameter vectors ``(count, p)`` that are spread as the posterior is.
 
@@ -70,16 +48,24 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     return np.array([estimate.transform.inverse(row) for row in z])
 
 
-def summary_of(values: Sequence[float]) -> SampleSummary:
-    """What samples say of a number; those that are NaN gave none."""
+def summary_of(values: Sequence[float]) -> dict[str, float]:
+    """What samples say of a number; those that are NaN gave none.
+
+    Returns
+    -------
+    dict
+        ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles, unbiased for the
+        median (Hyndman and Fan 1996, Am. Stat. 50:361, type 8), which lie close to the extremes
+        with fewer than 40 samples; and how many ``samples`` gave a number. NaN where these are too
+        few.
+    """
     known = np.array([v for v in values if np.isfinite(v)])
-    if len(known) < 2:
-        mean = float(known[0]) if len(known) else float("nan")
-        return SampleSummary(mean, float("nan"), float("nan"), float("nan"), len(known))
-    low, high = np.quantile(known, [0.025, 0.975], method="median_unbiased")
-    return SampleSummary(
-        float(known.mean()), float(known.std(ddof=1)), float(low), float(high), len(known)
-    )
+    mean = float(known.mean()) if len(known) else float("nan")
+    std = low = high = float("nan")
+    if len(known) > 1:
+        std = float(known.std(ddof=1))
+        low, high = map(float, np.quantile(known, [0.025, 0.975], method="median_unbiased"))
+    return {"mean": mean, "std": std, "low": low, "high": high, "samples": len(known)}
 
 
 NORMAL_95 = 1.959963984540054
@@ -92,14 +78,11 @@ class Sample:
 
     Attributes
     ----------
-    at : ndarray
-        ``(p,)`` parameters.
     measures : dict
         Empty where the valve was not closed.
     reason : str
     """
 
-    at: FloatArray
     measures: Measured
     reason: str = ""
 
@@ -138,7 +121,7 @@ class PredictedScenario:
         """Reasons of the samples that gave no closed valve."""
         return tuple(sample.reason for sample in self.samples if sample.failed)
 
-    def spread(self, name: str) -> SampleSummary:
+    def spread(self, name: str) -> dict[str, float]:
         """What the samples say of a measure; failed samples say nothing, and are counted apart."""
         return summary_of([s.measures.get(name, float("nan")) for s in self.samples])
 
@@ -164,8 +147,8 @@ class PredictedScenario:
         """
         spread, error = self.spread(name), NORMAL_95 * self.mesh_error(name)
         centre = self.at_estimate.measures.get(name, float("nan"))
-        low = centre - np.hypot(max(centre - spread.low, 0.0), error)
-        high = centre + np.hypot(max(spread.high - centre, 0.0), error)
+        low = centre - np.hypot(max(centre - spread["low"], 0.0), error)
+        high = centre + np.hypot(max(spread["high"] - centre, 0.0), error)
         if name.startswith(NEVER_NEGATIVE) and low < 0.0:
             low = 0.0
         return float(low), float(high)
@@ -194,18 +177,14 @@ class PredictedScenario:
             rows[name] = {
                 "estimate": value,
                 "first_order_std": self.first_order.get(name),
-                "mean": spread.mean,
-                "std": spread.std,
-                "low": spread.low,
-                "high": spread.high,
-                "samples": spread.count,
+                **spread,
                 "mesh_error": self.mesh_error(name),
                 "wide_low": low,
                 "wide_high": high,
                 "truth_own_mesh": on_own,
-                "inside_own_mesh": _inside(spread.low, on_own, spread.high),
+                "inside_own_mesh": _inside(spread["low"], on_own, spread["high"]),
                 "truth_same_mesh": on_same,
-                "inside_same_mesh": _inside(spread.low, on_same, spread.high),
+                "inside_same_mesh": _inside(spread["low"], on_same, spread["high"]),
                 "inside_wide": _inside(low, on_own, high),
             }
         return rows
@@ -226,14 +205,14 @@ def closed_valve(
     try:
         result = model.close(m, sensitivities=sensitivities)
     except MaterialError as error:
-        return Sample(m, {}, str(error)), None, None, None
+        return Sample({}, str(error)), None, None, None
     simulation = result.simulation
     if not simulation.converged:
-        return Sample(m, {}, simulation.reason.value), None, None, None
+        return Sample({}, simulation.reason.value), None, None, None
     x = simulation.frames[-1]
     measures = measure_closed(model, result.system, x)
     derivatives = simulation.sensitivities[-1] if sensitivities else None
-    return Sample(m, measures), result.system, x, derivatives
+    return Sample(measures), result.system, x, derivatives
 
 
 def predict_scenario(

@@ -7,7 +7,7 @@ surfaces, pandas tables, nibabel label maps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slic
 from mvest.exchange.surfaces import write_surface
 from mvest.problem.registration import displace
 from mvest.quantities import Length
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 
@@ -119,12 +119,40 @@ def arrive(
 def _through_slicerheart(
     patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
 ) -> ValveCase:
+    """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
+
+    Frames are midsurfaces (LPS mm; tips antero-lateral first); the atrial side of a leaflet lies
+    half its mean thickness from them.
+    """
+    import pandas as pd
+
+    folder, surface = folder / "slicerheart", patient.case.surface
+    folder.mkdir()
     annulus = patient.opened.annulus[:, :2] - patient.opened.annulus[:, :2].mean(axis=0)
-    landmarks = {name: int(np.argmax(annulus @ np.array(to))) for name, to in LANDMARKS.items()}
-    phases = dict(zip(("MD", "MS"), frames, strict=True))
-    _write_slicerheart(folder / "slicerheart", phases, patient.case.surface, landmarks)
+    contour: list[dict[str, str]] = []
+    marks: list[dict[str, str]] = []
+    for index, phase, frame in zip(("3", "12"), ("MD", "MS"), frames, strict=True):
+        ring, middle = frame.annulus, frame.annulus.mean(axis=0)
+        about = {"Filename": SCENE, "Phase": phase, "FrameNumber": index, "Valve": "mitral"}
+        for label, name in enumerate(surface.region_names):
+            thick = float(surface.thickness[surface.vertex_region == label].mean())
+            stem = f"{SCENE}_mitral_frame_{index}_{phase}_atrial_mitral_{name}_leaflet"
+            _write_atrial_side(folder / f"{stem}.vtk", frame, label, thick)
+        between = 0.5 * (ring + np.roll(ring, -1, axis=0))
+        for point in np.stack([ring, between], axis=1).reshape(-1, 3):
+            contour.append(about | _in_ras("AnnulusContour", "XYZ", point))
+        for name, to in LANDMARKS.items():
+            place = _in_ras("Landmark", "RAS", ring[int(np.argmax(annulus @ np.array(to)))])
+            marks.append(about | {"LandmarkLabel": name} | place)
+        muscles = ("antero-lateral", "postero-medial")
+        for muscle, tip in zip(muscles, frame.papillary_tips, strict=True):
+            points = (tip + 0.4 * (tip - middle), tip, middle)
+            _write_points(folder / f"PapillaryMarkup-{muscle}-{phase}.fcsv", points)
+    table_of = pd.DataFrame(contour).assign(AnnulusContourLabel="")
+    table_of.to_csv(folder / "AnnulusContourPoints.csv", index=False)
+    pd.DataFrame(marks).to_csv(folder / "ValveLandmarkPoints.csv", index=False)
     options = SlicerheartOptions(pressure_mmHg=frames[1].pressure_mmHg, std_mm=door.std_mm)
-    return import_slicerheart(folder / "slicerheart", options)
+    return import_slicerheart(folder, options)
 
 
 def _through_labels(
@@ -182,52 +210,17 @@ def _in_lps(frame: Frame) -> Frame:
 
 
 # -- exports --------------------------------------------------------------------------------------
-def _write_slicerheart(
-    folder: Path,
-    frames: Mapping[str, Frame],
-    surface: LeafletSurface,
-    landmarks: Mapping[str, int],
-) -> None:
-    """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
-
-    Frames by phase (MD, MS, ...) are midsurfaces (LPS mm; tips antero-lateral first); the atrial
-    side of a leaflet lies half its mean thickness from them. Landmarks are points of the annulus.
-    """
-    import pandas as pd
-
-    folder.mkdir()
-    contour: list[dict[str, str]] = []
-    marks: list[dict[str, str]] = []
-    for number, (phase, frame) in enumerate(frames.items()):
-        index, ring = str(3 + 9 * number), frame.annulus
-        about = {"Filename": SCENE, "Phase": phase, "FrameNumber": index, "Valve": "mitral"}
-        for label, name in enumerate(surface.region_names):
-            thick = float(surface.thickness[surface.vertex_region == label].mean())
-            stem = f"{SCENE}_mitral_frame_{index}_{phase}_atrial_mitral_{name}_leaflet"
-            _write_model(folder / f"{stem}.vtk", _atrial_side(frame, label, thick))
-        between = 0.5 * (ring + np.roll(ring, -1, axis=0))
-        for point in np.stack([ring, between], axis=1).reshape(-1, 3):
-            contour.append(about | _in_ras("AnnulusContour", "XYZ", point))
-        for name, k in landmarks.items():
-            marks.append(about | {"LandmarkLabel": name} | _in_ras("Landmark", "RAS", ring[k]))
-        muscles = ("antero-lateral", "postero-medial")
-        for muscle, tip in zip(muscles, frame.papillary_tips, strict=True):
-            middle = ring.mean(axis=0)
-            points = (tip + 0.4 * (tip - middle), tip, middle)
-            _write_points(folder / f"PapillaryMarkup-{muscle}-{phase}.fcsv", points)
-    table_of = pd.DataFrame(contour).assign(AnnulusContourLabel="")
-    table_of.to_csv(folder / "AnnulusContourPoints.csv", index=False)
-    pd.DataFrame(marks).to_csv(folder / "ValveLandmarkPoints.csv", index=False)
-
-
 def _in_ras(name: str, axes: str, point: FloatArray) -> dict[str, str]:
     """R, A, S of a point, as exported tables have them."""
     values = point * (-1, -1, 1)
     return {f"{name}{axis}": f"{value:.2f}" for axis, value in zip(axes, values, strict=True)}
 
 
-def _atrial_side(frame: Frame, label: int, thickness_mm: float) -> Any:
-    """One leaflet with triangles of its own, moved to the atrium by half its thickness."""
+def _write_atrial_side(file: Path, frame: Frame, label: int, thickness_mm: float) -> None:
+    """Write one leaflet with triangles of its own, half its thickness nearer to the atrium.
+
+    It is a binary legacy model with the header of 3D Slicer, which names its axes.
+    """
     try:
         import pyvista
     except ImportError as error:
@@ -235,19 +228,13 @@ def _atrial_side(frame: Frame, label: int, thickness_mm: float) -> Any:
             "folders of SlicerHeart are written by VTK: pip install mvest[viz]"
         ) from error
 
-    def surface(points: FloatArray, triangles: IntArray) -> Any:
-        return pyvista.PolyData.from_regular_faces(points, triangles)
-
+    surface = pyvista.PolyData.from_regular_faces
     normals = surface(frame.vertices, frame.triangles).compute_normals(
         cell_normals=False, split_vertices=False, consistent_normals=False
     )
     points = frame.vertices - 0.5 * thickness_mm * np.asarray(normals.point_data["Normals"])
     leaflet = surface(points, frame.triangles[frame.region == label]).clean()
-    return leaflet.subdivide(1, subfilter="linear").decimate_pro(0.4, preserve_topology=True)
-
-
-def _write_model(file: Path, model: Any) -> None:
-    """A binary legacy model with the header of 3D Slicer, which names its axes."""
+    model = leaflet.subdivide(1, subfilter="linear").decimate_pro(0.4, preserve_topology=True)
     model.clear_data()
     model.save(file, binary=True)
     version, _, *rest = file.read_bytes().split(b"\n", 2)
@@ -271,8 +258,7 @@ def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_m
     """
     import nibabel
 
-    normals = smooth_vertex_normals(frame.vertices, frame.triangles)
-    drawn, low = drawn_leaflets(frame, normals, thickness_mm)
+    drawn, low = drawn_leaflets(frame, thickness_mm)
     shape = [int(np.ceil(n * FINE_MM / voxel_mm)) for n in drawn.shape]
     # Voxels lie anywhere against the leaflets.
     start = 0.37 * voxel_mm
@@ -293,11 +279,11 @@ def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_m
 
 
 def drawn_leaflets(
-    frame: Frame | LeafletSurface, normals: FloatArray, thickness_mm: FloatArray
+    frame: Frame | LeafletSurface, thickness_mm: FloatArray
 ) -> tuple[NDArray[np.uint8], FloatArray]:
     """Labels on a fine grid, and where its first point is (LPS mm)."""
     vertices, triangles = frame.vertices, frame.triangles
-    corner = vertices[triangles]
+    corner, normals = vertices[triangles], smooth_vertex_normals(vertices, triangles)
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
     k = int(np.ceil(longest / (0.8 * FINE_MM)))
     i, j = np.meshgrid(np.arange(k + 1), np.arange(k + 1))

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mvest.errors import ConfigurationError, GeometryError
+from mvest.errors import GeometryError
 from mvest.quantities import Factor, Length, Modulus
 from mvest.simulation.virtual_patient import Deviations, PatientSimulation, draw_hidden
 from mvest.valve.anatomy.template import Template
@@ -42,19 +42,6 @@ class EchoSettings:
 
     spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
     tip_motion_mm: tuple[Length, Length] = (1.0, 3.0)  # of papillary tips
-
-
-def require_patient(patient: PatientSettings | None) -> PatientSettings:
-    """The configured patient.
-
-    Raises
-    ------
-    ConfigurationError
-        If none is.
-    """
-    if patient is None:
-        raise ConfigurationError("patient is not given; expected one of conf/patient")
-    return patient
 
 
 def draw_patient_values(patient: PatientSettings, rng: np.random.Generator) -> dict[str, float]:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import REGISTRATION
@@ -27,13 +26,9 @@ from mvest.simulation.motion import (
     with_tip_motion,
 )
 from mvest.simulation.virtual_patient import (
-    CLOSED,
-    REFERENCE,
-    Hidden,
     PatientSimulation,
     close_patient,
     held_states,
-    patient_model,
 )
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
@@ -57,24 +52,22 @@ class ImagedPatient:
     Attributes
     ----------
     valve : MovingValve
-        Its positions are true.
-    frames : tuple of str
-        Name of each of its frames, as keys of ``hidden.positions``.
-    pressure_mmHg : (T,)
-        What would be stated of the pressure; NaN in the frames of closing, for which nothing is.
+        Its positions are true: the open frame, those of closing, the closed one, those held.
     closed : int
         Number of the closed frame.
+    pressure_mmHg : float
+        What would be stated of it in the closed frame.
     stated : Valve
         In the layout, with the chordae as they would be stated.
-    hidden : Hidden
+    values : mapping
+        Parameter -> true value, as in `VirtualPatient`.
     """
 
     valve: MovingValve
-    frames: tuple[str, ...]
-    pressure_mmHg: FloatArray
     closed: int
+    pressure_mmHg: float
     stated: Valve
-    hidden: Hidden
+    values: Mapping[str, float]
 
     def chord_ratios(self) -> dict[str, FloatArray]:
         """Family -> true rest lengths of its chordae over the distance of their ends, closed.
@@ -85,7 +78,7 @@ class ImagedPatient:
         place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
         ends = place.interpolate(self.valve.vertices[self.closed], surface.triangles)
         away = np.linalg.norm(ends - self.valve.tips[self.closed][chordae.tip], axis=1)
-        ratio = self.hidden.values["chord_rest_length"] * chordae.rest_length / away
+        ratio = self.values["chord_rest_length"] * chordae.rest_length / away
         return {
             name: ratio[chordae.family == family]
             for family, name in enumerate(chordae.family_names)
@@ -99,7 +92,7 @@ def simulate_imaged_patient(
     simulation: PatientSimulation,
     settings: MotionSettings,
     mechanics: MechanicsSettings,
-    tip_motion: FloatArray | None = None,
+    tip_motion: FloatArray,
 ) -> ImagedPatient:
     """Close a template as a patient's valve.
 
@@ -116,7 +109,7 @@ def simulate_imaged_patient(
         left out for those of ``simulation``.
     mechanics : MechanicsSettings
         Its pressure is what is stated.
-    tip_motion : ndarray, optional
+    tip_motion : ndarray
         ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
 
     Raises
@@ -125,36 +118,27 @@ def simulate_imaged_patient(
         If the valve does not close, or not as a valve does.
     """
     own = {parameter: v for parameter, v in values.items() if parameter not in REGISTRATION}
-    shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
-    layout = ValveLayout(settings.columns, settings.rows)
     if not mechanics.protocol.equilibrium:
         raise InputError(
             "mechanics protocol equilibrium = False, expected True for a patient who is imaged"
         )
     # The coarse closure first: it is soon refused.
-    closing = closing_frames(name, template, own, settings, mechanics, shift)
-    seen = with_tip_motion(template.valve(layout.columns, layout.rows), shift)
+    closing = closing_frames(name, template, own, settings, mechanics, tip_motion)
+    seen = with_tip_motion(template.valve(settings.columns, settings.rows), tip_motion)
     contact = with_tip_motion(
-        template.valve(simulation.contact_columns, simulation.contact_rows), shift
+        template.valve(simulation.contact_columns, simulation.contact_rows), tip_motion
     )
-    model = patient_model(template, seen, contact, own, simulation, mechanics)
-    later = close_patient(name, model, own, simulation)
+    later = close_patient(name, template, seen, contact, own, simulation, mechanics)
     tips = [state.papillary_tips for state in held_states(simulation, contact).values()]
-    between = {f"closing_{k}": x for k, x in enumerate(closing.vertices[1:-1], start=1)}
-    positions = {REFERENCE: seen.surface.vertices, **between, **later}
-    frames = tuple(positions)
-    closed = frames.index(CLOSED)
-    pressures = [
-        0.0, *[np.nan] * len(between), mechanics.protocol.pressure_mmHg,
-        *simulation.held_pressure_mmHg,
-    ]  # fmt: skip
+    shapes = [seen.surface.vertices, *closing.vertices[1:-1], *later.values()]
+    closed = len(closing.vertices) - 1
     valve = moving_valve(
         name,
         template,
         seen.surface.thickness,
         settings,
-        np.stack(list(positions.values())),
+        np.stack(shapes),
         np.stack([*closing.tips, *tips]),
     )
     check_motion(valve, closed, settings.limits)
-    return ImagedPatient(valve, frames, np.array(pressures), closed, seen, Hidden(own, positions))
+    return ImagedPatient(valve, closed, mechanics.protocol.pressure_mmHg, seen, own)

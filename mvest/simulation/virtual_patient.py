@@ -78,11 +78,12 @@ class Deviations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hidden:
-    """What the case of a virtual patient does not say.
+class VirtualPatient:
+    """A simulated case, and what it does not say.
 
     Attributes
     ----------
+    case : ValveCase
     values : mapping
         Parameter -> true value: the moduli in MPa, factors on what the case states, and the
         displacement of the leaflets as they were seen.
@@ -91,16 +92,9 @@ class Hidden:
         the displacement included.
     """
 
+    case: ValveCase
     values: Mapping[str, float]
     positions: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VirtualPatient:
-    """A simulated case, and what it hides."""
-
-    case: ValveCase
-    hidden: Hidden
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,18 +234,67 @@ def simulate_patient(
     contact = real.valve(simulation.contact_columns, simulation.contact_rows)
     own = world.mechanics(mechanics, values)
     there = real.valve(simulation.seen_columns, simulation.seen_rows)
-    model = patient_model(real, there, contact, values, simulation, own)
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
-    true = {
-        frame: displace(vertices, registration, centre)
-        for frame, vertices in close_patient(name, model, values, simulation).items()
-    }
+    shapes = close_patient(name, real, there, contact, values, simulation, own)
+    true = {frame: displace(vertices, registration, centre) for frame, vertices in shapes.items()}
     case = _case(name, description, seen, true, simulation, mechanics, rng)
-    return VirtualPatient(case, Hidden(dict(values), {REFERENCE: seen.surface.vertices, **true}))
+    return VirtualPatient(case, dict(values), {REFERENCE: seen.surface.vertices, **true})
 
 
-def patient_model(
+def close_patient(
+    name: str,
+    template: Template,
+    seen: Valve,
+    contact: Valve,
+    values: Mapping[str, float],
+    simulation: PatientSimulation,
+    mechanics: MechanicsSettings,
+) -> dict[str, FloatArray]:
+    """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
+
+    The first frame is the closed one; those that are fitted with it and held out follow.
+
+    Parameters
+    ----------
+    name : str
+    template : Template
+    seen, contact : Valve
+        Of that template, where it is seen and where contact is sampled.
+    values : mapping
+        The model's parameters are its names, without those of a displacement.
+    simulation : PatientSimulation
+    mechanics : MechanicsSettings
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close, or has no equilibrium in one of these.
+    """
+    model = _model(template, seen, contact, values, simulation, mechanics)
+    states = held_states(simulation, contact)
+    errors = tuple(name for name in values if is_frame_pressure(name))
+    frames = FramesModel(
+        model,
+        CLOSED,
+        {frame: states[frame] for frame in simulation.fitted_frames[1:]},
+        mechanics.protocol.pressure_mmHg,
+        errors,
+    )
+    m = np.array([values[parameter] for parameter in frames.names])
+    at = frames.of_closure(m)
+    prediction = model(at)
+    if not prediction.converged:
+        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+    true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
+    for frame, vertices in zip(states, model.held(at, frames.under(m, states)), strict=True):
+        if vertices is None:
+            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
+        true[frame] = vertices
+    return true
+
+
+def _model(
     template: Template,
     seen: Valve,
     contact: Valve,
@@ -259,18 +302,7 @@ def patient_model(
     simulation: PatientSimulation,
     mechanics: MechanicsSettings,
 ) -> ClosureModel:
-    """The model that closes a virtual patient, with the guides that it follows.
-
-    Parameters
-    ----------
-    template : Template
-    seen, contact : Valve
-        Of that template, where it is seen and where contact is sampled.
-    values : mapping
-        The parameters are its names, without those of a displacement.
-    simulation : PatientSimulation
-    mechanics : MechanicsSettings
-    """
+    """The model that closes a virtual patient, with the guides that it follows."""
     # An exponential tissue has its coefficients, which follow from a modulus, and no modulus.
     exponential = simulation.world.exponential
     names = tuple(
@@ -301,40 +333,6 @@ def patient_model(
         )
     assert guide is not None
     return guide
-
-
-def close_patient(
-    name: str, model: ClosureModel, values: Mapping[str, float], simulation: PatientSimulation
-) -> dict[str, FloatArray]:
-    """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
-
-    The first frame is the closed one; those that are fitted with it and held out follow.
-
-    Raises
-    ------
-    GeometryError
-        If the valve does not close, or has no equilibrium in one of these.
-    """
-    states = held_states(simulation, model.contact_valve)
-    errors = tuple(name for name in values if is_frame_pressure(name))
-    frames = FramesModel(
-        model,
-        CLOSED,
-        {frame: states[frame] for frame in simulation.fitted_frames[1:]},
-        model.settings.protocol.pressure_mmHg,
-        errors,
-    )
-    m = np.array([values[parameter] for parameter in frames.names])
-    at = frames.of_closure(m)
-    prediction = model(at)
-    if not prediction.converged:
-        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
-    true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
-    for frame, vertices in zip(states, model.held(at, frames.under(m, states)), strict=True):
-        if vertices is None:
-            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
-        true[frame] = vertices
-    return true
 
 
 def _name(kind: str, pressure_mmHg: float) -> str:
@@ -389,42 +387,38 @@ def _case(
         chordae = replace(chordae, insertion=chordae.insertion + moved_ends)
     motion = seen.motion
     at_annulus, at_tips = world.boundary(motion.annulus[-1], motion.papillary_tips[-1], other)
-    closed = HeldState(
-        mechanics.protocol.pressure_mmHg,
-        motion.annulus[-1] + at_annulus,
-        motion.papillary_tips[-1] + at_tips,
-    )
     seen_later[0] = world.seen(seen_later[0], seen.surface, other)
-    states = {CLOSED: closed, **held_states(simulation, seen)}
-
-    def frame(name: str, time: float, role: Role, state: HeldState, vertices: FloatArray) -> Frame:
-        return Frame(
-            name,
+    states = {
+        REFERENCE: HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips + at_tips),
+        CLOSED: HeldState(
+            mechanics.protocol.pressure_mmHg,
+            motion.annulus[-1] + at_annulus,
+            motion.papillary_tips[-1] + at_tips,
+        ),
+        **held_states(simulation, seen),
+    }
+    end = mechanics.protocol.ramp
+    times = (0.0, *(end + k * FRAME_INTERVAL for k in range(len(true))))
+    roles = dict.fromkeys(simulation.fitted_frames, Role.FITTED)
+    roles |= {REFERENCE: Role.REFERENCE, CLOSED: Role.CLOSED}
+    frames = tuple(
+        Frame(
+            which,
             time,
-            role,
-            state.pressure_mmHg,
+            roles.get(which, Role.HELD_OUT),
+            states[which].pressure_mmHg,
             vertices,
             surface.triangles,
             surface.region,
-            state.annulus,
+            states[which].annulus,
             vertices[seen.free_edge],
-            state.papillary_tips,
+            states[which].papillary_tips,
             True,
         )
-
-    rest = HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips + at_tips)
-    end = mechanics.protocol.ramp
-    roles = {**dict.fromkeys(simulation.fitted_frames, Role.FITTED), CLOSED: Role.CLOSED}
-    later = [
-        frame(
-            which,
-            end + k * FRAME_INTERVAL,
-            roles.get(which, Role.HELD_OUT),
-            states[which],
-            vertices,
+        for which, time, vertices in zip(
+            (REFERENCE, *true), times, (surface.vertices, *seen_later), strict=True
         )
-        for k, (which, vertices) in enumerate(zip(true, seen_later, strict=True))
-    ]
+    )
     return ValveCase(
         name=name,
         description=description,
@@ -434,7 +428,7 @@ def _case(
         surface=surface,
         annulus=seen.annulus,
         free_edge=seen.free_edge,
-        frames=(frame(REFERENCE, 0.0, Role.REFERENCE, rest, surface.vertices), *later),
+        frames=frames,
         chordae=chordae,
         uncertainty=Uncertainty(simulation.std_mm, simulation.correlation_length_mm),
     )

@@ -65,14 +65,14 @@ def test_an_estimate_that_did_not_converge_has_no_samples():
 def test_the_interval_is_that_of_the_samples():
     # Type 8 of n = 40 numbers 1 to 40: at position (n + 1/3) p + 1/3 = 1.3417 for p = 0.025.
     spread = summary_of([*range(1, 41), float("nan")])
-    assert spread.count == 40
-    assert spread.low == pytest.approx(1.3417, abs=1e-4)
-    assert spread.high == pytest.approx(41 - 1.3417, abs=1e-4)
-    assert spread.mean == 20.5
-    assert spread.std == pytest.approx(np.std(range(40), ddof=1))
+    assert spread["samples"] == 40
+    assert spread["low"] == pytest.approx(1.3417, abs=1e-4)
+    assert spread["high"] == pytest.approx(41 - 1.3417, abs=1e-4)
+    assert spread["mean"] == 20.5
+    assert spread["std"] == pytest.approx(np.std(range(40), ddof=1))
 
 
 def test_one_sample_has_no_spread():
     spread = summary_of([3.0, float("nan")])
-    assert (spread.mean, spread.count) == (3.0, 1)
-    assert np.isnan([spread.std, spread.low, spread.high]).all()
+    assert (spread["mean"], spread["samples"]) == (3.0, 1)
+    assert np.isnan([spread["std"], spread["low"], spread["high"]]).all()

@@ -98,26 +98,26 @@ def test_what_is_hidden_spreads_as_it_is_told():
 
 
 def test_a_patient_is_seen_where_it_is_up_to_its_displacement_and_noise(patient, values):
-    case, hidden = patient.case, patient.hidden
-    assert hidden.values == values
+    case, positions = patient.case, patient.positions
+    assert patient.values == values
     assert [frame.name for frame in case.frames] == ["open", "closed", "held_95_mmHg"]
     open_, closed, held = case.frames
     assert [f.role for f in case.frames] == [Role.REFERENCE, Role.CLOSED, Role.HELD_OUT]
     # The reference is exact: the model is made from it.
     np.testing.assert_array_equal(open_.vertices, case.surface.vertices)
-    np.testing.assert_array_equal(hidden.positions["open"], case.surface.vertices)
+    np.testing.assert_array_equal(positions["open"], case.surface.vertices)
     # Without its displacement, the annulus of the seen valve is that of the boundary.
     centre = closed.annulus.mean(axis=0)
     registration = np.array([values[name] for name in REGISTRATION])
     assert np.linalg.norm(registration[:3]) > 0.5
-    true = hidden.positions["closed"]
+    true = positions["closed"]
     ring = true[case.annulus]
     assert np.linalg.norm(ring - closed.annulus, axis=1).mean() > 0.3
     undone = (ring - centre - registration[:3]) @ np.linalg.inv(turn_of(registration)).T + centre
     # The hinge holds the annulus of a coarse mesh, whose edges are not those that are seen.
     np.testing.assert_allclose(undone[::2], closed.annulus[::2], atol=0.15)
     for frame in (closed, held):
-        error = frame.vertices - hidden.positions[frame.name]
+        error = frame.vertices - positions[frame.name]
         assert 0.2 < error.std() < 0.6
         np.testing.assert_array_equal(frame.free_edge, frame.vertices[case.free_edge])
         assert frame.corresponds
@@ -164,7 +164,7 @@ def test_further_fitted_frames_are_closed_under_pressures_with_errors(patient, v
     assert both.case.fitted == (both.case.frames[2],)
     # The frame held out is under 97 + 2 mmHg; that of the other patient under 95 without an error,
     # and the one fitted here under 95 + 2.
-    true, other = both.hidden.positions, patient.hidden.positions
+    true, other = both.positions, patient.positions
     rise = [true[name] - other["held_95_mmHg"] for name in ("fitted_95_mmHg", "held_97_mmHg")]
     assert np.linalg.norm(rise[1]) == pytest.approx(2 * np.linalg.norm(rise[0]), rel=0.05)
     np.testing.assert_allclose(true["closed"] - other["closed"], 0.5 * rise[0], atol=0.02)
@@ -176,7 +176,7 @@ def test_further_fitted_frames_are_closed_under_pressures_with_errors(patient, v
 
 def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
     # The same valve seen 60 times: closing it once is enough.
-    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    hidden = {k: v for k, v in patient.positions.items() if k != "open"}
     seen = TEMPLATE.valve(32, 9)
     rng = np.random.default_rng(4)
     errors = []
@@ -198,7 +198,7 @@ def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
 
 
 def test_rough_errors_come_on_top_and_are_not_stated(patient):
-    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    hidden = {k: v for k, v in patient.positions.items() if k != "open"}
     rough = replace(SMALL, rough_std_mm=0.3)
     seen = TEMPLATE.valve(32, 9)
     case = virtual_patient._case(
@@ -214,7 +214,7 @@ def test_rough_errors_come_on_top_and_are_not_stated(patient):
 
 
 def test_chordae_end_on_the_leaflet_as_it_was_seen(patient):
-    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    hidden = {k: v for k, v in patient.positions.items() if k != "open"}
     seen = TEMPLATE.valve(32, 9)
     off = replace(SMALL, rest_std_mm=0.5)
     case = virtual_patient._case(
@@ -236,7 +236,7 @@ def test_chordae_end_on_the_leaflet_as_it_was_seen(patient):
 
 
 def test_a_patient_is_the_same_again(patient):
-    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    hidden = {k: v for k, v in patient.positions.items() if k != "open"}
     again = virtual_patient._case(
         "small", "d", TEMPLATE.valve(32, 9), hidden, SMALL, MECHANICS, np.random.default_rng(3)
     )

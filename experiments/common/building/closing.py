@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ COLUMNS = {
     "smallest det F": ":.2f",
     "Newton iterations": "",
 }
-"""Names and units of `mvest.scenarios.measures.StepMeasures`, in its order."""
+"""Units of what `mvest.scenarios.measures.measure_steps` measures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,10 +69,9 @@ class Closing:
         return replace(self, result=replace(self.result, simulation=two))
 
     def steps(self) -> Table:
-        """What each step measures (`mvest.scenarios.measures.StepMeasures`)."""
+        """What is measured of each step (`mvest.scenarios.measures.measure_steps`)."""
         steps = measure_steps(self.model, self.result, self.contact_distance_mm, self.normals)
-        rows = [dict(zip(COLUMNS, asdict(step).values(), strict=True)) for step in steps]
-        return table(rows, **COLUMNS)
+        return table(steps, **COLUMNS)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Each step: thick leaflets with stress and contact pressure (MPa), chordae and tips."""

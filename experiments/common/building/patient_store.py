@@ -11,7 +11,7 @@ import numpy as np
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.schema import Values
 from mvest.cases.writer import write_case
-from mvest.errors import InputError
+from mvest.errors import ConfigurationError, InputError
 from mvest.problem.stored import Store
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
@@ -20,7 +20,6 @@ from mvest.simulation.drawn_patient import (
     PatientSettings,
     draw_patient_values,
     first_that_closes,
-    require_patient,
 )
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
@@ -54,8 +53,15 @@ class PatientPlace:
 
 
 def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
-    """Simulate the configured patient, unless that was done: where it lies."""
-    patient = require_patient(patient)
+    """Simulate the configured patient, unless that was done: where it lies.
+
+    Raises
+    ------
+    ConfigurationError
+        If none is configured.
+    """
+    if patient is None:
+        raise ConfigurationError("patient is not given; expected one of conf/patient")
     described = {
         "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},
         "valve": values["valve"],
@@ -97,8 +103,8 @@ def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> N
     folder = root / "hidden"
     folder.mkdir(parents=True)
     write_case(root / "case", made.case)
-    arrays: dict[str, Any] = dict(made.hidden.positions)
+    arrays: dict[str, Any] = dict(made.positions)
     np.savez_compressed(folder / POSITIONS, **arrays)
-    values = dict(made.hidden.values)
+    values = dict(made.values)
     about = {"values": values, "made_from": dict(described), "anatomies_drawn": draws}
     write_json(folder / HIDDEN, about)

@@ -10,7 +10,6 @@ from scipy.interpolate import PchipInterpolator
 
 from mvest.simulation.arrival import FINE_MM, drawn_leaflets
 from mvest.valve.anatomy.valve import LeafletSurface, band_grid
-from mvest.valve.geometry.thickening import smooth_vertex_normals
 
 THICKNESS = 1.4
 HALF_LENGTH, HALF_WIDTH, DEPTH = 9.0, 6.0, 8.0
@@ -57,8 +56,7 @@ def voxelised(surface: LeafletSurface, voxel_mm: float) -> SimpleITK.Image:
 
     A voxel belongs to the leaflets if more than half of it does, to the larger part of the two.
     """
-    normals = smooth_vertex_normals(surface.vertices, surface.triangles)
-    drawn, low = drawn_leaflets(surface, normals, surface.thickness)
+    drawn, low = drawn_leaflets(surface, surface.thickness)
     parts = []
     for label in (1, 2):
         image = SimpleITK.GetImageFromArray((drawn == label).astype(np.float32).transpose(2, 1, 0))

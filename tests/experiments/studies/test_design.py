@@ -11,7 +11,7 @@ from experiments.studies import design
 from experiments.studies.design import STUDY, TRIED, Settings
 from mvest.personalisation.design import ERRORS_MMHG, KINDS
 from mvest.reporting.tables import table
-from mvest.simulation.virtual_patient import Hidden, VirtualPatient
+from mvest.simulation.virtual_patient import VirtualPatient
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up import made_up as made_record
 from tests.made_up_closure import MESH, TRUE, made_up_case, use
@@ -44,7 +44,7 @@ def made_up(monkeypatch):
             frames=tuple(replace(f, pressure_mmHg=120.0) if f.name == "closed" else f
                          for f in frames.frames),
         )  # fmt: skip
-        return VirtualPatient(frames, Hidden({**values, **TRUE}, {}))
+        return VirtualPatient(frames, {**values, **TRUE}, {})
 
     monkeypatch.setattr(design, "simulate_patient", simulate)
     monkeypatch.setattr(design, "build_coarse", lambda *_: type("M", (), {"mesh": MESH}))

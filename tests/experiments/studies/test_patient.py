@@ -19,7 +19,7 @@ from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.problem.verdict import ONE_STATE
 from mvest.simulation.drawn_patient import PatientSettings
-from mvest.simulation.virtual_patient import Hidden, VirtualPatient
+from mvest.simulation.virtual_patient import VirtualPatient
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up_patients import a_result
 from tests.made_up_closure import TRUE, made_up_case, use
@@ -51,7 +51,7 @@ def made_up_patient(name, description, template, values, simulation, mechanics, 
     case = made_up_case(0.3, 8.0, rng)
     exact = made_up_case()
     positions = {frame.name: frame.vertices for frame in exact.frames}
-    return VirtualPatient(case, Hidden(dict(TRUE), positions))
+    return VirtualPatient(case, dict(TRUE), positions)
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
 from mvest.simulation.arrival import DoorSettings, arrive
-from mvest.simulation.virtual_patient import Hidden, VirtualPatient
+from mvest.simulation.virtual_patient import VirtualPatient
 from tests.cases.folders import template_case
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up import made_up
@@ -121,7 +121,7 @@ def job(tmp_path, monkeypatch):
     def simulate(name, description, template, values, simulation, mechanics, rng):
         exact = made_up_case()
         positions = {frame.name: frame.vertices for frame in exact.frames}
-        return VirtualPatient(made_up_case(0.3, 8.0, rng), Hidden(dict(TRUE), positions))
+        return VirtualPatient(made_up_case(0.3, 8.0, rng), dict(TRUE), positions)
 
     monkeypatch.setattr(patient_store, "simulate_patient", simulate)
     values = plain(
