@@ -10,7 +10,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
@@ -135,16 +135,6 @@ def _unwrapped(kind: Any) -> tuple[Any, tuple[Any, ...]]:
             return kind, marks
 
 
-def marked(kind: Any, mark: Mark, key: str = "") -> Iterator[str]:
-    """Dotted names of the marked settings of a schema; a marked part stands for what is in it."""
-    kind, marks = _unwrapped(kind)
-    if mark in marks:
-        yield key
-    elif _is_schema(kind):
-        for name, hint in hints_of(kind).items():
-            yield from marked(hint, mark, f"{key}.{name}".lstrip("."))
-
-
 def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """Nested values without those of the dotted names."""
     kept = {key: value for key, value in values.items() if key not in names}
@@ -155,20 +145,23 @@ def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     return kept
 
 
-def ranges(kind: Any, key: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted names of all settings of a schema with a range; names within mappings are ``*``."""
+def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of the settings of a schema with each mark; names within mappings are ``*``."""
     kind, marks = _unwrapped(kind)
-    for mark in marks:
-        if isinstance(mark, FieldInfo):
-            yield key, mark
+    yield from ((key, mark) for mark in marks)
     if _is_schema(kind):
         for name, hint in hints_of(kind).items():
-            yield from ranges(hint, f"{key}.{name}".lstrip("."))
+            yield from marks_in(hint, f"{key}.{name}".lstrip("."))
     elif typing.get_origin(kind) in (dict, Mapping):
-        yield from ranges(typing.get_args(kind)[1], f"{key}.*")
+        yield from marks_in(typing.get_args(kind)[1], f"{key}.*")
     else:
         for part in typing.get_args(kind):
-            yield from ranges(part, key)
+            yield from marks_in(part, key)
+
+
+def ranges(kind: Any) -> list[tuple[str, FieldInfo]]:
+    """Dotted names of all settings of a schema with a range."""
+    return [(key, mark) for key, mark in marks_in(kind) if isinstance(mark, FieldInfo)]
 
 
 def require_admissible_values(
@@ -243,6 +236,7 @@ def require_within(key: str, value: float, within: FieldInfo | None) -> None:
         raise ConfigurationError(text + (f" ({why})" if why else ""))
 
 
+@cache
 def schema(*classes: type) -> type:
     """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
 
@@ -252,36 +246,15 @@ def schema(*classes: type) -> type:
     for cls in classes:
         hints = typing.get_type_hints(cls)
         for field in dataclasses.fields(cls):
-            kind = _config_type(hints[field.name])
-            if field.default_factory is not dataclasses.MISSING:
-                default = _field(kind, _config_value(field.default_factory()))
-            elif field.default is not dataclasses.MISSING:
-                default = _field(kind, _config_value(field.default))
-            else:
-                default = dataclasses.field(default=MISSING)
-            fields[field.name] = (field.name, kind, default)
+            default = dataclasses.field(default_factory=partial(_default, field))
+            fields[field.name] = (field.name, _config_type(hints[field.name]), default)
     return dataclasses.make_dataclass(f"{classes[0].__name__}Config", list(fields.values()))
 
 
-def _field(kind: Any, plain: Any) -> Any:
-    if isinstance(plain, list):
-        return dataclasses.field(default_factory=lambda: list(plain))
-    if dataclasses.is_dataclass(kind):
-        return dataclasses.field(default_factory=lambda: _instance(kind, plain))
-    if isinstance(plain, dict):
-        return dataclasses.field(default_factory=lambda: dict(plain))
-    return dataclasses.field(default=plain)
-
-
-def _instance(kind: Any, plain: Mapping[str, Any]) -> Any:
-    """A schema with values from plain data, schemas within it included."""
-    kinds = {field.name: field.type for field in dataclasses.fields(kind)}
-    return kind(
-        **{
-            name: _instance(kinds[name], value) if dataclasses.is_dataclass(kinds[name]) else value
-            for name, value in plain.items()
-        }
-    )
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return _config_value(field.default_factory())
+    return MISSING if field.default is dataclasses.MISSING else _config_value(field.default)
 
 
 def _config_type(hint: Any) -> Any:
@@ -301,7 +274,8 @@ def _config_type(hint: Any) -> Any:
 
 def _config_value(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _config_value(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        parts = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return schema(type(value))(**{name: _config_value(part) for name, part in parts.items()})
     if isinstance(value, tuple):
         return [_config_value(item) for item in value]
     return value
