@@ -17,7 +17,7 @@ from study_pages import comment_of
 
 from experiments.common.config import PARTS, Config
 from experiments.common.schema import ranges
-from experiments.common.study import load_study, study_names
+from experiments.common.study import load_settings, study_names
 from experiments.results.keep import records_of
 from mvest.mechanics.parameters import KINDS
 from mvest.reporting.skill import GENERIC, skill_table, stated
@@ -67,12 +67,7 @@ def setting_groups() -> str:
 def setting_ranges() -> str:
     """What settings may be, by the kinds of quantities."""
     found: dict[tuple[str, ...], set[str]] = {}
-    for kind in [
-        *PARTS["valve"],
-        *PARTS["mechanics"],
-        Config,
-        *(load_study(name).settings for name in study_names()),
-    ]:
+    for kind in [*PARTS["valve"], *PARTS["mechanics"], Config, *map(load_settings, study_names())]:
         for key, within in ranges(kind):
             bounds = {type(one).__name__: one for one in within.metadata}
             unit, _, why = (within.description or "").rpartition("; ")

@@ -30,7 +30,7 @@ from experiments.common.schema import (
     with_contents,
     without,
 )
-from experiments.common.study import load_study, study_names
+from experiments.common.study import load_settings, study_names
 from mvest.errors import ConfigurationError
 from mvest.files import sha256_of
 from mvest.imaging.models import MODEL_FILE
@@ -340,7 +340,7 @@ def _not_hashed(study: str | None) -> tuple[str, ...]:
 @cache
 def _kinds(study: str | None) -> dict[str, tuple[Any, ...]]:
     """Setting of a study at the top -> its type, or the types that it joins."""
-    own = hints_of(load_study(study).settings) if study in study_names() else {}
+    own = hints_of(load_settings(study)) if study in study_names() else {}
     return {name: (kind,) for name, kind in {**hints_of(Config), **own}.items()} | dict(PARTS)
 
 
@@ -365,7 +365,7 @@ class StudySource(ConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """The schema of a study: what every study has, and what its own settings add."""
         name = _study_of(config_path)
-        node = schema(Config, load_study(name).settings)
+        node = schema(Config, load_settings(name))
         parts = [
             (part, kind, field(default_factory=kind))
             for part, classes in PARTS.items()

@@ -95,13 +95,22 @@ def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None
             return float(value)
         return int(value) if kind is Any and float(value).is_integer() else value
     if isinstance(value, Mapping):
-        hints = hints_of(kind) if _is_schema(kind) else {}
-        inner = None if hints else (typing.get_args(kind) or (given,))[-1]
-        return {k: with_contents(hints.get(k, inner), item, value) for k, item in value.items()}
+        return {k: with_contents(hint, item, value) for k, hint, item in _parts(given, value)}
     if isinstance(value, list | tuple):
-        inner = (typing.get_args(kind) or (given,))[0]
-        return [with_contents(inner, item) for item in value]
+        return [with_contents(hint, item) for _, hint, item in _parts(given, value)]
     return value
+
+
+def _parts(given: Any, value: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """Name, type and value of each part of a mapping or list; without its own, the whole's type."""
+    kind, _ = _unwrapped(given)
+    inner = typing.get_args(kind) or (given,)
+    if isinstance(value, Mapping):
+        hints = hints_of(kind) if _is_schema(kind) else {}
+        other = None if hints else inner[-1]
+        yield from ((name, hints.get(name, other), part) for name, part in value.items())
+    else:
+        yield from ((None, inner[0], part) for part in value)
 
 
 @cache
@@ -186,7 +195,7 @@ def require_admissible_values(
     ConfigurationError
         One line with the setting, its value and the range.
     """
-    kind, marks = _unwrapped(kind)
+    given, (kind, marks) = kind, _unwrapped(kind)
     within = next((mark for mark in marks if isinstance(mark, FieldInfo)), None)
     if value is None or isinstance(value, bool):
         return
@@ -201,22 +210,12 @@ def require_admissible_values(
             raise ConfigurationError(f"{key} has {error}") from error
     elif len(value) > MAX_ENTRIES:
         raise ConfigurationError(f"{key} has {len(value)} entries, expected at most {MAX_ENTRIES}")
-    elif isinstance(value, Mapping):
-        hints = hints_of(kind) if _is_schema(kind) else {}
-        arguments = typing.get_args(kind)
-        inner = Any if within is None else Annotated[Any, within]
-        if len(arguments) == 2:
-            inner = arguments[1]
-        for name, part in value.items():
-            own = by_parameter(str(name)) if BY_PARAMETER in marks else None
-            hint = hints.get(name, inner) if own is None else Annotated[Any, own]
-            require_admissible_values(hint, part, f"{key}.{name}".lstrip("."), by_parameter)
     else:
-        arguments = typing.get_args(kind)
-        inner = arguments[0] if arguments else Any
-        for part in value:
-            hint = inner if within is None else Annotated[Any, within]
-            require_admissible_values(hint, part, key, by_parameter)
+        for name, hint, part in _parts(given, value):
+            own = by_parameter(str(name)) if BY_PARAMETER in marks else None
+            inner = hint if own is None else Annotated[Any, own]
+            whole = key if name is None else f"{key}.{name}".lstrip(".")
+            require_admissible_values(inner, part, whole, by_parameter)
 
 
 def require_within(key: str, value: float, within: FieldInfo | None) -> None:
@@ -289,24 +288,22 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
     ConfigurationError
         If a field without a default has no value.
     """
-    hints = typing.get_type_hints(cls)
-    names = [field.name for field in dataclasses.fields(typing.cast(Any, cls))]
-    missing = [name for name in names if values.get(name, MISSING) == MISSING]
+    hints = hints_of(typing.cast(Any, cls))
+    missing = [name for name in hints if values.get(name, MISSING) == MISSING]
     if missing:
         raise ConfigurationError(f"{cls.__name__} needs a value for {', '.join(missing)}")
-    return cls(**{name: _value(hints[name], values[name]) for name in names})
+    return cls(**{name: _value(hint, values[name]) for name, hint in hints.items()})
 
 
 def _value(hint: Any, value: Any) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    kind, _ = _unwrapped(hint)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if value is None:
         return None
-    if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type, hint), value)
+    if _is_schema(kind):
+        return build(kind, value)
     if origin is tuple and isinstance(value, Sequence):
         return tuple(_value(arguments[0], item) for item in value)
     if origin in (dict, Mapping) and isinstance(value, Mapping):
         return {key: _value(arguments[1], item) for key, item in value.items()}
-    if origin in (types.UnionType, typing.Union):
-        return _value(arguments[0], value)
     return value

@@ -133,8 +133,6 @@ def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSett
 
 def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
     """The estimator's mesh settings with the truth's changes."""
-    if truth["refine"] < 1:
-        raise ConfigurationError(f"truth.refine = {truth['refine']}, expected at least 1")
     changed = dict(mesh)
     changed["source"] = truth["source"] or mesh["source"]
     changed["edge_length"] = mesh["edge_length"] / truth["refine"]
@@ -281,8 +279,6 @@ def build_twin(config: Values) -> Twin:
     linear_solver(settings.solver)
     if not truth["dt_factor"] > 0:
         raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
-    if config["repeats"] < 1:
-        raise ConfigurationError(f"repeats = {config['repeats']}, expected at least 1")
     true_settings = truth_mechanics(settings, truth)
     _require_tissue(true_settings, parameters, values)
 

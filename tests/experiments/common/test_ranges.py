@@ -16,7 +16,7 @@ from experiments.common.schema import (
     require_admissible_values,
     require_within,
 )
-from experiments.common.study import load_study, study_names
+from experiments.common.study import load_settings, study_names
 from experiments.runner.execution.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
@@ -53,12 +53,7 @@ def without_range(kind: object, key: str = "") -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        Config,
-        *PARTS["valve"],
-        *PARTS["mechanics"],
-        *(load_study(name).settings for name in study_names()),
-    ],
+    [Config, *PARTS["valve"], *PARTS["mechanics"], *map(load_settings, study_names())],
     ids=lambda kind: f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}",
 )
 def test_every_number_has_a_range(kind: type) -> None:
