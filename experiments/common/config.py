@@ -23,7 +23,7 @@ from experiments.common.schema import (
     BY_PARAMETER,
     NOT_HASHED,
     hints_of,
-    marked,
+    marks_in,
     require_admissible_values,
     require_within,
     schema,
@@ -332,21 +332,16 @@ def _not_hashed(study: str | None) -> tuple[str, ...]:
         name
         for top, kinds in _kinds(study).items()
         for kind in kinds
-        for name in marked(kind, NOT_HASHED, top)
+        for name, mark in marks_in(kind, top)
+        if mark is NOT_HASHED
     )
 
 
 @cache
 def _kinds(study: str | None) -> dict[str, tuple[Any, ...]]:
     """Setting of a study at the top -> its type, or the types that it joins."""
-    settings = _settings(study)
-    own = {} if settings is None else hints_of(settings)
+    own = hints_of(load_settings(study)) if study in study_names() else {}
     return {name: (kind,) for name, kind in {**hints_of(Config), **own}.items()} | dict(PARTS)
-
-
-@cache
-def _settings(study: str | None) -> type | None:
-    return load_settings(study) if study in study_names() else None
 
 
 def _package_model() -> str | None:

@@ -10,7 +10,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
@@ -95,13 +95,22 @@ def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None
             return float(value)
         return int(value) if kind is Any and float(value).is_integer() else value
     if isinstance(value, Mapping):
-        hints = hints_of(kind) if _is_schema(kind) else {}
-        inner = None if hints else (typing.get_args(kind) or (given,))[-1]
-        return {k: with_contents(hints.get(k, inner), item, value) for k, item in value.items()}
+        return {k: with_contents(hint, item, value) for k, hint, item in _parts(given, value)}
     if isinstance(value, list | tuple):
-        inner = (typing.get_args(kind) or (given,))[0]
-        return [with_contents(inner, item) for item in value]
+        return [with_contents(hint, item) for _, hint, item in _parts(given, value)]
     return value
+
+
+def _parts(given: Any, value: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """Name, type and value of each part of a mapping or list; without its own, the whole's type."""
+    kind, _ = _unwrapped(given)
+    inner = typing.get_args(kind) or (given,)
+    if isinstance(value, Mapping):
+        hints = hints_of(kind) if _is_schema(kind) else {}
+        other = None if hints else inner[-1]
+        yield from ((name, hints.get(name, other), part) for name, part in value.items())
+    else:
+        yield from ((None, inner[0], part) for part in value)
 
 
 @cache
@@ -135,16 +144,6 @@ def _unwrapped(kind: Any) -> tuple[Any, tuple[Any, ...]]:
             return kind, marks
 
 
-def marked(kind: Any, mark: Mark, key: str = "") -> Iterator[str]:
-    """Dotted names of the marked settings of a schema; a marked part stands for what is in it."""
-    kind, marks = _unwrapped(kind)
-    if mark in marks:
-        yield key
-    elif _is_schema(kind):
-        for name, hint in hints_of(kind).items():
-            yield from marked(hint, mark, f"{key}.{name}".lstrip("."))
-
-
 def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """Nested values without those of the dotted names."""
     kept = {key: value for key, value in values.items() if key not in names}
@@ -155,20 +154,23 @@ def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     return kept
 
 
-def ranges(kind: Any, key: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted names of all settings of a schema with a range; names within mappings are ``*``."""
+def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of the settings of a schema with each mark; names within mappings are ``*``."""
     kind, marks = _unwrapped(kind)
-    for mark in marks:
-        if isinstance(mark, FieldInfo):
-            yield key, mark
+    yield from ((key, mark) for mark in marks)
     if _is_schema(kind):
         for name, hint in hints_of(kind).items():
-            yield from ranges(hint, f"{key}.{name}".lstrip("."))
+            yield from marks_in(hint, f"{key}.{name}".lstrip("."))
     elif typing.get_origin(kind) in (dict, Mapping):
-        yield from ranges(typing.get_args(kind)[1], f"{key}.*")
+        yield from marks_in(typing.get_args(kind)[1], f"{key}.*")
     else:
         for part in typing.get_args(kind):
-            yield from ranges(part, key)
+            yield from marks_in(part, key)
+
+
+def ranges(kind: Any) -> list[tuple[str, FieldInfo]]:
+    """Dotted names of all settings of a schema with a range."""
+    return [(key, mark) for key, mark in marks_in(kind) if isinstance(mark, FieldInfo)]
 
 
 def require_admissible_values(
@@ -193,7 +195,7 @@ def require_admissible_values(
     ConfigurationError
         One line with the setting, its value and the range.
     """
-    kind, marks = _unwrapped(kind)
+    given, (kind, marks) = kind, _unwrapped(kind)
     within = next((mark for mark in marks if isinstance(mark, FieldInfo)), None)
     if value is None or isinstance(value, bool):
         return
@@ -208,22 +210,12 @@ def require_admissible_values(
             raise ConfigurationError(f"{key} has {error}") from error
     elif len(value) > MAX_ENTRIES:
         raise ConfigurationError(f"{key} has {len(value)} entries, expected at most {MAX_ENTRIES}")
-    elif isinstance(value, Mapping):
-        hints = hints_of(kind) if _is_schema(kind) else {}
-        arguments = typing.get_args(kind)
-        inner = Any if within is None else Annotated[Any, within]
-        if len(arguments) == 2:
-            inner = arguments[1]
-        for name, part in value.items():
-            own = by_parameter(str(name)) if BY_PARAMETER in marks else None
-            hint = hints.get(name, inner) if own is None else Annotated[Any, own]
-            require_admissible_values(hint, part, f"{key}.{name}".lstrip("."), by_parameter)
     else:
-        arguments = typing.get_args(kind)
-        inner = arguments[0] if arguments else Any
-        for part in value:
-            hint = inner if within is None else Annotated[Any, within]
-            require_admissible_values(hint, part, key, by_parameter)
+        for name, hint, part in _parts(given, value):
+            own = by_parameter(str(name)) if BY_PARAMETER in marks else None
+            inner = hint if own is None else Annotated[Any, own]
+            whole = key if name is None else f"{key}.{name}".lstrip(".")
+            require_admissible_values(inner, part, whole, by_parameter)
 
 
 def require_within(key: str, value: float, within: FieldInfo | None) -> None:
@@ -243,6 +235,7 @@ def require_within(key: str, value: float, within: FieldInfo | None) -> None:
         raise ConfigurationError(text + (f" ({why})" if why else ""))
 
 
+@cache
 def schema(*classes: type) -> type:
     """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
 
@@ -252,36 +245,15 @@ def schema(*classes: type) -> type:
     for cls in classes:
         hints = typing.get_type_hints(cls)
         for field in dataclasses.fields(cls):
-            kind = _config_type(hints[field.name])
-            if field.default_factory is not dataclasses.MISSING:
-                default = _field(kind, _config_value(field.default_factory()))
-            elif field.default is not dataclasses.MISSING:
-                default = _field(kind, _config_value(field.default))
-            else:
-                default = dataclasses.field(default=MISSING)
-            fields[field.name] = (field.name, kind, default)
+            default = dataclasses.field(default_factory=partial(_default, field))
+            fields[field.name] = (field.name, _config_type(hints[field.name]), default)
     return dataclasses.make_dataclass(f"{classes[0].__name__}Config", list(fields.values()))
 
 
-def _field(kind: Any, plain: Any) -> Any:
-    if isinstance(plain, list):
-        return dataclasses.field(default_factory=lambda: list(plain))
-    if dataclasses.is_dataclass(kind):
-        return dataclasses.field(default_factory=lambda: _instance(kind, plain))
-    if isinstance(plain, dict):
-        return dataclasses.field(default_factory=lambda: dict(plain))
-    return dataclasses.field(default=plain)
-
-
-def _instance(kind: Any, plain: Mapping[str, Any]) -> Any:
-    """A schema with values from plain data, schemas within it included."""
-    kinds = {field.name: field.type for field in dataclasses.fields(kind)}
-    return kind(
-        **{
-            name: _instance(kinds[name], value) if dataclasses.is_dataclass(kinds[name]) else value
-            for name, value in plain.items()
-        }
-    )
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return _config_value(field.default_factory())
+    return MISSING if field.default is dataclasses.MISSING else _config_value(field.default)
 
 
 def _config_type(hint: Any) -> Any:
@@ -301,7 +273,8 @@ def _config_type(hint: Any) -> Any:
 
 def _config_value(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _config_value(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        parts = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return schema(type(value))(**{name: _config_value(part) for name, part in parts.items()})
     if isinstance(value, tuple):
         return [_config_value(item) for item in value]
     return value
@@ -315,24 +288,22 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
     ConfigurationError
         If a field without a default has no value.
     """
-    hints = typing.get_type_hints(cls)
-    names = [field.name for field in dataclasses.fields(typing.cast(Any, cls))]
-    missing = [name for name in names if values.get(name, MISSING) == MISSING]
+    hints = hints_of(typing.cast(Any, cls))
+    missing = [name for name in hints if values.get(name, MISSING) == MISSING]
     if missing:
         raise ConfigurationError(f"{cls.__name__} needs a value for {', '.join(missing)}")
-    return cls(**{name: _value(hints[name], values[name]) for name in names})
+    return cls(**{name: _value(hint, values[name]) for name, hint in hints.items()})
 
 
 def _value(hint: Any, value: Any) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    kind, _ = _unwrapped(hint)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if value is None:
         return None
-    if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type, hint), value)
+    if _is_schema(kind):
+        return build(kind, value)
     if origin is tuple and isinstance(value, Sequence):
         return tuple(_value(arguments[0], item) for item in value)
     if origin in (dict, Mapping) and isinstance(value, Mapping):
         return {key: _value(arguments[1], item) for key, item in value.items()}
-    if origin in (types.UnionType, typing.Union):
-        return _value(arguments[0], value)
     return value

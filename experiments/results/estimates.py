@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from experiments.common.records.record import Record, read_record
 from experiments.results.keep import RECORDS, records_of
 from experiments.sweeps.collected import SWEEPS, Sweep, read_sweep
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.problem.record import EstimateRecord
 
@@ -125,13 +125,10 @@ def write_estimates(folder: Path, target: Path) -> list[Path]:
     content = table.to_csv(index=False) if target.suffix == ".csv" else table.to_parquet()
     lines = [f'{name},{kind},{unit},"{text}"' for name, (kind, unit, text) in COLUMNS.items()]
     dictionary = "\n".join(["column,type,unit,meaning", *lines, ""])
-    try:
-        return [
-            write_atomically(target, content),
-            write_atomically(target.with_suffix(".columns.csv"), dictionary),
-        ]
-    except OSError as error:
-        raise cannot_write(target, error) from error
+    return [
+        write_atomically(target, content),
+        write_atomically(target.with_suffix(".columns.csv"), dictionary),
+    ]
 
 
 def _below(folder: Path, name: str) -> list[Path]:

@@ -142,7 +142,7 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
     InputError
         If the file cannot be read.
     """
-    from mvest.problem.fields import CaseFields
+    from mvest.problem.fields import case_fields
     from mvest.reporting.case import drawing
     from mvest.reporting.figures import ATRIUM, View
 
@@ -151,20 +151,13 @@ def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequenc
         count = len(arrays["chord_tip"])
         # The ends of the chordae are points of no triangle.
         shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
-        valve = CaseFields(
-            triangles=arrays["triangles"].astype(np.int64),
-            region=arrays["region"].astype(np.int64),
-            rest=shapes[0],
-            annulus=arrays["annulus"].astype(np.int64),
-            free_edge=np.zeros(0, dtype=np.int64),
-            frames=tuple(f"{t:g} s" for t in arrays["times"][1:]),
-            seen=np.ones(len(shapes) - 1, dtype=bool),
-            tips=arrays["tips"].astype(float),
-            chord_tip=arrays["chord_tip"].astype(np.int64),
-            chord_insertion=shapes.shape[1] - count + np.arange(count),
-            observed_points={},
-            reach_mm=float(arrays["reach_mm"]),
-        )
+        own = {
+            "rest": shapes[0],
+            "frames": [f"{t:g} s" for t in arrays["times"][1:]],
+            "seen": np.ones(len(shapes) - 1, dtype=bool),
+            "chord_insertion": shapes.shape[1] - count + np.arange(count),
+        }
+        valve = case_fields(arrays | own, turned=False)
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
     posterior = View("seen from the posterior side", 8.0, -90.0)

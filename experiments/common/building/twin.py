@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from experiments.common.progress import SolveBar
 from experiments.common.schema import Values
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
+from mvest.elements import ELEMENTS
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.wrappers import SharedStart
@@ -50,6 +52,13 @@ from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface, Valve
+
+BASE_GB = 0.4
+"""Of a job on the smallest mesh, its libraries included."""
+
+GB_A_NODE = 40e-6
+"""Most of it the factor of the tangent of a closed valve. Closures on hex18 had peaks of 0.37, 0.55
+and 0.99 GB at 4896, 10 000 and 24 600 nodes: 0.2 GB and 33 kB a node."""
 
 
 def build_truth(
@@ -124,8 +133,6 @@ def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSett
 
 def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
     """The estimator's mesh settings with the truth's changes."""
-    if truth["refine"] < 1:
-        raise ConfigurationError(f"truth.refine = {truth['refine']}, expected at least 1")
     changed = dict(mesh)
     changed["source"] = truth["source"] or mesh["source"]
     changed["edge_length"] = mesh["edge_length"] / truth["refine"]
@@ -141,36 +148,57 @@ def _cells(mesh: Values) -> dict[str, Any]:
     return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
 
 
+def require_room(values: Mapping[str, Any], limit_gb: float) -> None:
+    """Refuse structured meshes whose closure needs more memory than a job may have.
+
+    Raises
+    ------
+    ConfigurationError
+        If one does; the message names it.
+    """
+    element, truth = values["mechanics"]["element"], values["truth"]
+    meshes = {
+        "mesh": (element, values["mesh"]),
+        "truth": (truth["element"] or element, truth_mesh(values["mesh"], truth)),
+    }
+    if "personal" in values:
+        meshes["personal.mesh"] = element, {"layers": 1, **values["personal"]["mesh"]}
+    for name, (kind, mesh) in meshes.items():
+        if mesh["source"] != "structured" or kind not in ELEMENTS:
+            continue
+        cells = mesh["columns"], mesh["rows"], mesh["layers"]
+        needed = expected_memory_gb(kind, *cells)
+        if needed > limit_gb:
+            raise ConfigurationError(
+                f"{name}: {' x '.join(map(str, cells))} cells of {kind} need about {needed:.3g} GB,"
+                f" more than the {limit_gb:.3g} GB that a job may have (memory_limit_gb)"
+            )
+
+
+def expected_memory_gb(element: str, columns: int, rows: int, layers: int = 1) -> float:
+    """Peak of a job that closes a valve on a structured mesh, which grows with its nodes."""
+    nodes = ELEMENTS[element].node_coordinates.T
+    around, along, through = (np.unique(coordinate).size - 1 for coordinate in nodes)
+    count = around * columns * (along * rows + 1) * (through * layers + 1)
+    return BASE_GB + GB_A_NODE * float(count)
+
+
 MADE_BY = (closure_model, truth_mechanics, truth_mesh)
 """What makes the closures of a configured valve."""
 
 
-class Correlations:
-    """Correlations between the vertices of a surface, each length factorised once."""
-
-    def __init__(self, surface: LeafletSurface) -> None:
-        self.surface = surface
-        self._made: dict[float, SpatialCorrelation] = {}
-
-    def __call__(self, length: float) -> SpatialCorrelation:
-        """The correlation of one length, mm."""
-        if length not in self._made:
-            self._made[length] = SpatialCorrelation(self.surface.vertices, length)
-        return self._made[length]
-
-
 def observation_errors(
-    settings: Values, correlations: Correlations
+    settings: Values, surface: LeafletSurface, correlated: Callable[[float], SpatialCorrelation]
 ) -> tuple[ObservationError, ...]:
     """The configured errors that are not zero, in the order in which they arise."""
     offset = settings["annulus_offset_mm"]
     made: list[ObservationError] = [AnnulusOffset(tuple(offset))] if np.any(offset) else []
     made.append(WhiteNoise(settings["noise_mm"]))
     if settings["correlated_mm"]:
-        correlation = correlations(settings["correlation_length_mm"])
+        correlation = correlated(settings["correlation_length_mm"])
         made.append(CorrelatedNoise(settings["correlated_mm"], correlation))
     if settings["dropout_mm"]:
-        made.append(CoaptationDropout(settings["dropout_mm"], correlations.surface))
+        made.append(CoaptationDropout(settings["dropout_mm"], surface))
     return tuple(made)
 
 
@@ -251,8 +279,6 @@ def build_twin(config: Values) -> Twin:
     linear_solver(settings.solver)
     if not truth["dt_factor"] > 0:
         raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
-    if config["repeats"] < 1:
-        raise ConfigurationError(f"repeats = {config['repeats']}, expected at least 1")
     true_settings = truth_mechanics(settings, truth)
     _require_tissue(true_settings, parameters, values)
 
@@ -260,10 +286,11 @@ def build_twin(config: Values) -> Twin:
     observation = config["observation"]
     valve = anatomy.valve(observation["columns"], observation["rows"])
     check_parameters([*parameters, *config["fixed"], *truth["fixed"]], valve, settings)
-    correlations = Correlations(valve.surface)
-    errors = observation_errors(observation, correlations)
+    # Each length is factorised once.
+    correlated = cache(partial(SpatialCorrelation, valve.surface.vertices))
+    errors = observation_errors(observation, valve.surface, correlated)
     told_length = config["filter"]["R_correlation_mm"]
-    correlation = correlations(told_length) if told_length else None
+    correlation = correlated(told_length) if told_length else None
     plain = closure_model(config)
     model = replace(
         plain,

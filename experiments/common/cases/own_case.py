@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -68,24 +69,9 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
                 f"{', '.join(known)}"
             )
         unknowns.append(Prior(name, about.mean, about.std, Treatment(about.treatment)))
-    return with_stiffening(
-        PersonaliseSettings(
-            tuple(unknowns),
-            mechanics_of(values),
-            personal.mesh,
-            personal.tolerance,
-            personal.max_iterations,
-            personal.largest_change,
-            personal.paper,
-            personal.moduli_only,
-            personal.confirm,
-            personal.correspondence,
-            personal.errors,
-            considered_geometry=personal.considered_geometry,
-            considered_law=personal.considered_law,
-            pressures=personal.pressures,
-        )
-    )
+    # All other settings have the names of the library's.
+    others = {f.name: getattr(personal, f.name) for f in fields(personal) if f.name != "unknowns"}
+    return with_stiffening(PersonaliseSettings(tuple(unknowns), mechanics_of(values), **others))
 
 
 def read_configured(place: str | None) -> ValveCase:

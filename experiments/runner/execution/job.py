@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.common.building.memory import require_room
+from experiments.common.building.twin import require_room
 from experiments.common.config import hash_of
 from experiments.common.records.record import Record
 from experiments.common.records.writer import words_of, write_results

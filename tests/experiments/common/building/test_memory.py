@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.building.memory import expected_memory_gb
+from experiments.common.building.twin import expected_memory_gb
 from experiments.run import main
 
 MEASURED = {(36, 4): 0.29, (72, 8): 0.37, (100, 12): 0.55, (150, 20): 0.99}
