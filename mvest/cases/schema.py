@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -301,9 +302,9 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 CASE_FILE = "case.yaml"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CaseFolder:
-    """A case folder: finds the files in it and remembers which were used."""
+    """A case folder: its fields, the files that were used, and what was derived."""
 
     root: Path
     used: dict[str, Path] = field(default_factory=dict)
@@ -313,9 +314,27 @@ class CaseFolder:
         """The file with the fields, which every error names first."""
         return self.root / CASE_FILE
 
+    @cached_property
     def document(self) -> CaseFile:
         """The fields of the case; see `read_case_file`."""
         return read_case_file(self.file(CASE_FILE, "link"))
+
+    @cached_property
+    def derived(self) -> list[str]:
+        """Sentences, one for everything that was not given but derived."""
+        return list(self.document.derived)
+
+    def wrong(self, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
+        """The error for one field: file, field, and what is wrong with it."""
+        return wrong(self.case, field, what, kind)
+
+    @contextmanager
+    def at(self, field: str) -> Iterator[None]:
+        """Put the file and the field before the message of any error raised inside."""
+        try:
+            yield
+        except InputError as fault:
+            raise self.wrong(field, str(fault), type(fault)) from fault
 
     def file(self, name: str, where: str) -> Path:
         """The path of a file that a field names; it must lie in the folder."""
@@ -326,13 +345,11 @@ class CaseFolder:
             found = not outside and path.is_file()
             outside = outside or not path.resolve().is_relative_to(self.root.resolve())
         except (OSError, RuntimeError) as fault:  # a name too long, a link to itself
-            raise wrong(self.case, where, f"{name[:60]!r} cannot be found: {fault}") from fault
+            raise self.wrong(where, f"{name[:60]!r} cannot be found: {fault}") from fault
         if outside:
-            raise wrong(
-                self.case, where, f"{name!r} leads out of the folder; expected a file inside it"
-            )
+            raise self.wrong(where, f"{name!r} leads out of the folder; expected a file inside it")
         if not found:
-            raise wrong(self.case, where, f"{name!r}: no such file in {self.root}")
+            raise self.wrong(where, f"{name!r}: no such file in {self.root}")
         self.used[given.as_posix()] = path
         return path
 
@@ -350,6 +367,6 @@ def files_of_case(root: Path) -> dict[str, Path]:
     """Name -> file of all that reading a case folder opens, up to the first that is missing."""
     folder = CaseFolder(root)
     with suppress(InputError):  # it is refused when it is read
-        for where, name in folder.document().files():
+        for where, name in folder.document.files():
             folder.file(name, where)
     return folder.used

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mvest.cases.case import Frame, Role
-from mvest.cases.checks import at, check_chordae, check_thickness
+from mvest.cases.checks import check_chordae, check_thickness
 from mvest.cases.chord_layout import (
     CLOSED_DEPTH,
     SEEN_ON_BAND,
@@ -18,7 +18,7 @@ from mvest.cases.chord_layout import (
 )
 from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
 from mvest.cases.rims import Rims
-from mvest.cases.schema import CaseFile, CaseFolder, ChordaeEntry, PointData
+from mvest.cases.schema import CaseFolder, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
@@ -31,38 +31,26 @@ GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
 """mm, the method paper's values (ISBI 2013)."""
 
 
-def read_leaflets(
-    file: Path, document: CaseFile, reference: ReferenceFrame, derived: list[str]
-) -> LeafletSurface:
+def read_leaflets(folder: CaseFolder, reference: ReferenceFrame) -> LeafletSurface:
     """The midsurface of the reference frame; what was not given is added to ``derived``."""
-    seen, names = reference.seen, tuple(document.region_names().values())
+    seen, names = reference.seen, tuple(folder.document.region_names().values())
     n = len(seen.vertices)
-    bare = LeafletSurface(
-        seen.vertices,
-        seen.triangles,
-        reference.region,
-        names,
-        np.tile([1.0, 0.0, 0.0], (n, 1)),
-        np.ones(n),
-    )
-    with at(file, "thickness"):
-        thickness = _thickness(document, seen, names, bare.vertex_region, derived)
+    shape = seen.vertices, seen.triangles, reference.region, names
+    bare = LeafletSurface(*shape, np.tile([1.0, 0.0, 0.0], (n, 1)), np.ones(n))
+    with folder.at("thickness"):
+        thickness = _thickness(folder, seen, names, bare.vertex_region)
         check_thickness(thickness)
-    with at(file, "fibre"):
-        fibre = _fibre(document, reference, derived)
-    return LeafletSurface(seen.vertices, seen.triangles, reference.region, names, fibre, thickness)
+    with folder.at("fibre"):
+        fibre = _fibre(folder, reference)
+    return LeafletSurface(*shape, fibre, thickness)
 
 
 def _thickness(
-    document: CaseFile,
-    seen: SeenFrame,
-    names: tuple[str, ...],
-    vertex_region: IntArray,
-    derived: list[str],
+    folder: CaseFolder, seen: SeenFrame, names: tuple[str, ...], vertex_region: IntArray
 ) -> FloatArray:
-    given = document.thickness
+    given = folder.document.thickness
     if isinstance(given, PointData):
-        return MM_PER[document.units.length] * point_data(seen, given.point_data, 1)[:, 0]
+        return MM_PER[folder.document.units.length] * point_data(seen, given.point_data, 1)[:, 0]
     if isinstance(given, float):
         return np.full(len(seen.vertices), given)
     by_name: Mapping[str, float] = GENERIC_THICKNESS if given is None else given
@@ -72,17 +60,17 @@ def _thickness(
     unknown = [name for name in by_name if name not in names]
     if given is None:
         listed = ", ".join(f"{by_name[name]:g} mm ({name})" for name in names)
-        derived.append(f"thickness: {listed} assumed")
+        folder.derived.append(f"thickness: {listed} assumed")
     elif unknown:
         raise InputError(f"unknown region {unknown[0]!r}; known are {', '.join(names)}")
     return np.array([by_name[name] for name in names])[vertex_region]
 
 
-def _fibre(document: CaseFile, reference: ReferenceFrame, derived: list[str]) -> FloatArray:
+def _fibre(folder: CaseFolder, reference: ReferenceFrame) -> FloatArray:
     seen, rims = reference.seen, reference.rims
-    if document.fibre is not None:
-        return point_data(seen, document.fibre, 3)
-    derived.append(
+    if folder.document.fibre is not None:
+        return point_data(seen, folder.document.fibre, 3)
+    folder.derived.append(
         "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
     )
     return surface_coordinates(
@@ -110,25 +98,20 @@ def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
 
 
 def read_chordae(
-    folder: CaseFolder,
-    document: CaseFile,
-    reference: ReferenceFrame,
-    placed: list[tuple[Frame, Rims]],
-    derived: list[str],
+    folder: CaseFolder, reference: ReferenceFrame, placed: list[tuple[Frame, Rims]]
 ) -> Chordae:
     """The chordae of the table, or those laid out; then this is added to ``derived``."""
-    tip_count = len(reference.seen.tips)
-    if document.chordae is None:
-        with at(folder.case, "chordae"):
-            return _laid_out(document, reference, placed, derived)
-    given = document.chordae
+    given = folder.document.chordae
+    if given is None:
+        with folder.at("chordae"):
+            return _laid_out(folder, reference, placed)
     entry = given if isinstance(given, ChordaeEntry) else ChordaeEntry(file=given)  # type: ignore[call-arg]
     file = folder.file(entry.file, "chordae")
-    with at(folder.case, "chordae"):
-        chordae = _chord_table(file, entry, MM_PER[document.units.length])
-        check_chordae(chordae, reference.seen.vertices, tip_count)
+    with folder.at("chordae"):
+        chordae = _chord_table(file, entry, MM_PER[folder.document.units.length])
+        check_chordae(chordae, reference.seen.vertices, len(reference.seen.tips))
     if isinstance(given, str):
-        derived.append(f"chordae: toe strain {entry.toe_strain:g} assumed")
+        folder.derived.append(f"chordae: toe strain {entry.toe_strain:g} assumed")
     return chordae
 
 
@@ -154,47 +137,38 @@ def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
 
 
 def _laid_out(
-    document: CaseFile,
-    reference: ReferenceFrame,
-    placed: list[tuple[Frame, Rims]],
-    derived: list[str],
+    folder: CaseFolder, reference: ReferenceFrame, placed: list[tuple[Frame, Rims]]
 ) -> Chordae:
-    names = list(document.region_names().values())
+    names = list(folder.document.region_names().values())
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
         raise InputError(
             f"missing; it can be left out only for two regions, one of them named anterior, and "
             f"two papillary tips (here: {', '.join(names)}; {len(seen.tips)} tips)"
         )
-    anterior = names.index("anterior")
-    rims = reference.rims
-    band = LeafletBand.of(
-        seen.vertices, seen.triangles, reference.region, rims.annulus, rims.free_edge, anterior
-    )
+
+    def band(x: FloatArray, triangles: IntArray, region: IntArray, rims: Rims) -> LeafletBand:
+        loops = rims.annulus, rims.free_edge
+        return LeafletBand.of(x, triangles, region, *loops, names.index("anterior"))
+
+    opened = band(seen.vertices, seen.triangles, reference.region, reference.rims)
     seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
-    closed, closed_rims = seen_closed[0] if seen_closed else placed[0]
+    closed, rims = seen_closed[0] if seen_closed else placed[0]
     goal: LeafletBand | FloatArray
     if not seen_closed:
         how = (
             "an assumed closure: the free edges meet half-way between where they are open, at "
             f"{CLOSED_DEPTH:g} of their depth below the annulus"
         )
-        goal = assumed_closure(band, closed.annulus, closed.papillary_tips)
+        goal = assumed_closure(opened, closed.annulus, closed.papillary_tips)
     elif closed.corresponds:
         how, goal = "the closed frame (through its vertices)", closed.vertices
     else:
         how = "the closed frame (through the same material coordinates in it)"
-        goal = LeafletBand.of(
-            closed.vertices,
-            closed.triangles,
-            closed.region,
-            closed_rims.annulus,
-            closed_rims.free_edge,
-            anterior,
-        )
+        goal = band(closed.vertices, closed.triangles, closed.region, rims)
     layout = SEEN_ON_BAND if seen_closed else ChordLayout()
-    chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips, layout)
-    derived.append(
+    chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
+    folder.derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
         f"rest lengths from {how}"
     )
