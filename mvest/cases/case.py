@@ -98,13 +98,9 @@ class Uncertainty:
         if std.ndim > 1:
             raise InputError(f"observation std_mm: shape {std.shape}, expected one number or (n,)")
         bad = np.flatnonzero(~(np.isfinite(std) & (std > 0)))
-        if len(bad) and std.ndim == 0:
-            raise InputError(f"observation std_mm = {self.std_mm}, expected > 0")
         if len(bad):
-            raise InputError(
-                f"observation std_mm = {std[bad[0]]:g} at vertex {bad[0]} ({len(bad)} vertices in "
-                "all), expected > 0"
-            )
+            at = f" at vertex {bad[0]} ({len(bad)} vertices in all)" if std.ndim else ""
+            raise InputError(f"observation std_mm = {std.flat[bad[0]]:g}{at}, expected > 0")
         length = self.correlation_length_mm
         if not (np.isfinite(length) and length >= 0):
             raise InputError(f"observation correlation_length_mm = {length}, expected >= 0")
@@ -147,11 +143,7 @@ class ErrorSamples:
     def __post_init__(self) -> None:
         for name in ("vertices", "tips"):
             given = np.asarray(getattr(self, name))
-            if (
-                given.ndim != 4
-                or given.shape[3] != 3
-                or not np.issubdtype(given.dtype, np.floating)
-            ):
+            if given.ndim != 4 or given.shape[3] != 3 or given.dtype.kind != "f":
                 raise InputError(
                     f"error samples, {name}: {given.dtype} of shape {given.shape}, expected "
                     "floating-point numbers (samples, frames, points, 3)"

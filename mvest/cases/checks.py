@@ -22,7 +22,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_checks import check_surface
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 ANNULUS_DIAMETER = (15.0, 80.0)
 """mm, largest extent of an annulus between a small child's and the most dilated adult's."""
@@ -171,7 +171,7 @@ def check_normals(
     The annulus runs as the triangles at it do, so its vector area has their side, however the
     leaflets lie and however wide the orifice is. Edges within the surface are run along both ways.
     """
-    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edges = directed_edges(triangles)
     start, end = np.moveaxis(vertices[edges[np.isin(edges, annulus).all(axis=1)]], 1, 0)
     area = np.cross(start, end).sum(axis=0)
     towards = tips.mean(axis=0) - vertices[annulus].mean(axis=0)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -136,11 +137,9 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
 
 def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]) -> None:
     """Write samples so that they are read back unchanged."""
-    names, vertices, tips = np.array(list(frames)), samples.vertices, samples.tips
-    if samples.source is None:
-        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips)
-    else:
-        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips, source=samples.source)
+    source = {} if samples.source is None else {SOURCE: samples.source}
+    arrays: dict[str, Any] = {"vertices": samples.vertices, "tips": samples.tips} | source
+    np.savez_compressed(file, frames=np.array(list(frames)), **arrays)
 
 
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)

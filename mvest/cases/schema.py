@@ -46,22 +46,20 @@ Text = Annotated[str, Field(strict=True, max_length=MAX_TEXT)]
 Name = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]
 Index = Annotated[int, Field(strict=True, ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+NUMBER, TEXT, LIST, MAPPING, POINT_DATA = map(
+    Tag, ("\0number", "\0text", "\0list", "\0mapping", "\0point data")
+)
+EITHER = Discriminator(_kind)
+Label = Annotated[int, Field(strict=True)]
 Regions = Annotated[
-    Annotated[list[Name], Field(min_length=1), Tag("\0list")]
-    | Annotated[
-        dict[Annotated[int, Field(strict=True)], Name], Field(min_length=1), Tag("\0mapping")
-    ],
-    Discriminator(_kind),
+    Annotated[list[Name], Field(min_length=1), LIST]
+    | Annotated[dict[Label, Name], Field(min_length=1), MAPPING],
+    EITHER,
 ]
 SurfaceFiles = Annotated[
-    Annotated[Name, Tag("\0text")]
-    | Annotated[dict[Name, Name], Field(min_length=1), Tag("\0mapping")],
-    Discriminator(_kind),
+    Annotated[Name, TEXT] | Annotated[dict[Name, Name], Field(min_length=1), MAPPING], EITHER
 ]
-Curve = Annotated[
-    Annotated[Name, Tag("\0text")] | Annotated[list[Index], Field(min_length=3), Tag("\0list")],
-    Discriminator(_kind),
-]
+Curve = Annotated[Annotated[Name, TEXT] | Annotated[list[Index], Field(min_length=3), LIST], EITHER]
 
 
 class _Model(BaseModel):
@@ -80,6 +78,14 @@ class PointData(_Model):
     """A field at the vertices of the reference surface."""
 
     point_data: Name = Field(description="the name of point data of the reference surface")
+
+
+Thickness = Annotated[
+    Annotated[Number, NUMBER]
+    | Annotated[PointData, POINT_DATA]
+    | Annotated[dict[Name, Number], MAPPING],
+    EITHER,
+]
 
 
 class FrameEntry(_Model):
@@ -129,12 +135,14 @@ class ChordaeEntry(_Model):
     )
 
 
+ChordaeTable = Annotated[Annotated[Name, TEXT] | Annotated[ChordaeEntry, MAPPING], EITHER]
+
+
 class ObservationEntry(_Model):
     """How well the vertices of a frame are seen."""
 
     std_mm: Annotated[
-        Annotated[Number, Field(gt=0), Tag("\0number")] | Annotated[PointData, Tag("\0point data")],
-        Discriminator(_kind),
+        Annotated[Number, Field(gt=0), NUMBER] | Annotated[PointData, POINT_DATA], EITHER
     ] = Field(
         description="standard deviation of a coordinate in mm, > 0: a number, or "
         "{point_data: NAME} of the reference surface"
@@ -162,15 +170,9 @@ class CaseFile(_Model):
     regions: Regions = Field(
         description="a list of names (labels 0, 1, ...) or a mapping from label to name"
     )
-    thickness: (
-        Annotated[
-            Annotated[Number, Tag("\0number")]
-            | Annotated[PointData, Tag("\0point data")]
-            | Annotated[dict[Name, Number], Tag("\0mapping")],
-            Discriminator(_kind),
-        ]
-        | None
-    ) = Field(None, description="mm: a number, a number for every region, or {point_data: NAME}")
+    thickness: Thickness | None = Field(
+        None, description="mm: a number, a number for every region, or {point_data: NAME}"
+    )
     fibre: Name | None = Field(
         None, description="the name of point data (3 components) of the reference surface"
     )
@@ -180,13 +182,9 @@ class CaseFile(_Model):
     pressure_curve: Name | None = Field(
         None, description="a .csv file with the columns time,pressure"
     )
-    chordae: (
-        Annotated[
-            Annotated[Name, Tag("\0text")] | Annotated[ChordaeEntry, Tag("\0mapping")],
-            Discriminator(_kind),
-        ]
-        | None
-    ) = Field(None, description="a .csv file, or a mapping with file, toe_strain and families")
+    chordae: ChordaeTable | None = Field(
+        None, description="a .csv file, or a mapping with file, toe_strain and families"
+    )
     observation: ObservationEntry | None = Field(
         None, description="a mapping with std_mm, correlation_length_mm and error_samples"
     )
@@ -222,34 +220,6 @@ def case_schema() -> dict[str, Any]:
     return CaseFile.model_json_schema()
 
 
-def wrong(file: Path, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
-    """The error for one field of a case: file, field, and what is wrong with it, in one line."""
-    return kind(f"{file}: {one_line(field, 80)}: {one_line(what)}")
-
-
-def read_case_file(file: Path) -> CaseFile:
-    """Read ``case.yaml``.
-
-    Raises
-    ------
-    InputError
-        The file is no plain YAML mapping, or a field is missing, unknown or of the wrong kind: one
-        line with the field, what was found and what would be right.
-    """
-    data = read_yaml(file)
-    version = data.get("version")
-    if version != VERSION or isinstance(version, bool):
-        found = f"{version!r} is not known" if "version" in data else "is missing"
-        raise wrong(file, "version", f"{found}; expected {VERSION}")
-    try:
-        return CaseFile.model_validate(data)
-    except ValidationError as fault:
-        errors = fault.errors(include_url=False)
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        field, what = _explained(errors[0]["loc"], errors[0]["type"], errors[0]["input"])
-        raise wrong(file, field, what + more) from fault
-
-
 def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
     """Dotted field and a sentence for one of pydantic's errors."""
     path = [part for part in loc if not (isinstance(part, str) and part.startswith("\0"))]
@@ -265,18 +235,11 @@ def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, st
         return field, f"is missing; expected {expected}"
     shown = repr(value)
     found = shown if len(shown) <= 60 else shown[:57] + "..."
-    note = ""
-    if isinstance(value, str) and _is_number(value):
-        note = " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
-    return field, f"found {found}{note}; expected {expected}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    if isinstance(value, str):
+        with suppress(ValueError):
+            float(value)
+            found += " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
+    return field, f"found {found}; expected {expected}"
 
 
 def _place(path: Sequence[int | str]) -> tuple[type[BaseModel], str]:
@@ -316,8 +279,26 @@ class CaseFolder:
 
     @cached_property
     def document(self) -> CaseFile:
-        """The fields of the case; see `read_case_file`."""
-        return read_case_file(self.file(CASE_FILE, "link"))
+        """The fields of the case.
+
+        Raises
+        ------
+        InputError
+            The file is no plain YAML mapping, or a field is missing, unknown or of the wrong kind:
+            one line with the field, what was found and what would be right.
+        """
+        data = read_yaml(self.file(CASE_FILE, "link"))
+        version = data.get("version")
+        if version != VERSION or isinstance(version, bool):
+            found = f"{version!r} is not known" if "version" in data else "is missing"
+            raise self.wrong("version", f"{found}; expected {VERSION}")
+        try:
+            return CaseFile.model_validate(data)
+        except ValidationError as fault:
+            errors = fault.errors(include_url=False)
+            more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+            field, what = _explained(errors[0]["loc"], errors[0]["type"], errors[0]["input"])
+            raise self.wrong(field, what + more) from fault
 
     @cached_property
     def derived(self) -> list[str]:
@@ -325,8 +306,8 @@ class CaseFolder:
         return list(self.document.derived)
 
     def wrong(self, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
-        """The error for one field: file, field, and what is wrong with it."""
-        return wrong(self.case, field, what, kind)
+        """The error for one field: file, field, and what is wrong with it, in one line."""
+        return kind(f"{self.case}: {one_line(field, 80)}: {one_line(what)}")
 
     @contextmanager
     def at(self, field: str) -> Iterator[None]:

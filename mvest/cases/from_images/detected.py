@@ -12,14 +12,13 @@ import numpy as np
 
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import PressureCurve
-from mvest.cases.from_images.build import CaseTexts, case_of_sequence
-from mvest.cases.from_images.errors_in_world import (
+from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
+from mvest.cases.from_images.detector_errors import (
     samples_in_world,
     with_bands,
     without_expected_error,
 )
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
-from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
 from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
 from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS

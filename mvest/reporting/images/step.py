@@ -36,7 +36,7 @@ def write_image_step(
     Returns
     -------
     dict
-        As `mvest.cases.from_images.image_step` has it.
+        As `mvest.cases.from_images.detected.image_step` has it.
     """
     files = write_detected(detected, folder)
     name, low = detected.case.name, detected.settings.min_confidence

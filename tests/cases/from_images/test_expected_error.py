@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.cases.from_images import without_expected_error
-from mvest.cases.from_images.expected_error import coverage, error_at_shape, in_mirror
+from mvest.cases.from_images.detector_errors import (
+    coverage,
+    error_at_shape,
+    in_mirror,
+    without_expected_error,
+)
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout

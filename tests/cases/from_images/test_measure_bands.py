@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mvest.cases.from_images import measure_meaning, measure_sequence, valve_axes, with_bands
-from mvest.cases.from_images.errors_in_world import BANDED
+from mvest.cases.from_images.detector_errors import BANDED, valve_axes, with_bands
+from mvest.cases.from_images.measures import measure_meaning, measure_sequence
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
 from tests import made_up_sequence
