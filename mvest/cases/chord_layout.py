@@ -10,15 +10,17 @@ no lines of it. So phi is the share of the arc length between the commissures, o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.dimensions import ChordLayout
+from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 
@@ -40,17 +42,18 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 1.002 (SD 0.03, marginal) and 0.966 (0.013, basal) times as long in sixteen simulated valves."""
 
 
-class Places(Protocol):
-    """A valve whose points can be found by the template's coordinates."""
+class Places(NamedTuple):
+    """A valve whose points are found by the template's coordinates.
 
-    @property
-    def vertices(self) -> FloatArray:
-        """``(n, 3)`` mm."""
-        ...
+    Attributes
+    ----------
+    vertices : (n, 3) mm
+    locate : callable
+        phi ``(k,)`` (degrees) and s ``(k,)`` -> corners ``(k, 3)`` and weights ``(k, 3)``.
+    """
 
-    def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Corners ``(k, 3)`` and weights ``(k, 3)`` of points at phi (degrees) and s."""
-        ...
+    vertices: FloatArray
+    locate: Callable[[FloatArray, FloatArray], tuple[IntArray, FloatArray]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +104,10 @@ class LeafletBand:
         """
         around, edge = directed(annulus, triangles), directed(free_edge, triangles)
         coordinates = surface_coordinates(vertices, triangles, around, free_edge)
-
-        on_annulus = _angle_table(vertices, triangles, region, around, coordinates.theta, anterior)
+        pieces, of_edge = (commissures(loop, triangles, region) for loop in (around, edge))
+        on_annulus = _angle_table(vertices, pieces, around, coordinates.theta, anterior)
         # The free edge runs against the annulus.
-        on_edge = _angle_table(
-            vertices, triangles, region, edge, coordinates.theta, anterior, backwards=True
-        )
+        on_edge = _angle_table(vertices, of_edge, edge, coordinates.theta, anterior, backwards=True)
         on_edge[1] += 2 * np.pi * np.round((on_annulus[1, 0] - on_edge[1, 0]) / (2 * np.pi))
         return cls(vertices, coordinates, on_annulus, on_edge)
 
@@ -127,15 +128,13 @@ class LeafletBand:
 
 def _angle_table(
     vertices: FloatArray,
-    triangles: IntArray,
-    region: IntArray,
+    pieces: dict[int, tuple[int, int]],
     loop: IntArray,
     theta: FloatArray,
     anterior: int,
     backwards: bool = False,
 ) -> FloatArray:
-    """Phi (degrees) and harmonic angle (rad, unwrapped) ``(2, k)`` along a loop."""
-    pieces = commissures(loop, triangles, region)
+    """Phi (degrees) and harmonic angle (rad, unwrapped) ``(2, k)`` along a loop in its pieces."""
     tables = []
     for label in sorted(pieces, key=lambda piece: piece != anterior):
         positions, share = arc_shares(vertices[loop], *pieces[label])
@@ -193,9 +192,9 @@ def assumed_closure(
 
 
 def lay_out_chordae(
-    open_valve: Places,
+    open_valve: Places | LeafletBand,
     open_tips: FloatArray,
-    closed_valve: Places | FloatArray,
+    closed_valve: LeafletBand | FloatArray,
     closed_tips: FloatArray,
     layout: ChordLayout,
 ) -> Chordae:
@@ -225,7 +224,7 @@ def lay_out_chordae(
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")
-    phi, s, family = _places(layout)
+    phi, s, family, _ = Template(TemplateParameters(chordae=layout)).chord_places()
     corners, weights = open_valve.locate(phi, s)
     insertion = _weighted(open_valve.vertices, corners, weights)
     if isinstance(closed_valve, np.ndarray):
@@ -241,15 +240,3 @@ def lay_out_chordae(
     )
     stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
     return Chordae(tip, insertion, family, FAMILIES, rest_length, stiffness, layout.toe_strain)
-
-
-def _places(layout: ChordLayout) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Angle (degrees), s and family of all chordae of both halves."""
-    half = [(phi, layout.marginal_s, 0) for phi in layout.marginal_phi]
-    half += [(phi, s, 1) for phi, s in layout.basal]
-    phi, s, family = np.array(half, dtype=np.float64).T
-    return (
-        np.concatenate([phi, 180.0 - phi]),
-        np.tile(s, 2),
-        np.tile(family, 2).astype(np.int64),
-    )

@@ -100,12 +100,8 @@ def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
         With the size and place of the loops: those that are no annulus and no free edge are holes.
     """
     loops = boundary_loops(triangles)
-    if len(loops) != 2:
-        raise GeometryError(_wrong_number(vertices, loops))
-    return loops
-
-
-def _wrong_number(vertices: FloatArray, loops: list[IntArray]) -> str:
+    if len(loops) == 2:
+        return loops
     perimeter = [
         float(np.linalg.norm(vertices[loop] - vertices[np.roll(loop, -1)], axis=1).sum())
         for loop in loops
@@ -123,7 +119,7 @@ def _wrong_number(vertices: FloatArray, loops: list[IntArray]) -> str:
         )
     else:
         advice = "open it along the annulus and along the free edge"
-    return (
+    raise GeometryError(
         f"{len(loops)} boundary loops ({listed or 'none'}), expected two, the annulus and the free "
         f"edge: {advice}"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -17,13 +17,13 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
-from mvest.cases.chord_layout import SEEN_CLOSURE, lay_out_chordae
+from mvest.cases.chord_layout import SEEN_CLOSURE, Places, lay_out_chordae
 from mvest.cases.from_images.measures import Row, closed_frame
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template, vertex_region
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -138,17 +138,6 @@ def choose_frames(
     return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
-    """The valve of a frame, whose layout knows the template's coordinates."""
-
-    vertices: FloatArray
-    layout: ValveLayout
-
-    def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        return self.layout.locate(phi, s)
-
-
 @dataclass(frozen=True, slots=True)
 class CaseTexts:
     """What a case says of itself."""
@@ -190,8 +179,7 @@ def case_of_sequence(
     layout = sequence.layout
     derived = list(frames.derived)
     reference = sequence.vertices[frames.open]
-    annulus = reference[layout.annulus]
-    side = ventricular_side(annulus, reference[layout.free_edge])
+    side = ventricular_side(reference[layout.annulus], reference[layout.free_edge])
     for number in frames.in_order:
         _check_frame(sequence, number, side, is_reference=number == frames.open)
     given = GENERIC_THICKNESS if thickness_mm is None else thickness_mm
@@ -202,11 +190,8 @@ def case_of_sequence(
     if thickness_mm is None:
         listed = ", ".join(f"{given[name]:g} mm ({name})" for name in layout.region_names)
         derived.append(f"thickness: {listed} assumed")
-    typical = Template(
-        TemplateParameters().changed(
-            {f"leaflets.{name}.thickness": mm for name, mm in given.items()}
-        )
-    )
+    changes = {f"leaflets.{name}.thickness": mm for name, mm in given.items()}
+    typical = Template(TemplateParameters().changed(changes))
     thickness = typical.thickness(layout.phi, layout.s)
     check_thickness(thickness)
     derived += [
@@ -216,16 +201,10 @@ def case_of_sequence(
         "leaflet",
         "annulus and free edge: the first and the last row of the image step's layout",
     ]
-    surface = LeafletSurface(
-        reference,
-        layout.triangles,
-        layout.region,
-        layout.region_names,
-        _fibres(layout, reference, typical),
-        thickness,
-    )
+    shape = reference, layout.triangles, layout.region, layout.region_names
+    surface = LeafletSurface(*shape, _fibres(layout, reference, typical), thickness)
     chordae = lay_out_chordae(
-        _Placed(reference, layout),
+        Places(reference, layout.locate),
         sequence.tips[frames.open],
         sequence.vertices[frames.closed],
         sequence.tips[frames.closed],
@@ -236,11 +215,7 @@ def case_of_sequence(
         "rest lengths from the closed frame (through its vertices)"
     )
     return ValveCase(
-        name=texts.name,
-        description=texts.description,
-        source=texts.source,
-        licence=texts.licence,
-        simulated=texts.simulated,
+        **asdict(texts),
         surface=surface,
         annulus=layout.annulus,
         free_edge=layout.free_edge,

@@ -38,7 +38,7 @@ from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, LANDMARKS, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.text import read_numbers
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 
 IMAGES, CASE = "images", "case"
 """Folders of measures, surfaces and landmarks, and of the case."""
@@ -67,10 +67,7 @@ class DetectedValve:
     case : ValveCase
         With a stand-in for the pressure if none is stated.
     settings : ImagedSettings
-    model_sha256 : str
-        Of the detection model.
-    trained_on : mapping
-        What that model says of its training.
+    model : DetectionModel
     unlike : str
         How the volume is unlike those of training; empty if it is not.
     """
@@ -81,8 +78,7 @@ class DetectedValve:
     frames: CaseFrames
     case: ValveCase
     settings: ImagedSettings
-    model_sha256: str
-    trained_on: Mapping[str, Any]
+    model: DetectionModel
     unlike: str
 
     @property
@@ -162,7 +158,9 @@ def detect_in_volume(
     # What is asked for, before anything that takes long.
     said: list[str] = []
     by_hand = _landmarks(settings, said)
-    curve = _pressure_curve(settings)
+    curve = None
+    if settings.pressure_curve is not None:
+        curve = PressureCurve(*read_numbers(Path(settings.pressure_curve), ("time", "pressure")).T)
     if estimate and not settings.states_pressure:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
@@ -183,7 +181,9 @@ def detect_in_volume(
     accuracy = measured.at(valve.confidence)
     rows = with_bands(valve, rows, accuracy.samples, accuracy.tip_samples)
     corrected, errors, tip_errors = without_expected_error(valve, frames, measured)
-    kept = _thinned(len(errors), settings.error_samples)
+    # Evenly spread samples of the errors.
+    spread = np.linspace(0, len(errors) - 1, settings.error_samples)
+    kept = np.unique(spread.round().astype(np.int64))
     case = case_of_sequence(
         corrected,
         frames,
@@ -209,8 +209,7 @@ def detect_in_volume(
         frames,
         replace(case, derived=(*case.derived, less, *said)),
         settings,
-        model.sha256,
-        model.trained_on,
+        model,
         _unlike(valve.confidence, accuracy),
     )
 
@@ -282,8 +281,8 @@ def image_step(
         "closed_frame": frames.closed,
         "confidence": detected.valve.frame_confidence.tolist(),
         "unlike": detected.unlike,
-        "model_sha256": detected.model_sha256,
-        "trained_on": dict(detected.trained_on),
+        "model_sha256": detected.model.sha256,
+        "trained_on": dict(detected.model.trained_on),
         "sentences": list(detected.sentences),
         "files": list(files),
     }
@@ -328,13 +327,6 @@ def _unlike(confidence: float, accuracy: DetectionAccuracy) -> str:
         f"{confidence:.2f} in the median frame, expected at least {accuracy.like_from:.2f}, below "
         f"which {100 * share:.2g} % of volumes like those are expected"
     )
-
-
-def _pressure_curve(settings: ImagedSettings) -> PressureCurve | None:
-    if settings.pressure_curve is None:
-        return None
-    table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
-    return PressureCurve(table[:, 0], table[:, 1])
 
 
 def _landmarks(
@@ -387,8 +379,3 @@ def _frames(
         held_out={frame: float(value) for frame, value in settings.held_out},
         min_confidence=settings.min_confidence,
     )
-
-
-def _thinned(count: int, wanted: int) -> IntArray:
-    """Numbers of evenly spread samples of the errors, at most ``wanted``."""
-    return np.unique(np.linspace(0, count - 1, wanted).round().astype(np.int64))
