@@ -61,16 +61,12 @@ def require_new(folder: Path | str) -> Path:
 
 def _check_reference(case: ValveCase) -> None:
     frame, surface = case.frame(Role.REFERENCE), case.surface
-    for name in ("vertices", "triangles", "region"):
-        if not np.array_equal(getattr(frame, name), getattr(surface, name)):
+    own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
+    own |= {name: surface.vertices[getattr(case, name)] for name in ("annulus", "free_edge")}
+    for name, wanted in own.items():
+        if not np.array_equal(getattr(frame, name), wanted):
             raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} are not those of "
-                "the surface"
-            )
-    for name in ("annulus", "free_edge"):
-        if not np.array_equal(getattr(frame, name), surface.vertices[getattr(case, name)]):
-            raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} is not where the "
+                f"case {case.name}: {name} of the reference frame {frame.name!r} is not as the "
                 "surface has it"
             )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -76,7 +76,7 @@ class CaseFrames:
 def choose_frames(
     sequence: ValveSequence,
     rows: Sequence[Row],
-    pressure_mmhg: float,
+    pressure_mmhg: float | Callable[[float], float],
     *,
     open_: int | None = None,
     closed: int | None = None,
@@ -93,8 +93,8 @@ def choose_frames(
     sequence : ValveSequence
     rows : sequence
         Measures of every frame (`mvest.cases.from_images.measures.measure_sequence`).
-    pressure_mmhg : float
-        In the closed frame.
+    pressure_mmhg : float or callable
+        In the closed frame, or at any time (s).
     open_, closed : int, optional
         Where they are stated.
     held_out : mapping, optional
@@ -135,6 +135,8 @@ def choose_frames(
             f"no open and closed frame can be chosen {among} (the best: {highest:.2f}); give the "
             "frames, or landmarks by hand"
         )
+    if callable(pressure_mmhg):
+        pressure_mmhg = pressure_mmhg(float(sequence.times[closed]))
     return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))
 
 

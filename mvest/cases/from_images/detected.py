@@ -19,7 +19,7 @@ from mvest.cases.from_images.detector_errors import (
     without_expected_error,
 )
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
-from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
+from mvest.cases.from_images.measures import Row, measure_sequence, write_measures
 from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
@@ -177,10 +177,19 @@ def detect_in_volume(
     )
     thickness = settings.thickness
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
-    frames = _frames(settings, curve, valve, rows)
+    pressure = settings.pressure_mmHg
+    frames = choose_frames(
+        valve,
+        rows,
+        curve or (STAND_IN_MMHG if pressure is None else pressure),
+        open_=settings.open_frame,
+        closed=settings.closed_frame,
+        held_out={frame: float(value) for frame, value in settings.held_out},
+        min_confidence=settings.min_confidence,
+    )
     accuracy = measured.at(valve.confidence)
-    rows = with_bands(valve, rows, accuracy.samples, accuracy.tip_samples)
-    corrected, errors, tip_errors = without_expected_error(valve, frames, measured)
+    rows = with_bands(valve, rows, accuracy)
+    corrected, errors = without_expected_error(valve, frames, measured)
     # Evenly spread samples of the errors.
     spread = np.linspace(0, len(errors) - 1, settings.error_samples)
     kept = np.unique(spread.round().astype(np.int64))
@@ -195,7 +204,7 @@ def detect_in_volume(
             settings.simulated,
         ),
         thickness_mm=thickness,
-        error_samples=samples_in_world(corrected, frames, errors[kept], tip_errors[kept]),
+        error_samples=samples_in_world(corrected, frames, errors[kept]),
     )
     off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
     less = (
@@ -357,25 +366,3 @@ def _landmarks(
         if unplaced:
             derived.append(f"landmarks of frame {frame}: {', '.join(unplaced)} not placed")
     return landmarks or None
-
-
-def _frames(
-    settings: ImagedSettings, curve: PressureCurve | None, valve: ValveSequence, rows: list[Row]
-) -> CaseFrames:
-    pressure, closed, count = settings.pressure_mmHg, settings.closed_frame, len(valve.times)
-    if curve is not None:
-        if closed is None:
-            sure = [r for r in rows if (r["confidence"] or 0.0) >= settings.min_confidence]
-            closed = closed_frame(sure)
-        if closed is None or not 0 <= closed < count:
-            raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
-        pressure = curve(float(valve.times[closed]))
-    return choose_frames(
-        valve,
-        rows,
-        STAND_IN_MMHG if pressure is None else pressure,
-        open_=settings.open_frame,
-        closed=closed,
-        held_out={frame: float(value) for frame, value in settings.held_out},
-        min_confidence=settings.min_confidence,
-    )

@@ -51,19 +51,18 @@ areas of leaflets that are moved by them would say more of the roughness than of
 """
 
 
-def _joined(
-    layout: ValveLayout, errors: FloatArray, tip_errors: FloatArray, least: int = 0
-) -> FloatArray:
-    """Errors of leaflets and tips as one array ``(K, 2, n + 2, 3)``, their shapes checked."""
+def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
+    """Errors of leaflets and, after them, tips ``(K, 2, n + 2, 3)`` mm, their shapes checked."""
+    errors, tips = accuracy.samples, accuracy.tip_samples
     count, n = len(errors), layout.size
-    if count < least:
+    if count < 2:
         raise InputError(f"errors of {count} valves, expected two samples or more")
-    if errors.shape != (count, 2, n, 3) or tip_errors.shape != (count, 2, 2, 3):
+    if errors.shape != (count, 2, n, 3) or tips.shape != (count, 2, 2, 3):
         raise InputError(
-            f"errors of shape {errors.shape} and of tips {tip_errors.shape}, expected (samples, 2, "
-            f"{n}, 3) and (samples, 2, 2, 3)"
+            f"errors of shape {errors.shape} and of tips {tips.shape}, expected (samples, 2, {n}, "
+            "3) and (samples, 2, 2, 3)"
         )
-    return np.concatenate([errors, tip_errors], axis=2)
+    return np.concatenate([errors, tips], axis=2)
 
 
 def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
@@ -73,7 +72,7 @@ def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
 
 
 def samples_in_world(
-    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray, tip_errors: FloatArray
+    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray
 ) -> ErrorSamples:
     """Errors measured on other valves, as displacements in the frames of a case.
 
@@ -85,17 +84,19 @@ def samples_in_world(
     ----------
     sequence : ValveSequence
     frames : CaseFrames
-    errors : (K, 2, n, 3) mm
-        Found less true, in the axes of each valve, in its open and its closed frame.
-    tip_errors : (K, 2, 2, 3) mm
+    errors : (K, 2, n + 2, 3) mm
+        Of leaflets and, after them, tips: found less true, in the axes of each valve, in its open
+        and its closed frame.
 
     Raises
     ------
     InputError
         They are not of this layout.
     """
-    moves, count = _joined(sequence.layout, errors, tip_errors), len(errors)
-    moves = np.concatenate([moves, in_mirror(sequence.layout, moves)])
+    points, count = sequence.layout.size + 2, len(errors)
+    if errors.shape[1:] != (2, points, 3):
+        raise InputError(f"errors of shape {errors.shape}, expected (samples, 2, {points}, 3)")
+    moves = np.concatenate([errors, in_mirror(sequence.layout, errors)])
     numbers, which = _frames_and_errors(frames)
     axes = np.stack([valve_axes(sequence, number) for number in numbers])
     # Where it may have been is where it was found less the error.
@@ -105,7 +106,7 @@ def samples_in_world(
 
 def without_expected_error(
     sequence: ValveSequence, frames: CaseFrames, accuracy: DetectionAccuracy
-) -> tuple[ValveSequence, FloatArray, FloatArray]:
+) -> tuple[ValveSequence, FloatArray]:
     """The valve less the error that is expected of it, and errors of other valves about theirs.
 
     What detectors are off by on average where they find such a valve (`expected_error`), no spread
@@ -124,8 +125,8 @@ def without_expected_error(
     Returns
     -------
     sequence : ValveSequence
-    errors : (K, 2, n, 3) mm
-    tip_errors : (K, 2, 2, 3) mm
+    errors : (K, 2, n + 2, 3) mm
+        Of leaflets and, after them, tips.
 
     Raises
     ------
@@ -140,18 +141,18 @@ def without_expected_error(
         vertices[number] -= off[:-2]
         tips[number] -= off[-2:]
     samples *= accuracy.factor(sequence.confidence)
-    return (
-        replace(sequence, vertices=vertices, tips=tips),
-        samples[:, :, :-2],
-        samples[:, :, -2:],
-    )
+    return replace(sequence, vertices=vertices, tips=tips), samples
 
 
 def _in_own_axes(sequence: ValveSequence, frame: int) -> FloatArray:
     """Leaflets and, after them, tips ``(n + 2, 3)`` mm in the axes of the valve in a frame."""
-    vertices, tips = sequence.vertices[frame], sequence.tips[frame]
-    pose = pose_of(vertices, tips, sequence.layout)
-    return np.asarray((np.concatenate([vertices, tips]) - pose.centre) @ pose.rotation[0])
+    centre = sequence.annulus[frame].mean(axis=0)
+    return np.asarray((_points(sequence, frame) - centre) @ valve_axes(sequence, frame))
+
+
+def _points(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Leaflets and, after them, tips ``(n + 2, 3)`` mm."""
+    return np.concatenate([sequence.vertices[frame], sequence.tips[frame]])
 
 
 def _frames_and_errors(frames: CaseFrames) -> tuple[list[int], list[int]]:
@@ -161,7 +162,7 @@ def _frames_and_errors(frames: CaseFrames) -> tuple[list[int], list[int]]:
 
 
 def with_bands(
-    sequence: ValveSequence, rows: Sequence[Row], errors: FloatArray, tip_errors: FloatArray
+    sequence: ValveSequence, rows: Sequence[Row], accuracy: DetectionAccuracy
 ) -> list[Row]:
     """Measures of every frame, and between which bounds 95 % of true ones are expected.
 
@@ -176,10 +177,8 @@ def with_bands(
     sequence : ValveSequence
     rows : sequence of dict
         Its measures, from `mvest.cases.from_images.measures.measure_sequence`.
-    errors : (K, 2, n, 3) mm
-        Found less true, in the axes of each of K valves, in its open and its closed frame, as they
-        are stated for a volume of this confidence.
-    tip_errors : (K, 2, 2, 3) mm
+    accuracy : DetectionAccuracy
+        Of the detectors in a volume of this confidence.
 
     Returns
     -------
@@ -191,7 +190,8 @@ def with_bands(
     InputError
         They are of fewer than two valves, or not of this layout.
     """
-    count = len(_joined(sequence.layout, errors, tip_errors, least=2))
+    errors, annulus = _errors_of(sequence.layout, accuracy), sequence.layout.annulus
+    count = len(errors)
     surface = leaflets_of(sequence.layout, 1.0)  # whose thickness these measures do not ask for
     reach = float(student_t.ppf(0.975, count - 1)) * np.sqrt(1.0 + 1.0 / count)
     banded = []
@@ -199,12 +199,8 @@ def with_bands(
         bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in BOUNDS)
         if row[BANDED[0]] is not None:
             which, axes = (0 if is_open(row) else 1), valve_axes(sequence, t)
-            vertices = sequence.vertices[t] - errors[:, which] @ axes.T
-            tips = sequence.tips[t] - tip_errors[:, which] @ axes.T
-            again = [
-                annulus_and_tips(x, surface, x[sequence.layout.annulus], own)
-                for x, own in zip(vertices, tips, strict=True)
-            ]
+            moved = _points(sequence, t) - errors[:, which] @ axes.T
+            again = [annulus_and_tips(x[:-2], surface, x[annulus], x[-2:]) for x in moved]
             for name in BANDED:
                 values = np.array([one.get(name, np.nan) for one in again], dtype=np.float64)
                 middle, half = values.mean(), reach * values.std(ddof=1)
@@ -240,7 +236,7 @@ def expected_error(
     InputError
         Errors are of fewer than two valves, or not of this layout.
     """
-    errors = _joined(layout, accuracy.samples, accuracy.tip_samples, least=2)
+    errors = _errors_of(layout, accuracy)
     shapes = None
     if accuracy.shapes is not None and accuracy.tip_shapes is not None:
         shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
