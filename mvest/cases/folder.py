@@ -32,6 +32,7 @@ from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line, read_numbers
 from mvest.typing import FloatArray
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
+from mvest.valve.anatomy.valve import checked_floats
 
 VENTRICLE = ((0.40, 6.0), (0.53, 14.0), (0.58, 120.0), (0.75, 130.0), (0.80, 8.0))
 ATRIUM = ((0.40, 7.0), (0.47, 20.0), (0.53, 5.0), (0.58, 7.0), (0.70, 10.0))
@@ -61,14 +62,10 @@ class PressureCurve:
     pressure_mmHg: FloatArray
 
     def __post_init__(self) -> None:
-        time, pressure = np.asarray(self.time), np.asarray(self.pressure_mmHg)
-        if time.ndim != 1 or len(time) < 2 or pressure.shape != time.shape:
-            raise InputError(
-                f"pressure curve: times {time.shape} and pressures {pressure.shape}, expected two "
-                "or more of each"
-            )
-        if not (np.isfinite(time).all() and np.isfinite(pressure).all()):
-            raise InputError("pressure curve: times and pressures must be finite numbers")
+        time = checked_floats("pressure curve: times", self.time, (None,))
+        checked_floats("pressure curve: pressures", self.pressure_mmHg, time.shape)
+        if len(time) < 2:
+            raise InputError(f"pressure curve: {len(time)} point, expected two or more")
         if (np.diff(time) <= 0).any():
             row = int(np.argmax(np.diff(time) <= 0)) + 1
             raise InputError(
@@ -126,11 +123,8 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     stored = read_npz(file, ARRAYS, exact=True, optional=(SOURCE,), where=file.name)
     names, vertices, tips = (stored[name] for name in ARRAYS)
     if names.ndim != 1 or names.dtype.kind != "U" or names.tolist() != list(frames):
-        shown = (
-            one_line(names.tolist(), 80)
-            if names.dtype.kind == "U"
-            else f"an array of {names.dtype}"
-        )
+        text = names.dtype.kind == "U"
+        shown = one_line(names.tolist(), 80) if text else f"an array of {names.dtype}"
         raise InputError(f"{file.name}: frames {shown}, expected {one_line(list(frames), 120)}")
     return ErrorSamples(vertices, tips, stored.get(SOURCE))
 

@@ -232,7 +232,11 @@ def match_annulus(
     other = directed(seen_annulus, seen[1])
     pieces = commissures(loop, triangles, region)
     other_pieces = commissures(other, seen[1], seen[2])
-    if _cycle(list(pieces)) != _cycle(list(other_pieces)):
+    # Cyclic sequences, begun at their smallest entries.
+    order, other_order = (
+        np.roll(labels, -int(np.argmin(labels))) for labels in (list(pieces), list(other_pieces))
+    )
+    if not np.array_equal(order, other_order):
         raise InputError(
             f"along the annulus the regions follow each other as {list(other_pieces)}, in the "
             f"reference frame as {list(pieces)}"
@@ -245,12 +249,6 @@ def match_annulus(
         for axis in range(3):
             placed[loop[at], axis] = np.interp(share, other_share, other_curve[other_at, axis])
     return placed[reference_annulus]
-
-
-def _cycle(labels: list[int]) -> list[int]:
-    """A cyclic sequence begun at its smallest entry."""
-    start = labels.index(min(labels))
-    return labels[start:] + labels[:start]
 
 
 def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
