@@ -258,9 +258,7 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
 
 
 def image_step(
-    detected: DetectedValve,
-    files: Sequence[str] = (),
-    pictures: Sequence[Mapping[str, Any]] = (),
+    detected: DetectedValve, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
 ) -> dict[str, tuple[Mapping[str, Any], ...]]:
     """What a record says of the image step, as details (`mvest.personalisation.record`).
 
@@ -350,11 +348,7 @@ def _landmarks(
             for name, item in lists.items()
             if item.kind == "Fiducial" and name != ANNULUS_LABELS
         ]
-        points = {
-            label: point
-            for item in mine
-            for label, point in zip(item.labels, item.points, strict=True)
-        }
+        points = dict(pair for item in mine for pair in zip(item.labels, item.points, strict=True))
         strange = sorted(set(points) - set(LANDMARKS))
         if strange or not points or len(points) < sum(len(item.labels) for item in mine):
             raise InputError(

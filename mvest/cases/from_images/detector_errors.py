@@ -97,8 +97,8 @@ def samples_in_world(
     if errors.shape[1:] != (2, points, 3):
         raise InputError(f"errors of shape {errors.shape}, expected (samples, 2, {points}, 3)")
     moves = np.concatenate([errors, in_mirror(sequence.layout, errors)])
-    numbers, which = _frames_and_errors(frames)
-    axes = np.stack([valve_axes(sequence, number) for number in numbers])
+    which = [int(number != frames.open) for number in frames.in_order]
+    axes = np.stack([valve_axes(sequence, number) for number in frames.in_order])
     # Where it may have been is where it was found less the error.
     moves = -np.einsum("fij,kfnj->kfni", axes, moves[:, which])
     return ErrorSamples(moves[:, :, :-2], moves[:, :, -2:], np.tile(np.arange(count), 2))
@@ -133,32 +133,25 @@ def without_expected_error(
     InputError
         They are not of this layout, or of fewer than two valves.
     """
-    shape = np.stack([_in_own_axes(sequence, n) for n in (frames.open, frames.closed)])
+    shape = np.stack(
+        [
+            (_points(sequence, n) - sequence.annulus[n].mean(axis=0)) @ valve_axes(sequence, n)
+            for n in (frames.open, frames.closed)
+        ]
+    )
     expected, samples = expected_error(sequence.layout, accuracy, shape)
     vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
-    for number, which in zip(*_frames_and_errors(frames), strict=True):
-        off = expected[which] @ valve_axes(sequence, number).T
+    for number in frames.in_order:
+        off = expected[int(number != frames.open)] @ valve_axes(sequence, number).T
         vertices[number] -= off[:-2]
         tips[number] -= off[-2:]
     samples *= accuracy.factor(sequence.confidence)
     return replace(sequence, vertices=vertices, tips=tips), samples
 
 
-def _in_own_axes(sequence: ValveSequence, frame: int) -> FloatArray:
-    """Leaflets and, after them, tips ``(n + 2, 3)`` mm in the axes of the valve in a frame."""
-    centre = sequence.annulus[frame].mean(axis=0)
-    return np.asarray((_points(sequence, frame) - centre) @ valve_axes(sequence, frame))
-
-
 def _points(sequence: ValveSequence, frame: int) -> FloatArray:
     """Leaflets and, after them, tips ``(n + 2, 3)`` mm."""
     return np.concatenate([sequence.vertices[frame], sequence.tips[frame]])
-
-
-def _frames_and_errors(frames: CaseFrames) -> tuple[list[int], list[int]]:
-    """Frames of the case, and for each whether it is open (0) or closed (1)."""
-    numbers = list(frames.in_order)
-    return numbers, [0 if number == frames.open else 1 for number in numbers]
 
 
 def with_bands(
