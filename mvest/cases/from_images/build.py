@@ -17,9 +17,8 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
-from mvest.cases.chord_layout import SEEN_CLOSURE, Places, lay_out_chordae
 from mvest.cases.from_images.measures import Row, closed_frame
-from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.tissue import GENERIC_THICKNESS, SEEN_CLOSURE, Places, lay_out_chordae
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence

@@ -13,11 +13,10 @@ import yaml
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.chord_layout import FAMILIES
 from mvest.cases.folder import read_case
 from mvest.cases.rims import two_loops
 from mvest.cases.schema import CASE_FILE
-from mvest.cases.tissue import CHORD_COLUMNS, GENERIC_THICKNESS
+from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES, GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
 from mvest.exchange.importing.joining import (
     REGIONS,

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import SEEN_CLOSURE
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
@@ -16,6 +15,7 @@ from mvest.cases.from_images.detector_errors import (
     without_expected_error,
 )
 from mvest.cases.from_images.measures import measure_sequence
+from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
