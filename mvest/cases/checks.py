@@ -13,14 +13,12 @@ from unicodedata import normalize
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
 from mvest.cases.rims import loop_vector_area
 from mvest.cases.schema import CaseFolder
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
@@ -32,8 +30,6 @@ LARGEST_THICKNESS = 5.0
 """mm."""
 FARTHEST_TIP = 100.0
 """mm from the centre of the annulus."""
-CHORD_REACH = 3.0
-"""mm from an insertion to the nearest vertex, as `mvest.valve.anatomy.valve.Valve` demands."""
 
 
 def _check_different(folder: CaseFolder, field: str, names: Sequence[str]) -> None:
@@ -201,20 +197,4 @@ def check_closing_pressure(pressure_mmhg: float, unit: str) -> None:
         raise InputError(
             f"{pressure_mmhg:g} mmHg on the closed valve, expected {low:g} to {high:g} mmHg: is it "
             f"in {other} (units.pressure says {unit})? It is positive where it closes the valve"
-        )
-
-
-def check_chordae(chordae: Chordae, vertices: FloatArray, tip_count: int) -> None:
-    """Raise unless every chord starts at a tip that exists and ends on the leaflets."""
-    bad = np.flatnonzero(chordae.tip >= tip_count)
-    if len(bad):
-        k = int(bad[0])
-        raise InputError(f"chord {k} starts at tip {chordae.tip[k]}, expected 0 to {tip_count - 1}")
-    gap = np.atleast_1d(cKDTree(vertices).query(chordae.insertion)[0])
-    if gap.max() > CHORD_REACH:
-        k = int(np.argmax(gap))
-        raise GeometryError(
-            f"chord {k} is disconnected: its insertion at "
-            f"{np.round(chordae.insertion[k], 2).tolist()} mm is {gap[k]:.1f} mm from the "
-            f"leaflets, expected at most {CHORD_REACH:g} mm in the reference frame"
         )

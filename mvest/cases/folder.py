@@ -186,7 +186,7 @@ def read_case(path: Path | str) -> ValveCase:
             with folder.at("observation.error_samples"):
                 samples = read_error_samples(file, [frame.name for frame in document.frames])
     entry = document.chordae
-    return ValveCase(
+    case = ValveCase(
         name=document.name,
         description=document.description,
         source=document.source,
@@ -203,6 +203,10 @@ def read_case(path: Path | str) -> ValveCase:
         error_samples=samples,
         chordae_follow=entry is None or (isinstance(entry, ChordaeEntry) and entry.follow),
     )
+    if entry is not None:
+        with folder.at("chordae"):
+            _ = case.valve  # whose chordae start at its tips and end on its leaflets
+    return case
 
 
 def _pressures(folder: CaseFolder) -> list[float]:
