@@ -24,9 +24,8 @@ from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples, ValveCase
-from mvest.cases.chord_layout import SEEN_CLOSURE
-from mvest.cases.from_images.build import CaseTexts, case_of_sequence
-from mvest.cases.from_images.frame_choice import CaseFrames
+from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence
+from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.segmentations import write_sequence_nrrd

@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.reading.npz import check_array
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 
@@ -98,13 +99,9 @@ class Uncertainty:
         if std.ndim > 1:
             raise InputError(f"observation std_mm: shape {std.shape}, expected one number or (n,)")
         bad = np.flatnonzero(~(np.isfinite(std) & (std > 0)))
-        if len(bad) and std.ndim == 0:
-            raise InputError(f"observation std_mm = {self.std_mm}, expected > 0")
         if len(bad):
-            raise InputError(
-                f"observation std_mm = {std[bad[0]]:g} at vertex {bad[0]} ({len(bad)} vertices in "
-                "all), expected > 0"
-            )
+            at = f" at vertex {bad[0]} ({len(bad)} vertices in all)" if std.ndim else ""
+            raise InputError(f"observation std_mm = {std.flat[bad[0]]:g}{at}, expected > 0")
         length = self.correlation_length_mm
         if not (np.isfinite(length) and length >= 0):
             raise InputError(f"observation correlation_length_mm = {length}, expected >= 0")
@@ -146,23 +143,14 @@ class ErrorSamples:
 
     def __post_init__(self) -> None:
         for name in ("vertices", "tips"):
-            given = np.asarray(getattr(self, name))
-            if (
-                given.ndim != 4
-                or given.shape[3] != 3
-                or not np.issubdtype(given.dtype, np.floating)
-            ):
-                raise InputError(
-                    f"error samples, {name}: {given.dtype} of shape {given.shape}, expected "
-                    "floating-point numbers (samples, frames, points, 3)"
-                )
-            values = np.array(given, dtype=np.float64)
-            bad = np.argwhere(~(np.abs(values) <= LARGEST_ERROR))
+            given, where = np.asarray(getattr(self, name)), f"error samples, {name}"
+            values = check_array(given, where, "f", (None, None, None, 3))
+            bad = np.argwhere(np.abs(values) > LARGEST_ERROR)
             if len(bad):
-                where = tuple(bad[0].tolist())
+                at = tuple(bad[0].tolist())
                 raise InputError(
-                    f"error samples, {name}: {values[where]} mm at {where}, expected a "
-                    f"displacement of at most {LARGEST_ERROR:g} mm"
+                    f"{where}: {values[at]} mm at {at}, expected a displacement of at most "
+                    f"{LARGEST_ERROR:g} mm"
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
@@ -172,13 +160,8 @@ class ErrorSamples:
                 f"{self.tips.shape[:2]} of the tips; expected as many"
             )
         if self.source is not None:
-            source = np.array(self.source)
-            if source.shape != (len(self),) or not np.issubdtype(source.dtype, np.integer):
-                raise InputError(
-                    f"error samples, source: {source.dtype} of shape {source.shape}, expected an "
-                    f"integer for each of {len(self)} samples"
-                )
-            source = source.astype(np.int64)
+            given = np.asarray(self.source)
+            source = check_array(given, "error samples, source", "i", (len(self),))
             source.setflags(write=False)
             object.__setattr__(self, "source", source)
         if not MIN_SAMPLES <= len(self) <= MAX_SAMPLES:

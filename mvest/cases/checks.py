@@ -7,24 +7,20 @@ and the field before them.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 from unicodedata import normalize
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
 from mvest.cases.rims import loop_vector_area
-from mvest.cases.schema import CaseFile, wrong
+from mvest.cases.schema import CaseFolder
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_checks import check_surface
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 ANNULUS_DIAMETER = (15.0, 80.0)
 """mm, largest extent of an annulus between a small child's and the most dilated adult's."""
@@ -34,45 +30,29 @@ LARGEST_THICKNESS = 5.0
 """mm."""
 FARTHEST_TIP = 100.0
 """mm from the centre of the annulus."""
-CHORD_REACH = 3.0
-"""mm from an insertion to the nearest vertex, as `mvest.valve.anatomy.valve.Valve` demands."""
 
 
-@contextmanager
-def at(file: Path, field: str) -> Iterator[None]:
-    """Put the file and the field before the message of any error raised inside."""
-    try:
-        yield
-    except InputError as fault:
-        raise wrong(file, field, str(fault), type(fault)) from fault
-
-
-def check_regions(file: Path, document: CaseFile) -> None:
-    """Raise unless the regions have different names."""
-    _check_different(file, "regions", list(document.region_names().values()))
-
-
-def _check_different(file: Path, field: str, names: Sequence[str]) -> None:
+def _check_different(folder: CaseFolder, field: str, names: Sequence[str]) -> None:
     """Raise unless names differ by more than Unicode normal form, case and spaces."""
     seen: dict[str, str] = {}
     for name in names:
         key = " ".join(normalize("NFKC", name).casefold().split())
         if key in seen:
             alike = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
-            raise wrong(file, field, f"the name {name!r} {alike}; expected different names")
+            raise folder.wrong(field, f"the name {name!r} {alike}; expected different names")
         seen[key] = name
 
 
-def check_frames(file: Path, document: CaseFile) -> None:
-    """Raise unless the frames' names, times, roles and numbers of tips go together."""
-    frames = document.frames
+def check_names_and_frames(folder: CaseFolder) -> None:
+    """Raise unless the names of regions, and frames' names, times, roles and tips go together."""
+    frames = folder.document.frames
     names = [frame.name for frame in frames]
-    _check_different(file, "frames", names)
+    _check_different(folder, "regions", list(folder.document.region_names().values()))
+    _check_different(folder, "frames", names)
     for number, (a, b) in enumerate(itertools.pairwise(frames), start=1):
         if b.time <= a.time:
-            unit = document.units.time
-            raise wrong(
-                file,
+            unit = folder.document.units.time
+            raise folder.wrong(
                 f"frames.{number}.time",
                 f"{b.time:g} {unit} of {b.name!r} is not after {a.time:g} {unit} of {a.name!r}; "
                 "put the frames in the order of time",
@@ -81,8 +61,7 @@ def check_frames(file: Path, document: CaseFile) -> None:
         members = [frame.name for frame in frames if frame.role == role]
         if len(members) != 1:
             listed = ", ".join(members) or "none"
-            raise wrong(
-                file,
+            raise folder.wrong(
                 "frames",
                 f"{len(members)} frames have the role {role} ({listed}), expected exactly one",
             )
@@ -90,8 +69,7 @@ def check_frames(file: Path, document: CaseFile) -> None:
     first = len(frames[0].papillary_tips)
     for number, frame in enumerate(frames):
         if len(count) > 1 and len(frame.papillary_tips) != first:
-            raise wrong(
-                file,
+            raise folder.wrong(
                 f"frames.{number}.papillary_tips",
                 f"{len(frame.papillary_tips)} tips, but {first} in frame {names[0]!r}; expected "
                 "the same tips in the same order in all frames",
@@ -189,7 +167,7 @@ def check_normals(
     The annulus runs as the triangles at it do, so its vector area has their side, however the
     leaflets lie and however wide the orifice is. Edges within the surface are run along both ways.
     """
-    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edges = directed_edges(triangles)
     start, end = np.moveaxis(vertices[edges[np.isin(edges, annulus).all(axis=1)]], 1, 0)
     area = np.cross(start, end).sum(axis=0)
     towards = tips.mean(axis=0) - vertices[annulus].mean(axis=0)
@@ -219,20 +197,4 @@ def check_closing_pressure(pressure_mmhg: float, unit: str) -> None:
         raise InputError(
             f"{pressure_mmhg:g} mmHg on the closed valve, expected {low:g} to {high:g} mmHg: is it "
             f"in {other} (units.pressure says {unit})? It is positive where it closes the valve"
-        )
-
-
-def check_chordae(chordae: Chordae, vertices: FloatArray, tip_count: int) -> None:
-    """Raise unless every chord starts at a tip that exists and ends on the leaflets."""
-    bad = np.flatnonzero(chordae.tip >= tip_count)
-    if len(bad):
-        k = int(bad[0])
-        raise InputError(f"chord {k} starts at tip {chordae.tip[k]}, expected 0 to {tip_count - 1}")
-    gap = np.atleast_1d(cKDTree(vertices).query(chordae.insertion)[0])
-    if gap.max() > CHORD_REACH:
-        k = int(np.argmax(gap))
-        raise GeometryError(
-            f"chord {k} is disconnected: its insertion at "
-            f"{np.round(chordae.insertion[k], 2).tolist()} mm is {gap[k]:.1f} mm from the "
-            f"leaflets, expected at most {CHORD_REACH:g} mm in the reference frame"
         )

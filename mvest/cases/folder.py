@@ -17,27 +17,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
 
-from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
-from mvest.cases.checks import at, check_closing_pressure, check_frames, check_regions
-from mvest.cases.frames import SECONDS_PER, SeenFrame, check_reference, place_frame, read_frame
-from mvest.cases.schema import (
-    CASE_FILE,
-    CaseFile,
-    CaseFolder,
-    ChordaeEntry,
-    ObservationEntry,
-    PointData,
-)
+from mvest.cases.case import ErrorSamples, Role, Uncertainty, ValveCase
+from mvest.cases.checks import check_closing_pressure, check_names_and_frames
+from mvest.cases.frames import SECONDS_PER, check_reference, place_frame, read_frame
+from mvest.cases.schema import CASE_FILE, CaseFolder, ChordaeEntry, PointData
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
 from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line, read_numbers
 from mvest.typing import FloatArray
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
+from mvest.valve.anatomy.valve import checked_floats
 
 VENTRICLE = ((0.40, 6.0), (0.53, 14.0), (0.58, 120.0), (0.75, 130.0), (0.80, 8.0))
 ATRIUM = ((0.40, 7.0), (0.47, 20.0), (0.53, 5.0), (0.58, 7.0), (0.70, 10.0))
@@ -67,14 +62,10 @@ class PressureCurve:
     pressure_mmHg: FloatArray
 
     def __post_init__(self) -> None:
-        time, pressure = np.asarray(self.time), np.asarray(self.pressure_mmHg)
-        if time.ndim != 1 or len(time) < 2 or pressure.shape != time.shape:
-            raise InputError(
-                f"pressure curve: times {time.shape} and pressures {pressure.shape}, expected two "
-                "or more of each"
-            )
-        if not (np.isfinite(time).all() and np.isfinite(pressure).all()):
-            raise InputError("pressure curve: times and pressures must be finite numbers")
+        time = checked_floats("pressure curve: times", self.time, (None,))
+        checked_floats("pressure curve: pressures", self.pressure_mmHg, time.shape)
+        if len(time) < 2:
+            raise InputError(f"pressure curve: {len(time)} point, expected two or more")
         if (np.diff(time) <= 0).any():
             row = int(np.argmax(np.diff(time) <= 0)) + 1
             raise InputError(
@@ -132,22 +123,17 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     stored = read_npz(file, ARRAYS, exact=True, optional=(SOURCE,), where=file.name)
     names, vertices, tips = (stored[name] for name in ARRAYS)
     if names.ndim != 1 or names.dtype.kind != "U" or names.tolist() != list(frames):
-        shown = (
-            one_line(names.tolist(), 80)
-            if names.dtype.kind == "U"
-            else f"an array of {names.dtype}"
-        )
+        text = names.dtype.kind == "U"
+        shown = one_line(names.tolist(), 80) if text else f"an array of {names.dtype}"
         raise InputError(f"{file.name}: frames {shown}, expected {one_line(list(frames), 120)}")
     return ErrorSamples(vertices, tips, stored.get(SOURCE))
 
 
 def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]) -> None:
     """Write samples so that they are read back unchanged."""
-    names, vertices, tips = np.array(list(frames)), samples.vertices, samples.tips
-    if samples.source is None:
-        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips)
-    else:
-        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips, source=samples.source)
+    source = {} if samples.source is None else {SOURCE: samples.source}
+    arrays: dict[str, Any] = {"vertices": samples.vertices, "tips": samples.tips} | source
+    np.savez_compressed(file, frames=np.array(list(frames)), **arrays)
 
 
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
@@ -173,33 +159,34 @@ def read_case(path: Path | str) -> ValveCase:
         raise InputError(f"{folder.root}: no such folder; expected a folder with {CASE_FILE}")
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
-    document = folder.document()
-    check_regions(folder.case, document)
-    check_frames(folder.case, document)
-    derived = list(document.derived)
-    seen = [read_frame(folder, document, number) for number in range(len(document.frames))]
+    document, derived = folder.document, folder.derived
+    check_names_and_frames(folder)
+    seen = [read_frame(folder, number) for number in range(len(document.frames))]
     first = next(s for s in seen if s.entry.role == Role.REFERENCE.value)
-    reference = check_reference(folder.case, first, derived)
-    pressures = _pressures(folder, document, derived)
-    placed = [
-        place_frame(folder.case, document, reference, s, p, derived)
-        for s, p in zip(seen, pressures, strict=True)
-    ]
-    frames = tuple(frame for frame, _ in placed)
-    surface = read_leaflets(folder.case, document, reference, derived)
-    chordae = read_chordae(folder, document, reference, placed, derived)
-    samples = None
-    if document.observation is None:
-        uncertainty = GENERIC_UNCERTAINTY
+    reference = check_reference(folder, first)
+    pressures = _pressures(folder)
+    placed = [place_frame(folder, reference, s, p) for s, p in zip(seen, pressures, strict=True)]
+    surface = read_leaflets(folder, reference)
+    chordae = read_chordae(folder, reference, placed)
+    uncertainty, samples, given = GENERIC_UNCERTAINTY, None, document.observation
+    if given is None:
         derived.append(
             f"observation: standard deviation {uncertainty.std_mm:g} mm and correlation length "
             f"{uncertainty.correlation_length_mm:g} mm assumed"
         )
     else:
-        uncertainty = _uncertainty(folder, document.observation, first)
-        samples = _error_samples(folder, document, frames)
+        with folder.at("observation.std_mm"):
+            std = given.std_mm
+            seen_std = (
+                point_data(first, std.point_data, 1)[:, 0] if isinstance(std, PointData) else std
+            )
+            uncertainty = Uncertainty(seen_std, given.correlation_length_mm)
+        if given.error_samples is not None:
+            file = folder.file(given.error_samples, "observation.error_samples")
+            with folder.at("observation.error_samples"):
+                samples = read_error_samples(file, [frame.name for frame in document.frames])
     entry = document.chordae
-    return ValveCase(
+    case = ValveCase(
         name=document.name,
         description=document.description,
         source=document.source,
@@ -208,7 +195,7 @@ def read_case(path: Path | str) -> ValveCase:
         surface=surface,
         annulus=reference.rims.annulus,
         free_edge=reference.rims.free_edge,
-        frames=frames,
+        frames=tuple(frame for frame, _ in placed),
         chordae=chordae,
         uncertainty=uncertainty,
         derived=tuple(derived),
@@ -216,54 +203,37 @@ def read_case(path: Path | str) -> ValveCase:
         error_samples=samples,
         chordae_follow=entry is None or (isinstance(entry, ChordaeEntry) and entry.follow),
     )
+    if entry is not None:
+        with folder.at("chordae"):
+            _ = case.valve  # whose chordae start at its tips and end on its leaflets
+    return case
 
 
-def _uncertainty(folder: CaseFolder, given: ObservationEntry, first: SeenFrame) -> Uncertainty:
-    with at(folder.case, "observation.std_mm"):
-        std = given.std_mm
-        if not isinstance(std, PointData):
-            return Uncertainty(std, given.correlation_length_mm)
-        return Uncertainty(point_data(first, std.point_data, 1)[:, 0], given.correlation_length_mm)
-
-
-def _error_samples(
-    folder: CaseFolder, document: CaseFile, frames: tuple[Frame, ...]
-) -> ErrorSamples | None:
-    assert document.observation is not None
-    where, name = "observation.error_samples", document.observation.error_samples
-    if name is None:
-        return None
-    file = folder.file(name, where)
-    with at(folder.case, where):
-        return read_error_samples(file, [frame.name for frame in frames])
-
-
-def _pressures(folder: CaseFolder, document: CaseFile, derived: list[str]) -> list[float]:
+def _pressures(folder: CaseFolder) -> list[float]:
     """Transmitral pressure (mmHg) of every frame."""
+    document = folder.document
     unit = document.units.pressure
     to_mmhg = 1.0 if unit == "mmHg" else mpa_to_mmhg(kpa_to_mpa(1.0))
     to_seconds = SECONDS_PER[document.units.time]
     curve = generic_curve()
     if document.pressure_curve is not None:
         file = folder.file(document.pressure_curve, "pressure_curve")
-        with at(folder.case, "pressure_curve"):
+        with folder.at("pressure_curve"):
             table = read_numbers(file, ("time", "pressure"))
             curve = PressureCurve(to_seconds * table[:, 0], to_mmhg * table[:, 1])
     result = []
     for number, frame in enumerate(document.frames):
-        where = f"frames.{number}.pressure"
-        if frame.pressure is not None:
-            pressure = to_mmhg * frame.pressure
-        else:
-            with at(folder.case, where):
+        with folder.at(f"frames.{number}.pressure"):
+            if frame.pressure is not None:
+                pressure = to_mmhg * frame.pressure
+            else:
                 pressure = _from_curve(curve, to_seconds * frame.time)
-            if document.pressure_curve is None:
-                derived.append(
-                    f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
-                    "transmitral curve, whose clock is taken to be that of the frames"
-                )
-        if frame.role != Role.REFERENCE.value:
-            with at(folder.case, where):
+                if document.pressure_curve is None:
+                    folder.derived.append(
+                        f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
+                        "transmitral curve, whose clock is taken to be that of the frames"
+                    )
+            if frame.role != Role.REFERENCE.value:
                 check_closing_pressure(pressure, unit)
         result.append(pressure)
     return result

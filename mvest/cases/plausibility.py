@@ -8,18 +8,19 @@ exchanged, thickness in centimetres. Nothing here closes a valve; it takes milli
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.rims import loop_vector_area
 from mvest.errors import GeometryError, InputError
-from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.triangles import areas
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.valve import LeafletSurface, lumped_areas
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area
-from mvest.valve.measure.measurements import leaflet_length
+from mvest.valve.measure.measurements import leaflet_length, surface_area
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,20 +55,13 @@ RANGES: Mapping[str, HumanRange] = {
     "ap_diameter": HumanRange(15.0, 51.0, "mm", _SIZES),
     "commissural_diameter": HumanRange(20.0, 58.0, "mm", _SIZES),
     "anterior_length": HumanRange(
-        13.0,
-        40.0,
-        "mm",
-        "20 to 25 mm in adults, up to 40 % more in myxomatous valves, children's less",
+        13.0, 40.0, "mm", "20 to 25 mm in adults, 40 % more in myxomatous valves, less in children"
     ),
     "posterior_length": HumanRange(
         6.0, 30.0, "mm", "10 to 14 mm in adults, up to twice that in myxomatous valves"
     ),
     "open_orifice": HumanRange(
-        50.0,
-        900.0,
-        "mm²",
-        "4 to 6 cm² in adults; below 1 cm² is severe stenosis, of which the "
-        "leaflets are not those of the model",
+        50.0, 900.0, "mm²", "4 to 6 cm² in adults; below 1 cm² is severe stenosis, no model's valve"
     ),
     "chord_length": HumanRange(
         3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion; branches are shorter"
@@ -79,16 +73,10 @@ RANGES: Mapping[str, HumanRange] = {
         60.0, 200.0, "mmHg", "left ventricular systolic less left atrial pressure"
     ),
     "area_change": HumanRange(
-        0.8,
-        1.5,
-        "",
-        "areal stretch of leaflets in vivo is 1.1 to 1.4; they do not shrink under load",
+        0.8, 1.5, "", "areal stretch of leaflets in vivo is 1.1 to 1.4; they do not shrink"
     ),
     "stretch": HumanRange(
-        0.55,
-        1.6,
-        "",
-        "principal stretches in vivo are 1.0 to 1.3; a distance across a bend is shorter",
+        0.55, 1.6, "", "principal stretches in vivo are 1.0 to 1.3; bends bring points nearer"
     ),
     "chord_strain": HumanRange(
         -0.2, 0.25, "", "chordae stretch by 4.3 ± 3.4 % (porcine); a closed valve hangs on them"
@@ -133,18 +121,16 @@ class Doubt:
         return f"{self.field}: {self.text}"
 
 
+Planes = Mapping[str, AnnulusPlane | None]
+"""Plane of the annulus by the name of a frame; None where it has none."""
+
+
 def doubts(case: ValveCase) -> tuple[Doubt, ...]:
     """All that is doubtful about a case, mistakes first; empty if nothing is."""
-    found = [
-        *_of_pressure(case),
-        *_of_thickness(case),
-        *_of_annulus(case),
-        *_of_leaflets(case),
-        *_of_orifice(case),
-        *_of_stretch(case),
-        *_of_chordae(case),
-        *_of_motion(case),
-    ]
+    planes = {frame.name: _plane(case, frame) for frame in case.frames}
+    found = [*_of_anatomy(case, planes), *_of_leaflets(case, planes), *_of_orifice(case, planes)]
+    if case.closed is not None:
+        found += [*_of_closing(case, case.closed, planes), *_of_motion(case)]
     return tuple(sorted(found, key=lambda doubt: not doubt.mistake))
 
 
@@ -169,92 +155,48 @@ def _outside(field: str, what: str, value: float, name: str, hint: str = "") -> 
         yield Doubt(field, f"{text}: {hint}" if hint else text, mistake=bool(hint))
 
 
-def _of_pressure(case: ValveCase) -> Iterator[Doubt]:
-    closed = case.closed
-    if closed is None:
-        return
-    for frame in (closed, *case.fitted):
-        pressure = frame.pressure_mmHg
-        # kPa taken for mmHg: 120 mmHg are 16 kPa.
-        hint = "is it in kPa?" if 8.0 <= pressure <= 27.0 else ""
-        field = "frames.pressure" if frame is closed else f"frames.{frame.name}.pressure"
-        what = "the pressure on the closed valve"
-        yield from _outside(field, what, pressure, "closing_pressure", hint)
-    for frame in case.fitted:
-        yield from _of_order(case, closed, frame)
-
-
-def _of_order(case: ValveCase, closed: Frame, other: Frame) -> Iterator[Doubt]:
-    """Whether the leaflets are nearer to the atrium under the larger of two pressures."""
-    heights = []
-    for frame in (closed, other):
-        plane = _plane(case, frame)
-        if plane is None:
-            return
-        heights.append(-float(plane.coordinates(frame.vertices)[:, 2] @ _weights(frame)))
-    rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
-    doubt = case.uncertainty
-    size = float(areas(closed.vertices, closed.triangles).sum())
-    alike = 2.0 * np.pi * doubt.correlation_length_mm**2
-    independent = len(closed.vertices) if alike == 0.0 else max(size / alike, 1.0)
-    if rise < -ORDER_STDS * doubt.typical_mm * np.sqrt(2.0 / independent):
-        high, low = sorted((closed, other), key=lambda f: f.pressure_mmHg, reverse=True)
-        yield Doubt(
-            f"frames.{other.name}.pressure",
-            f"under {high.pressure_mmHg:.3g} mmHg in {high.name!r} the leaflets lie {-rise:.1f} mm "
-            f"farther from the atrium than under {low.pressure_mmHg:.3g} mmHg in {low.name!r}: are "
-            "frames or pressures exchanged?",
-            mistake=True,
-        )
-
-
-def _weights(frame: Frame) -> FloatArray:
-    """Share of a frame's area ``(n,)`` about each of its vertices."""
-    own = np.repeat(areas(frame.vertices, frame.triangles) / 3.0, 3)
-    about = np.bincount(frame.triangles.ravel(), own, len(frame.vertices))
-    return about / about.sum()
-
-
-def _of_thickness(case: ValveCase) -> Iterator[Doubt]:
+def _of_anatomy(case: ValveCase, planes: Planes) -> Iterator[Doubt]:
+    """Thickness, chordae and the annulus of each frame."""
     typical = float(np.median(case.surface.thickness))
-    expected = RANGES["thickness"]
-    hint = "is it in cm?" if 10 * typical in expected and typical not in expected else ""
+    hint = "is it in cm?" if 10 * typical in RANGES["thickness"] else ""
     yield from _outside("thickness", "the leaflets' typical thickness", typical, "thickness", hint)
-
-
-def _of_annulus(case: ValveCase) -> Iterator[Doubt]:
     for frame in case.frames:
-        plane = _plane(case, frame)
+        plane, field = planes[frame.name], f"frames.{frame.name}.annulus"
         if plane is None:
             continue
         try:
             size = measure_annulus(frame.annulus, plane)
         except GeometryError as fault:
-            yield Doubt(f"frames.{frame.name}.annulus", str(fault))
+            yield Doubt(field, str(fault))
             continue
-        field = f"frames.{frame.name}.annulus"
         width, depth = size.commissural_diameter, size.anteroposterior_diameter
         yield from _outside(field, "its anteroposterior diameter", depth, "ap_diameter")
         yield from _outside(field, "its commissural diameter", width, "commissural_diameter")
+    tips = case.frame(Role.REFERENCE).papillary_tips[case.chordae.tip]
+    length = np.linalg.norm(case.chordae.insertion - tips, axis=1)
+    expected = RANGES["chord_length"]
+    strange = [k for k, own in enumerate(length) if float(own) not in expected]
+    if strange:
+        yield Doubt(
+            "chordae",
+            f"{len(strange)} of {len(length)} chords are not {expected} long, chord {strange[0]} "
+            f"{length[strange[0]]:.1f} mm",
+        )
 
 
-def _of_leaflets(case: ValveCase) -> Iterator[Doubt]:
+def _of_leaflets(case: ValveCase, planes: Planes) -> Iterator[Doubt]:
     """Lengths of the leaflets, and whether they are exchanged."""
-    surface = case.surface
-    names = surface.region_names
-    reference = case.frame(Role.REFERENCE)
-    plane = _plane(case, reference)
-    if set(names) != {"anterior", "posterior"} or plane is None:
+    surface, plane = case.surface, planes[case.frame(Role.REFERENCE).name]
+    if set(surface.region_names) != {"anterior", "posterior"} or plane is None:
         return
+    annulus = surface.vertices[case.annulus]
+    step = np.linalg.norm(np.roll(annulus, -1, axis=0) - annulus, axis=1)
     length, share = {}, {}
-    on_annulus = np.zeros(len(surface.vertices), dtype=bool)
-    on_annulus[case.annulus] = True
-    for number, name in enumerate(names):
+    for number, name in enumerate(surface.region_names):
         triangles = surface.triangles[surface.region == number]
         length[name] = leaflet_length(surface.vertices, triangles, plane)
-        own = np.zeros(len(surface.vertices), dtype=bool)
-        own[triangles] = True
-        share[name] = _arc(surface.vertices, case.annulus, own)
+        own = np.isin(case.annulus, triangles)
+        share[name] = float(step[own & np.roll(own, -1)].sum())
     part = share["anterior"] / max(sum(share.values()), 1e-12)
     if part > 0.5 and length["anterior"] < length["posterior"]:
         yield Doubt(
@@ -264,35 +206,27 @@ def _of_leaflets(case: ValveCase) -> Iterator[Doubt]:
             "anterior one is the longer, on the shorter part of the annulus: are they exchanged?",
             mistake=True,
         )
-    for name in names:
-        yield from _outside(
-            "regions", f"the length of the {name} leaflet", length[name], f"{name}_length"
-        )
+    for name, own_length in length.items():
+        what = f"the length of the {name} leaflet"
+        yield from _outside("regions", what, own_length, f"{name}_length")
 
 
-def _arc(vertices: FloatArray, loop: IntArray, own: np.typing.NDArray[np.bool_]) -> float:
-    following = np.roll(loop, -1)
-    length = np.linalg.norm(vertices[following] - vertices[loop], axis=1)
-    return float(length[own[loop] & own[following]].sum())
-
-
-def _of_orifice(case: ValveCase) -> Iterator[Doubt]:
+def _of_orifice(case: ValveCase, planes: Planes) -> Iterator[Doubt]:
+    """What the leaflets leave free, and whether the frames are exchanged."""
     reference, closed = case.frame(Role.REFERENCE), case.closed
-    open_ = free_orifice(case, reference)
-    if open_ is None:
+    free = [_free(frame, planes[frame.name]) for frame in (reference, closed or reference)]
+    if free[0] is None or free[1] is None:
         return
-    left = None if closed is None else free_orifice(case, closed)
-    if closed is not None and left is None:
-        return
-    if closed is not None and left is not None and left > open_:
+    if closed is not None and free[1] > free[0]:
         yield Doubt(
             "frames",
-            f"the closed frame {closed.name!r} leaves {left:.0f} mm² free, the reference "
-            f"{reference.name!r} {open_:.0f} mm²: are the frames exchanged?",
+            f"the closed frame {closed.name!r} leaves {free[1]:.0f} mm² free, the reference "
+            f"{reference.name!r} {free[0]:.0f} mm²: are the frames exchanged?",
             mistake=True,
         )
-        return
-    yield from _outside(f"frames.{reference.name}", "the open orifice", open_, "open_orifice")
+    else:
+        field = f"frames.{reference.name}"
+        yield from _outside(field, "the open orifice", free[0], "open_orifice")
 
 
 def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = None) -> float | None:
@@ -308,89 +242,105 @@ def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = No
         Where a model has the vertices of the reference frame, instead of what was seen.
     """
     plane = _plane(case, frame)
+    if vertices is not None:
+        triangles, annulus = case.surface.triangles, vertices[case.annulus]
+        frame = replace(frame, vertices=vertices, triangles=triangles, annulus=annulus)
+    return _free(frame, plane)
+
+
+def _free(frame: Frame, plane: AnnulusPlane | None) -> float | None:
     if plane is None:
         return None
     try:
-        if vertices is not None:
-            triangles = case.surface.triangles
-            return orifice_area(vertices, triangles, vertices[case.annulus], plane, 0.5)
         return orifice_area(frame.vertices, frame.triangles, frame.annulus, plane, 0.5)
     except GeometryError:
         return None
 
 
-def _of_stretch(case: ValveCase) -> Iterator[Doubt]:
-    """Whether the leaflets keep their size from the open to the closed frame."""
-    surface, closed = case.surface, case.closed
-    if closed is None:
-        return
-    field = f"frames.{closed.name}.surface"
-    for number, name in enumerate(surface.region_names):
-        before = areas(surface.vertices, surface.triangles[surface.region == number]).sum()
-        after = areas(closed.vertices, closed.triangles[closed.region == number]).sum()
-        if before <= 0 or after <= 0:
-            continue
-        change = float(after / before)
-        yield from _outside(
-            field, f"area of the {name} leaflet, closed over open,", change, "area_change"
-        )
-        if not closed.corresponds:
-            continue
-        members = np.unique(surface.triangles[surface.region == number])
-        members = members[:: max(1, len(members) // MAX_VERTICES)]
-        rest, moved = surface.vertices[members], closed.vertices[members]
-        first, second = cKDTree(rest).query_pairs(REACH_MM, output_type="ndarray").T
-        apart = np.linalg.norm(rest[first] - rest[second], axis=1)
-        far = apart > 0.7 * REACH_MM
-        if not far.any():
-            continue
-        now = np.linalg.norm(moved[first] - moved[second], axis=1)
-        stretch = (now / np.maximum(apart, 1e-12))[far]
-        low, high = np.quantile(stretch, [EXTREME_SHARE, 1 - EXTREME_SHARE])
-        expected = RANGES["stretch"]
-        if low not in expected or high not in expected:
-            yield Doubt(
-                field,
-                f"points of the {name} leaflet {0.7 * REACH_MM:.1f} to {REACH_MM:g} mm apart come "
-                f"to {low:.2f} to {high:.2f} times their distance in the open frame, expected "
-                f"{expected}: do its vertices correspond?",
-                mistake=True,
-            )
+def _of_closing(case: ValveCase, closed: Frame, planes: Planes) -> Iterator[Doubt]:
+    """Pressures, and what they do to leaflets and chordae."""
+    for frame in (closed, *case.fitted):
+        pressure = frame.pressure_mmHg
+        # kPa taken for mmHg: 120 mmHg are 16 kPa.
+        hint = "is it in kPa?" if 8.0 <= pressure <= 27.0 else ""
+        field = "frames.pressure" if frame is closed else f"frames.{frame.name}.pressure"
+        what = "the pressure on the closed valve"
+        yield from _outside(field, what, pressure, "closing_pressure", hint)
+    for frame in case.fitted:
+        yield from _of_order(case, closed, frame, planes)
+    for number, name in enumerate(case.surface.region_names):
+        yield from _of_stretch(case.surface, closed, number, name)
+    if closed.corresponds and len(case.chordae):
+        chordae = case.chordae
+        _, at = cKDTree(case.surface.vertices).query(chordae.insertion)
+        length = np.linalg.norm(closed.vertices[at] - closed.papillary_tips[chordae.tip], axis=1)
+        # Single chords end where noise takes them.
+        tight, middle = np.quantile(length / chordae.rest_length - 1.0, [0.9, 0.5])
+        too_tight = tight > RANGES["chord_strain"].high
+        share, strain = ("a tenth", tight) if too_tight else ("half", middle)
+        what = f"the strain that {share} of the chordae exceed"
+        field = f"frames.{closed.name}.papillary_tips"
+        yield from _outside(field, what, float(strain), "chord_strain")
 
 
-def _of_chordae(case: ValveCase) -> Iterator[Doubt]:
-    chordae = case.chordae
-    if not len(chordae):
-        return
-    reference, closed = case.frame(Role.REFERENCE), case.closed
-    open_ = np.linalg.norm(chordae.insertion - reference.papillary_tips[chordae.tip], axis=1)
-    expected = RANGES["chord_length"]
-    strange = [k for k, length in enumerate(open_) if float(length) not in expected]
-    if strange:
+def _of_order(case: ValveCase, closed: Frame, other: Frame, planes: Planes) -> Iterator[Doubt]:
+    """Whether the leaflets are nearer to the atrium under the larger of two pressures."""
+    heights = []
+    for frame in (closed, other):
+        plane, size = planes[frame.name], lumped_areas(frame.vertices, frame.triangles)
+        if plane is None:
+            return
+        heights.append(-float(plane.coordinates(frame.vertices)[:, 2] @ size / size.sum()))
+    rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
+    doubt = case.uncertainty
+    alike = 2.0 * np.pi * doubt.correlation_length_mm**2
+    whole = surface_area(closed.vertices, closed.triangles)
+    independent = len(closed.vertices) if alike == 0.0 else max(whole / alike, 1.0)
+    if rise < -ORDER_STDS * doubt.typical_mm * np.sqrt(2.0 / independent):
+        high, low = sorted((closed, other), key=lambda f: f.pressure_mmHg, reverse=True)
         yield Doubt(
-            "chordae",
-            f"{len(strange)} of {len(open_)} chords are not {expected} long, chord {strange[0]} "
-            f"{open_[strange[0]]:.1f} mm",
+            f"frames.{other.name}.pressure",
+            f"under {high.pressure_mmHg:.3g} mmHg in {high.name!r} the leaflets lie {-rise:.1f} mm "
+            f"farther from the atrium than under {low.pressure_mmHg:.3g} mmHg in {low.name!r}: are "
+            "frames or pressures exchanged?",
+            mistake=True,
         )
-    if closed is None or not closed.corresponds:
+
+
+def _of_stretch(surface: LeafletSurface, closed: Frame, number: int, name: str) -> Iterator[Doubt]:
+    """Whether a leaflet keeps its size from the open to the closed frame."""
+    field, own = f"frames.{closed.name}.surface", surface.triangles[surface.region == number]
+    before = surface_area(surface.vertices, own)
+    after = surface_area(closed.vertices, closed.triangles[closed.region == number])
+    if before <= 0 or after <= 0:
         return
-    _, at = cKDTree(case.surface.vertices).query(chordae.insertion)
-    length = np.linalg.norm(closed.vertices[at] - closed.papillary_tips[chordae.tip], axis=1)
-    strain = length / chordae.rest_length - 1.0
-    field = f"frames.{closed.name}.papillary_tips"
-    # Single chords end where noise takes them.
-    tight, middle = np.quantile(strain, [0.9, 0.5])
-    if tight > RANGES["chord_strain"].high:
-        what = "the strain that a tenth of the chordae exceed"
-        yield from _outside(field, what, float(tight), "chord_strain")
-    else:
-        what = "the strain that half of the chordae exceed"
-        yield from _outside(field, what, float(middle), "chord_strain")
+    what = f"area of the {name} leaflet, closed over open,"
+    yield from _outside(field, what, after / before, "area_change")
+    if not closed.corresponds:
+        return
+    members = np.unique(own)
+    members = members[:: max(1, len(members) // MAX_VERTICES)]
+    rest, moved = surface.vertices[members], closed.vertices[members]
+    pairs = cKDTree(rest).query_pairs(REACH_MM, output_type="ndarray")
+    apart, now = (np.linalg.norm(np.diff(x[pairs], axis=1)[:, 0], axis=1) for x in (rest, moved))
+    far = apart > 0.7 * REACH_MM
+    if not far.any():
+        return
+    low, high = np.quantile(now[far] / apart[far], [EXTREME_SHARE, 1 - EXTREME_SHARE])
+    expected = RANGES["stretch"]
+    if low not in expected or high not in expected:
+        yield Doubt(
+            field,
+            f"points of the {name} leaflet {0.7 * REACH_MM:.1f} to {REACH_MM:g} mm apart come to "
+            f"{low:.2f} to {high:.2f} times their distance in the open frame, expected "
+            f"{expected}: do its vertices correspond?",
+            mistake=True,
+        )
 
 
 def _of_motion(case: ValveCase) -> Iterator[Doubt]:
+    """How far each frame is from the reference."""
     reference = case.frame(Role.REFERENCE)
-    size = _loop_area(reference.annulus)
     for frame in case.frames:
         if frame is reference:
             continue
@@ -399,23 +349,12 @@ def _of_motion(case: ValveCase) -> Iterator[Doubt]:
             motion = float(np.linalg.norm(frame.vertices - reference.vertices, axis=1).max())
             yield from _outside(field, "the largest motion of a vertex", motion, "motion")
         tips = np.linalg.norm(frame.papillary_tips - reference.papillary_tips, axis=1)
-        yield from _outside(
-            f"{field}.papillary_tips",
-            "the largest motion of a tip",
-            float(tips.max()),
-            "tip_motion",
-        )
-        yield from _outside(
-            f"{field}.annulus",
-            "the area of the annulus over that of the reference",
-            _loop_area(frame.annulus) / size,
-            "annulus_change",
-        )
-
-
-def _loop_area(loop: FloatArray) -> float:
-    spokes = loop - loop.mean(axis=0)
-    return 0.5 * float(np.linalg.norm(np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)))
+        what = "the largest motion of a tip"
+        yield from _outside(f"{field}.papillary_tips", what, float(tips.max()), "tip_motion")
+        sizes = [np.linalg.norm(loop_vector_area(one.annulus)) for one in (frame, reference)]
+        what = "the area of the annulus over that of the reference"
+        change = float(sizes[0] / sizes[1])
+        yield from _outside(f"{field}.annulus", what, change, "annulus_change")
 
 
 def _plane(case: ValveCase, frame: Frame) -> AnnulusPlane | None:
@@ -423,12 +362,9 @@ def _plane(case: ValveCase, frame: Frame) -> AnnulusPlane | None:
 
     The anterior direction is to the leaflet of that name, or to the first.
     """
-    surface = case.surface
-    names = surface.region_names
+    surface, names = case.surface, case.surface.region_names
     number = names.index("anterior") if "anterior" in names else 0
-    own = np.zeros(len(surface.vertices), dtype=bool)
-    own[surface.triangles[surface.region == number]] = True
-    anterior = own[case.annulus]
+    anterior = np.isin(case.annulus, surface.triangles[surface.region == number])
     if not anterior.any() or len(frame.annulus) != len(case.annulus):
         return None
     try:

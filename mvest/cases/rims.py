@@ -11,6 +11,7 @@ moving a vertex.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
+from mvest.valve.geometry.triangles import directed_edges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,12 +100,8 @@ def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
         With the size and place of the loops: those that are no annulus and no free edge are holes.
     """
     loops = boundary_loops(triangles)
-    if len(loops) != 2:
-        raise GeometryError(_wrong_number(vertices, loops))
-    return loops
-
-
-def _wrong_number(vertices: FloatArray, loops: list[IntArray]) -> str:
+    if len(loops) == 2:
+        return loops
     perimeter = [
         float(np.linalg.norm(vertices[loop] - vertices[np.roll(loop, -1)], axis=1).sum())
         for loop in loops
@@ -121,7 +119,7 @@ def _wrong_number(vertices: FloatArray, loops: list[IntArray]) -> str:
         )
     else:
         advice = "open it along the annulus and along the free edge"
-    return (
+    raise GeometryError(
         f"{len(loops)} boundary loops ({listed or 'none'}), expected two, the annulus and the free "
         f"edge: {advice}"
     )
@@ -153,22 +151,8 @@ def _which(name: str, wanted: IntArray, loops: list[IntArray]) -> int:
 
 def directed(loop: IntArray, triangles: IntArray) -> IntArray:
     """A boundary loop in the direction of its triangles, with the same first vertex."""
-    following = {
-        (int(a), int(b)) for i in range(3) for a, b in np.roll(triangles, -i, axis=1)[:, :2]
-    }
-    if (int(loop[0]), int(loop[1])) in following:
-        return loop
-    return np.roll(loop[::-1], 1)
-
-
-def edge_regions(loop: IntArray, triangles: IntArray, region: IntArray) -> IntArray:
-    """Region ``(k,)`` of the triangle at each edge from ``loop[i]`` to ``loop[i + 1]``."""
-    owner: dict[tuple[int, int], int] = {}
-    for i in range(3):
-        pairs = np.roll(triangles, -i, axis=1)[:, :2].tolist()
-        owner.update({(a, b): r for (a, b), r in zip(pairs, region.tolist(), strict=True)})
-    ends = zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)
-    return np.array([owner[pair] for pair in ends], dtype=np.int64)
+    runs_along = (directed_edges(triangles) == loop[:2]).all(axis=1).any()
+    return loop if runs_along else np.roll(loop[::-1], 1)
 
 
 def commissures(
@@ -186,7 +170,10 @@ def commissures(
     GeometryError
         A region does not touch the loop in one piece, or there is only one region.
     """
-    labels = edge_regions(loop, triangles, region)
+    edges = map(tuple, directed_edges(triangles).tolist())
+    region_at = dict(zip(edges, np.tile(region, 3).tolist(), strict=True))
+    along = zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)
+    labels = np.array([region_at[pair] for pair in along], dtype=np.int64)
     begins = np.flatnonzero(labels != np.roll(labels, 1))
     present = labels[begins]
     if len(begins) < 2:
@@ -245,7 +232,11 @@ def match_annulus(
     other = directed(seen_annulus, seen[1])
     pieces = commissures(loop, triangles, region)
     other_pieces = commissures(other, seen[1], seen[2])
-    if _cycle(list(pieces)) != _cycle(list(other_pieces)):
+    # Cyclic sequences, begun at their smallest entries.
+    order, other_order = (
+        np.roll(labels, -int(np.argmin(labels))) for labels in (list(pieces), list(other_pieces))
+    )
+    if not np.array_equal(order, other_order):
         raise InputError(
             f"along the annulus the regions follow each other as {list(other_pieces)}, in the "
             f"reference frame as {list(pieces)}"
@@ -258,12 +249,6 @@ def match_annulus(
         for axis in range(3):
             placed[loop[at], axis] = np.interp(share, other_share, other_curve[other_at, axis])
     return placed[reference_annulus]
-
-
-def _cycle(labels: list[int]) -> list[int]:
-    """A cyclic sequence begun at its smallest entry."""
-    start = labels.index(min(labels))
-    return labels[start:] + labels[:start]
 
 
 def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
@@ -284,20 +269,22 @@ def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
     ears : ndarray
         ``(k,)`` those that were cured.
     """
-    none = np.zeros(0, dtype=np.int64)
-    try:
+    loops: list[IntArray] = []
+    with suppress(GeometryError):
         loops = boundary_loops(triangles)
-    except GeometryError:
-        return triangles, none
     if len(loops) != 2:
-        return triangles, none
+        return triangles, np.zeros(0, dtype=np.int64)
     loop_of = np.full(int(triangles.max()) + 1, -1)
     for number, loop in enumerate(loops):
         loop_of[loop] = number
     corners = [tuple(triangle) for triangle in triangles.tolist()]
     owner = {edge: t for t, triangle in enumerate(corners) for edge in _edges(triangle)}
     cured = []
-    while turned := [t for t in _ears(corners, loop_of) if _turn(corners, owner, t, loop_of)]:
+    turned = [-1]
+    while turned:
+        on = loop_of[np.array(corners)]
+        ears = np.flatnonzero((on[:, 0] >= 0) & (on == on[:, :1]).all(axis=1)).tolist()
+        turned = [ear for ear in ears if _turn(corners, owner, ear, loop_of)]
         cured += turned
     return np.array(corners, dtype=np.int64), np.unique(np.array(cured, dtype=np.int64))
 
@@ -305,13 +292,6 @@ def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
 def _edges(triangle: tuple[int, ...]) -> list[tuple[int, int]]:
     a, b, c = triangle
     return [(a, b), (b, c), (c, a)]
-
-
-def _ears(triangles: list[tuple[int, ...]], loop_of: IntArray) -> list[int]:
-    on = loop_of[np.array(triangles)]
-    same = (on[:, 0] >= 0) & (on[:, 0] == on[:, 1]) & (on[:, 0] == on[:, 2])
-    ears: list[int] = np.flatnonzero(same).tolist()
-    return ears
 
 
 def _turn(

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -45,22 +46,20 @@ Text = Annotated[str, Field(strict=True, max_length=MAX_TEXT)]
 Name = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]
 Index = Annotated[int, Field(strict=True, ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+NUMBER, TEXT, LIST, MAPPING, POINT_DATA = map(
+    Tag, ("\0number", "\0text", "\0list", "\0mapping", "\0point data")
+)
+EITHER = Discriminator(_kind)
+Label = Annotated[int, Field(strict=True)]
 Regions = Annotated[
-    Annotated[list[Name], Field(min_length=1), Tag("\0list")]
-    | Annotated[
-        dict[Annotated[int, Field(strict=True)], Name], Field(min_length=1), Tag("\0mapping")
-    ],
-    Discriminator(_kind),
+    Annotated[list[Name], Field(min_length=1), LIST]
+    | Annotated[dict[Label, Name], Field(min_length=1), MAPPING],
+    EITHER,
 ]
 SurfaceFiles = Annotated[
-    Annotated[Name, Tag("\0text")]
-    | Annotated[dict[Name, Name], Field(min_length=1), Tag("\0mapping")],
-    Discriminator(_kind),
+    Annotated[Name, TEXT] | Annotated[dict[Name, Name], Field(min_length=1), MAPPING], EITHER
 ]
-Curve = Annotated[
-    Annotated[Name, Tag("\0text")] | Annotated[list[Index], Field(min_length=3), Tag("\0list")],
-    Discriminator(_kind),
-]
+Curve = Annotated[Annotated[Name, TEXT] | Annotated[list[Index], Field(min_length=3), LIST], EITHER]
 
 
 class _Model(BaseModel):
@@ -79,6 +78,14 @@ class PointData(_Model):
     """A field at the vertices of the reference surface."""
 
     point_data: Name = Field(description="the name of point data of the reference surface")
+
+
+Thickness = Annotated[
+    Annotated[Number, NUMBER]
+    | Annotated[PointData, POINT_DATA]
+    | Annotated[dict[Name, Number], MAPPING],
+    EITHER,
+]
 
 
 class FrameEntry(_Model):
@@ -128,12 +135,14 @@ class ChordaeEntry(_Model):
     )
 
 
+ChordaeTable = Annotated[Annotated[Name, TEXT] | Annotated[ChordaeEntry, MAPPING], EITHER]
+
+
 class ObservationEntry(_Model):
     """How well the vertices of a frame are seen."""
 
     std_mm: Annotated[
-        Annotated[Number, Field(gt=0), Tag("\0number")] | Annotated[PointData, Tag("\0point data")],
-        Discriminator(_kind),
+        Annotated[Number, Field(gt=0), NUMBER] | Annotated[PointData, POINT_DATA], EITHER
     ] = Field(
         description="standard deviation of a coordinate in mm, > 0: a number, or "
         "{point_data: NAME} of the reference surface"
@@ -161,15 +170,9 @@ class CaseFile(_Model):
     regions: Regions = Field(
         description="a list of names (labels 0, 1, ...) or a mapping from label to name"
     )
-    thickness: (
-        Annotated[
-            Annotated[Number, Tag("\0number")]
-            | Annotated[PointData, Tag("\0point data")]
-            | Annotated[dict[Name, Number], Tag("\0mapping")],
-            Discriminator(_kind),
-        ]
-        | None
-    ) = Field(None, description="mm: a number, a number for every region, or {point_data: NAME}")
+    thickness: Thickness | None = Field(
+        None, description="mm: a number, a number for every region, or {point_data: NAME}"
+    )
     fibre: Name | None = Field(
         None, description="the name of point data (3 components) of the reference surface"
     )
@@ -179,13 +182,9 @@ class CaseFile(_Model):
     pressure_curve: Name | None = Field(
         None, description="a .csv file with the columns time,pressure"
     )
-    chordae: (
-        Annotated[
-            Annotated[Name, Tag("\0text")] | Annotated[ChordaeEntry, Tag("\0mapping")],
-            Discriminator(_kind),
-        ]
-        | None
-    ) = Field(None, description="a .csv file, or a mapping with file, toe_strain and families")
+    chordae: ChordaeTable | None = Field(
+        None, description="a .csv file, or a mapping with file, toe_strain and families"
+    )
     observation: ObservationEntry | None = Field(
         None, description="a mapping with std_mm, correlation_length_mm and error_samples"
     )
@@ -221,34 +220,6 @@ def case_schema() -> dict[str, Any]:
     return CaseFile.model_json_schema()
 
 
-def wrong(file: Path, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
-    """The error for one field of a case: file, field, and what is wrong with it, in one line."""
-    return kind(f"{file}: {one_line(field, 80)}: {one_line(what)}")
-
-
-def read_case_file(file: Path) -> CaseFile:
-    """Read ``case.yaml``.
-
-    Raises
-    ------
-    InputError
-        The file is no plain YAML mapping, or a field is missing, unknown or of the wrong kind: one
-        line with the field, what was found and what would be right.
-    """
-    data = read_yaml(file)
-    version = data.get("version")
-    if version != VERSION or isinstance(version, bool):
-        found = f"{version!r} is not known" if "version" in data else "is missing"
-        raise wrong(file, "version", f"{found}; expected {VERSION}")
-    try:
-        return CaseFile.model_validate(data)
-    except ValidationError as fault:
-        errors = fault.errors(include_url=False)
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        field, what = _explained(errors[0]["loc"], errors[0]["type"], errors[0]["input"])
-        raise wrong(file, field, what + more) from fault
-
-
 def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
     """Dotted field and a sentence for one of pydantic's errors."""
     path = [part for part in loc if not (isinstance(part, str) and part.startswith("\0"))]
@@ -264,18 +235,11 @@ def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, st
         return field, f"is missing; expected {expected}"
     shown = repr(value)
     found = shown if len(shown) <= 60 else shown[:57] + "..."
-    note = ""
-    if isinstance(value, str) and _is_number(value):
-        note = " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
-    return field, f"found {found}{note}; expected {expected}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    if isinstance(value, str):
+        with suppress(ValueError):
+            float(value)
+            found += " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
+    return field, f"found {found}; expected {expected}"
 
 
 def _place(path: Sequence[int | str]) -> tuple[type[BaseModel], str]:
@@ -301,9 +265,9 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 CASE_FILE = "case.yaml"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CaseFolder:
-    """A case folder: finds the files in it and remembers which were used."""
+    """A case folder: its fields, the files that were used, and what was derived."""
 
     root: Path
     used: dict[str, Path] = field(default_factory=dict)
@@ -313,9 +277,45 @@ class CaseFolder:
         """The file with the fields, which every error names first."""
         return self.root / CASE_FILE
 
+    @cached_property
     def document(self) -> CaseFile:
-        """The fields of the case; see `read_case_file`."""
-        return read_case_file(self.file(CASE_FILE, "link"))
+        """The fields of the case.
+
+        Raises
+        ------
+        InputError
+            The file is no plain YAML mapping, or a field is missing, unknown or of the wrong kind:
+            one line with the field, what was found and what would be right.
+        """
+        data = read_yaml(self.file(CASE_FILE, "link"))
+        version = data.get("version")
+        if version != VERSION or isinstance(version, bool):
+            found = f"{version!r} is not known" if "version" in data else "is missing"
+            raise self.wrong("version", f"{found}; expected {VERSION}")
+        try:
+            return CaseFile.model_validate(data)
+        except ValidationError as fault:
+            errors = fault.errors(include_url=False)
+            more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+            field, what = _explained(errors[0]["loc"], errors[0]["type"], errors[0]["input"])
+            raise self.wrong(field, what + more) from fault
+
+    @cached_property
+    def derived(self) -> list[str]:
+        """Sentences, one for everything that was not given but derived."""
+        return list(self.document.derived)
+
+    def wrong(self, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
+        """The error for one field: file, field, and what is wrong with it, in one line."""
+        return kind(f"{self.case}: {one_line(field, 80)}: {one_line(what)}")
+
+    @contextmanager
+    def at(self, field: str) -> Iterator[None]:
+        """Put the file and the field before the message of any error raised inside."""
+        try:
+            yield
+        except InputError as fault:
+            raise self.wrong(field, str(fault), type(fault)) from fault
 
     def file(self, name: str, where: str) -> Path:
         """The path of a file that a field names; it must lie in the folder."""
@@ -326,13 +326,11 @@ class CaseFolder:
             found = not outside and path.is_file()
             outside = outside or not path.resolve().is_relative_to(self.root.resolve())
         except (OSError, RuntimeError) as fault:  # a name too long, a link to itself
-            raise wrong(self.case, where, f"{name[:60]!r} cannot be found: {fault}") from fault
+            raise self.wrong(where, f"{name[:60]!r} cannot be found: {fault}") from fault
         if outside:
-            raise wrong(
-                self.case, where, f"{name!r} leads out of the folder; expected a file inside it"
-            )
+            raise self.wrong(where, f"{name!r} leads out of the folder; expected a file inside it")
         if not found:
-            raise wrong(self.case, where, f"{name!r}: no such file in {self.root}")
+            raise self.wrong(where, f"{name!r}: no such file in {self.root}")
         self.used[given.as_posix()] = path
         return path
 
@@ -350,6 +348,6 @@ def files_of_case(root: Path) -> dict[str, Path]:
     """Name -> file of all that reading a case folder opens, up to the first that is missing."""
     folder = CaseFolder(root)
     with suppress(InputError):  # it is refused when it is read
-        for where, name in folder.document().files():
+        for where, name in folder.document.files():
             folder.file(name, where)
     return folder.used

@@ -61,23 +61,27 @@ def require_new(folder: Path | str) -> Path:
 
 def _check_reference(case: ValveCase) -> None:
     frame, surface = case.frame(Role.REFERENCE), case.surface
-    for name in ("vertices", "triangles", "region"):
-        if not np.array_equal(getattr(frame, name), getattr(surface, name)):
+    own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
+    own |= {name: surface.vertices[getattr(case, name)] for name in ("annulus", "free_edge")}
+    for name, wanted in own.items():
+        if not np.array_equal(getattr(frame, name), wanted):
             raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} are not those of "
-                "the surface"
-            )
-    for name in ("annulus", "free_edge"):
-        if not np.array_equal(getattr(frame, name), surface.vertices[getattr(case, name)]):
-            raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} is not where the "
+                f"case {case.name}: {name} of the reference frame {frame.name!r} is not as the "
                 "surface has it"
             )
 
 
 def _write_files(folder: Path, case: ValveCase) -> None:
     folder.mkdir()
-    chordae = case.chordae
+    chordae, std = case.chordae, case.uncertainty.std_mm
+    observation: dict[str, Any] = {
+        "std_mm": {"point_data": "std_mm"} if isinstance(std, np.ndarray) else float(std),
+        "correlation_length_mm": float(case.uncertainty.correlation_length_mm),
+    }
+    if case.error_samples is not None:
+        observation["error_samples"] = "errors.npz"
+        names = [frame.name for frame in case.frames]
+        write_error_samples(folder / "errors.npz", case.error_samples, names)
     document: dict[str, Any] = {
         "version": VERSION,
         "name": case.name,
@@ -89,14 +93,14 @@ def _write_files(folder: Path, case: ValveCase) -> None:
         "regions": list(case.surface.region_names),
         "thickness": {"point_data": "thickness"},
         "fibre": "fibre",
-        "frames": [_write_frame(folder, case, k) for k in range(len(case.frames))],
+        "frames": [_write_frame(folder, case, k, own) for k, own in enumerate(case.frames)],
         "chordae": {
             "file": "chordae.csv",
             "toe_strain": float(chordae.toe_strain),
             "families": list(chordae.family_names),
             **({"follow": True} if case.chordae_follow else {}),
         },
-        "observation": _observation(folder, case),
+        "observation": observation,
         "derived": list(case.derived),
     }
     families = [chordae.family_names[k] for k in chordae.family]
@@ -116,21 +120,7 @@ def _write_files(folder: Path, case: ValveCase) -> None:
     (folder / CASE_FILE).write_text(text, encoding="utf-8")
 
 
-def _observation(folder: Path, case: ValveCase) -> dict[str, Any]:
-    std = case.uncertainty.std_mm
-    entry: dict[str, Any] = {
-        "std_mm": {"point_data": "std_mm"} if isinstance(std, np.ndarray) else float(std),
-        "correlation_length_mm": float(case.uncertainty.correlation_length_mm),
-    }
-    if case.error_samples is not None:
-        entry["error_samples"] = "errors.npz"
-        names = [frame.name for frame in case.frames]
-        write_error_samples(folder / "errors.npz", case.error_samples, names)
-    return entry
-
-
-def _write_frame(folder: Path, case: ValveCase, number: int) -> dict[str, Any]:
-    frame = case.frames[number]
+def _write_frame(folder: Path, case: ValveCase, number: int, frame: Frame) -> dict[str, Any]:
     stem = f"frame_{number:02d}"
     point_data = {}
     if frame.role is Role.REFERENCE:
@@ -159,9 +149,5 @@ def _write_frame(folder: Path, case: ValveCase, number: int) -> dict[str, Any]:
         "free_edge": f"{stem}_free_edge.csv",
         "papillary_tips": np.asarray(frame.papillary_tips, dtype=np.float64).tolist(),
         "pressure": float(frame.pressure_mmHg),
-        **_correspondence(frame),
+        **({} if frame.role is Role.REFERENCE else {"corresponds": bool(frame.corresponds)}),
     }
-
-
-def _correspondence(frame: Frame) -> dict[str, Any]:
-    return {} if frame.role is Role.REFERENCE else {"corresponds": bool(frame.corresponds)}

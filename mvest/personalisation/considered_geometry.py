@@ -312,7 +312,7 @@ def rest_lengths_by_ends(
     """Relative change ``(q, c)`` of the chordae's rest lengths where they follow from the frames.
 
     They are in proportion to a chord's distance in the closed frame, or, where that would be too
-    short, in the open one (`mvest.cases.chord_layout.lay_out_chordae`). Where vertices of the
+    short, in the open one (`mvest.cases.tissue.lay_out_chordae`). Where vertices of the
     closed frame do not correspond, so that it is not known where a chord ends there, the open one
     stands for it. None: they are known by themselves.
 

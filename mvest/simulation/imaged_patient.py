@@ -72,7 +72,7 @@ class ImagedPatient:
     def chord_ratios(self) -> dict[str, FloatArray]:
         """Family -> true rest lengths of its chordae over the distance of their ends, closed.
 
-        A layout by a closed frame that was seen needs it (`mvest.cases.chord_layout`).
+        A layout by a closed frame that was seen needs it (`mvest.cases.tissue`).
         """
         surface, chordae = self.stated.surface, self.stated.chordae
         place = closest_points(chordae.insertion, surface.vertices, surface.triangles)

@@ -7,9 +7,9 @@ import pytest
 
 from experiments.run import main
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
+from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout

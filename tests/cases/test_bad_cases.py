@@ -494,7 +494,7 @@ CASES = {
     "no such fibres": (put("fibre", "fibres"), I, "fibre", "no point data 'fibres'"),
     # Chordae.
     "chord disconnected": (cell(3, "z", "40"), G, "chordae", r"chord 3 is disconnected.* mm from"),
-    "tip index out of range": (cell(5, "tip", "2"), I, "chordae", "chord 5 starts at tip 2, expec"),
+    "tip index out of range": (cell(5, "tip", "2"), I, "chordae", "chord 5 starts at papillary"),
     "negative tip index": (cell(5, "tip", "-1"), I, "chordae", "tip of row 5 is '-1'"),
     "rest length 0": (cell(2, "rest_length_mm", "0"), I, "chordae", "rest_length of chord 2 is 0"),
     "stiffness negative": (cell(2, "stiffness_n", "-1"), I, "chordae", "stiffness of .* 2 is -1"),

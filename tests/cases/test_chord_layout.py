@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.cases.folder import read_case
+from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template

@@ -35,7 +35,7 @@ def test_no_curve_is_continued_beyond_its_ends(time):
     ("time", "pressure", "message"),
     [
         ([0.0], [1.0], "two or more"),
-        ([0.0, 1.0], [1.0], "two or more"),
+        ([0.0, 1.0], [1.0], "pressures: shape"),
         ([0.0, np.nan], [1.0, 2.0], "finite"),
         ([0.0, 1.0, 1.0], [1.0, 2.0, 3.0], "time 1 s of point 2"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import SEEN_ON_BAND, LeafletBand, lay_out_chordae
+from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError

@@ -14,7 +14,7 @@ from experiments.common.records.record import Number, Record
 from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore, Seen
-from mvest.cases.from_images.expected_error import coverage
+from mvest.cases.from_images.detector_errors import coverage
 from mvest.errors import ConfigurationError, InputError
 from mvest.files import sha256_of, write_atomically
 from mvest.imaging.detection.pose_search import MODES
@@ -383,7 +383,7 @@ def coverage_rows(
     layout: ValveLayout,
     min_confidence: float,
 ) -> list[Row]:
-    """A row for each setting and frame: see `mvest.cases.from_images.expected_error.coverage`."""
+    """A row for each setting and frame: see `mvest.cases.from_images.detector_errors.coverage`."""
     rows: list[Row] = []
     for kind, setting in SETTINGS.items():
         if seen := _detected(sequences[kind], min_confidence):

@@ -4,7 +4,3 @@ The frames of a sequence are taken as those of a case folder would be, with the 
 same derivations: fibres run around the valve, and chordae are laid out as in the template, as long
 as the closed frame asks for. Coordinates stay those of the images (LPS).
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

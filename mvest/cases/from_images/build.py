@@ -1,14 +1,15 @@
-"""The case that a sequence tells."""
+"""The frames that are chosen of a sequence, and the case that they tell."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.checks import (
+    CLOSING_PRESSURE,
     check_annulus_size,
     check_band,
     check_normals,
@@ -16,13 +17,12 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
-from mvest.cases.chord_layout import SEEN_CLOSURE, lay_out_chordae
-from mvest.cases.from_images.frame_choice import CaseFrames
-from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.from_images.measures import Row, closed_frame
+from mvest.cases.tissue import GENERIC_THICKNESS, SEEN_CLOSURE, Places, lay_out_chordae
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import ValveSequence
-from mvest.typing import FloatArray, IntArray
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template, vertex_region
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -33,15 +33,110 @@ UNSEEN_STD_MM = 10.0
 """Standard deviation of a vertex whose error was never measured: it is given no weight."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
-    """The valve of a frame, whose layout knows the template's coordinates."""
+@dataclass(frozen=True, slots=True)
+class CaseFrames:
+    """Which frames of a sequence are used, by their numbers.
 
-    vertices: FloatArray
-    layout: ValveLayout
+    Attributes
+    ----------
+    open, closed : int
+    pressure_mmHg : float
+        Transmitral pressure in the closed frame.
+    held_out : mapping
+        Further frames of the closed valve -> transmitral pressure in mmHg.
+    derived : tuple of str
+        How frames were chosen that were not stated.
+    """
 
-    def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        return self.layout.locate(phi, s)
+    open: int
+    closed: int
+    pressure_mmHg: float
+    held_out: Mapping[int, float] = field(default_factory=dict)
+    derived: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        used = [self.open, self.closed, *self.held_out]
+        if len(set(used)) != len(used):
+            raise InputError(f"frames {used} (open, closed, held out) are not all different")
+        low, high = CLOSING_PRESSURE
+        for frame, pressure in ((self.closed, self.pressure_mmHg), *self.held_out.items()):
+            if not low <= pressure <= high:
+                raise InputError(
+                    f"pressure of frame {frame} = {pressure} mmHg on the closed valve, expected "
+                    f"{low:g} to {high:g} mmHg"
+                )
+
+    @property
+    def in_order(self) -> list[int]:
+        """Numbers of all of them, in the order of time."""
+        return sorted([self.open, self.closed, *self.held_out])
+
+
+def choose_frames(
+    sequence: ValveSequence,
+    rows: Sequence[Row],
+    pressure_mmhg: float | Callable[[float], float],
+    *,
+    open_: int | None = None,
+    closed: int | None = None,
+    held_out: Mapping[int, float] | None = None,
+    min_confidence: float = MIN_CONFIDENCE,
+) -> CaseFrames:
+    """Choose the frames that were not stated.
+
+    The closed frame is the one in which the leaflets touch over the largest area, the open frame
+    the one with the largest orifice, among frames that are as confident as asked for.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    rows : sequence
+        Measures of every frame (`mvest.cases.from_images.measures.measure_sequence`).
+    pressure_mmhg : float or callable
+        In the closed frame, or at any time (s).
+    open_, closed : int, optional
+        Where they are stated.
+    held_out : mapping, optional
+        Frame -> pressure, mmHg.
+    min_confidence : float
+        Of a frame that is chosen.
+
+    Raises
+    ------
+    InputError
+        A frame that is stated does not exist, or none can be chosen.
+    """
+    count, held = len(sequence.times), dict(held_out or {})
+    for name, number in (("open", open_), ("closed", closed), *(("held-out", k) for k in held)):
+        if number is not None and not 0 <= number < count:
+            raise InputError(f"{name} frame {number}, expected one of 0 to {count - 1}")
+    sure = [
+        row
+        for row in rows
+        if sequence.frame_confidence[int(row["frame"] or 0)] >= min_confidence
+        and row["orifice_mm2"] is not None
+    ]
+    among = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
+    derived = []
+    if closed is None:
+        closed = closed_frame([row for row in sure if int(row["frame"] or 0) not in held])
+        derived.append(
+            f"closed frame: {closed}, whose leaflets touch over the largest area, {among}"
+        )
+    if open_ is None:
+        others = [row for row in sure if int(row["frame"] or 0) not in {closed, *held}]
+        best = max(others, key=lambda row: row["orifice_mm2"] or 0.0, default=None)
+        open_ = None if best is None else int(best["frame"] or 0)
+        derived.append(f"open frame: {open_}, with the largest orifice, {among}")
+    if open_ is None or closed is None:
+        highest = float(np.max(sequence.frame_confidence))
+        raise InputError(
+            f"no open and closed frame can be chosen {among} (the best: {highest:.2f}); give the "
+            "frames, or landmarks by hand"
+        )
+    if callable(pressure_mmhg):
+        pressure_mmhg = pressure_mmhg(float(sequence.times[closed]))
+    return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +180,7 @@ def case_of_sequence(
     layout = sequence.layout
     derived = list(frames.derived)
     reference = sequence.vertices[frames.open]
-    annulus = reference[layout.annulus]
-    side = ventricular_side(annulus, reference[layout.free_edge])
+    side = ventricular_side(reference[layout.annulus], reference[layout.free_edge])
     for number in frames.in_order:
         _check_frame(sequence, number, side, is_reference=number == frames.open)
     given = GENERIC_THICKNESS if thickness_mm is None else thickness_mm
@@ -97,11 +191,8 @@ def case_of_sequence(
     if thickness_mm is None:
         listed = ", ".join(f"{given[name]:g} mm ({name})" for name in layout.region_names)
         derived.append(f"thickness: {listed} assumed")
-    typical = Template(
-        TemplateParameters().changed(
-            {f"leaflets.{name}.thickness": mm for name, mm in given.items()}
-        )
-    )
+    changes = {f"leaflets.{name}.thickness": mm for name, mm in given.items()}
+    typical = Template(TemplateParameters().changed(changes))
     thickness = typical.thickness(layout.phi, layout.s)
     check_thickness(thickness)
     derived += [
@@ -111,16 +202,10 @@ def case_of_sequence(
         "leaflet",
         "annulus and free edge: the first and the last row of the image step's layout",
     ]
-    surface = LeafletSurface(
-        reference,
-        layout.triangles,
-        layout.region,
-        layout.region_names,
-        _fibres(layout, reference, typical),
-        thickness,
-    )
+    shape = reference, layout.triangles, layout.region, layout.region_names
+    surface = LeafletSurface(*shape, _fibres(layout, reference, typical), thickness)
     chordae = lay_out_chordae(
-        _Placed(reference, layout),
+        Places(reference, layout.locate),
         sequence.tips[frames.open],
         sequence.vertices[frames.closed],
         sequence.tips[frames.closed],
@@ -131,11 +216,7 @@ def case_of_sequence(
         "rest lengths from the closed frame (through its vertices)"
     )
     return ValveCase(
-        name=texts.name,
-        description=texts.description,
-        source=texts.source,
-        licence=texts.licence,
-        simulated=texts.simulated,
+        **asdict(texts),
         surface=surface,
         annulus=layout.annulus,
         free_edge=layout.free_edge,

@@ -12,15 +12,14 @@ import numpy as np
 
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import PressureCurve
-from mvest.cases.from_images.build import CaseTexts, case_of_sequence
-from mvest.cases.from_images.errors_in_world import (
+from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
+from mvest.cases.from_images.detector_errors import (
     samples_in_world,
     with_bands,
     without_expected_error,
 )
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
-from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
-from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
+from mvest.cases.from_images.measures import Row, measure_sequence, write_measures
 from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
@@ -39,7 +38,7 @@ from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, LANDMARKS, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.text import read_numbers
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 
 IMAGES, CASE = "images", "case"
 """Folders of measures, surfaces and landmarks, and of the case."""
@@ -68,10 +67,7 @@ class DetectedValve:
     case : ValveCase
         With a stand-in for the pressure if none is stated.
     settings : ImagedSettings
-    model_sha256 : str
-        Of the detection model.
-    trained_on : mapping
-        What that model says of its training.
+    model : DetectionModel
     unlike : str
         How the volume is unlike those of training; empty if it is not.
     """
@@ -82,8 +78,7 @@ class DetectedValve:
     frames: CaseFrames
     case: ValveCase
     settings: ImagedSettings
-    model_sha256: str
-    trained_on: Mapping[str, Any]
+    model: DetectionModel
     unlike: str
 
     @property
@@ -163,7 +158,9 @@ def detect_in_volume(
     # What is asked for, before anything that takes long.
     said: list[str] = []
     by_hand = _landmarks(settings, said)
-    curve = _pressure_curve(settings)
+    curve = None
+    if settings.pressure_curve is not None:
+        curve = PressureCurve(*read_numbers(Path(settings.pressure_curve), ("time", "pressure")).T)
     if estimate and not settings.states_pressure:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
@@ -180,11 +177,22 @@ def detect_in_volume(
     )
     thickness = settings.thickness
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
-    frames = _frames(settings, curve, valve, rows)
+    pressure = settings.pressure_mmHg
+    frames = choose_frames(
+        valve,
+        rows,
+        curve or (STAND_IN_MMHG if pressure is None else pressure),
+        open_=settings.open_frame,
+        closed=settings.closed_frame,
+        held_out={frame: float(value) for frame, value in settings.held_out},
+        min_confidence=settings.min_confidence,
+    )
     accuracy = measured.at(valve.confidence)
-    rows = with_bands(valve, rows, accuracy.samples, accuracy.tip_samples)
-    corrected, errors, tip_errors = without_expected_error(valve, frames, measured)
-    kept = _thinned(len(errors), settings.error_samples)
+    rows = with_bands(valve, rows, accuracy)
+    corrected, errors = without_expected_error(valve, frames, measured)
+    # Evenly spread samples of the errors.
+    spread = np.linspace(0, len(errors) - 1, settings.error_samples)
+    kept = np.unique(spread.round().astype(np.int64))
     case = case_of_sequence(
         corrected,
         frames,
@@ -196,7 +204,7 @@ def detect_in_volume(
             settings.simulated,
         ),
         thickness_mm=thickness,
-        error_samples=samples_in_world(corrected, frames, errors[kept], tip_errors[kept]),
+        error_samples=samples_in_world(corrected, frames, errors[kept]),
     )
     off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
     less = (
@@ -210,8 +218,7 @@ def detect_in_volume(
         frames,
         replace(case, derived=(*case.derived, less, *said)),
         settings,
-        model.sha256,
-        model.trained_on,
+        model,
         _unlike(valve.confidence, accuracy),
     )
 
@@ -251,9 +258,7 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
 
 
 def image_step(
-    detected: DetectedValve,
-    files: Sequence[str] = (),
-    pictures: Sequence[Mapping[str, Any]] = (),
+    detected: DetectedValve, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
 ) -> dict[str, tuple[Mapping[str, Any], ...]]:
     """What a record says of the image step, as details (`mvest.personalisation.record`).
 
@@ -283,8 +288,8 @@ def image_step(
         "closed_frame": frames.closed,
         "confidence": detected.valve.frame_confidence.tolist(),
         "unlike": detected.unlike,
-        "model_sha256": detected.model_sha256,
-        "trained_on": dict(detected.trained_on),
+        "model_sha256": detected.model.sha256,
+        "trained_on": dict(detected.model.trained_on),
         "sentences": list(detected.sentences),
         "files": list(files),
     }
@@ -331,13 +336,6 @@ def _unlike(confidence: float, accuracy: DetectionAccuracy) -> str:
     )
 
 
-def _pressure_curve(settings: ImagedSettings) -> PressureCurve | None:
-    if settings.pressure_curve is None:
-        return None
-    table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
-    return PressureCurve(table[:, 0], table[:, 1])
-
-
 def _landmarks(
     settings: ImagedSettings, derived: list[str]
 ) -> dict[int, dict[str, FloatArray]] | None:
@@ -350,11 +348,7 @@ def _landmarks(
             for name, item in lists.items()
             if item.kind == "Fiducial" and name != ANNULUS_LABELS
         ]
-        points = {
-            label: point
-            for item in mine
-            for label, point in zip(item.labels, item.points, strict=True)
-        }
+        points = dict(pair for item in mine for pair in zip(item.labels, item.points, strict=True))
         strange = sorted(set(points) - set(LANDMARKS))
         if strange or not points or len(points) < sum(len(item.labels) for item in mine):
             raise InputError(
@@ -366,30 +360,3 @@ def _landmarks(
         if unplaced:
             derived.append(f"landmarks of frame {frame}: {', '.join(unplaced)} not placed")
     return landmarks or None
-
-
-def _frames(
-    settings: ImagedSettings, curve: PressureCurve | None, valve: ValveSequence, rows: list[Row]
-) -> CaseFrames:
-    pressure, closed, count = settings.pressure_mmHg, settings.closed_frame, len(valve.times)
-    if curve is not None:
-        if closed is None:
-            sure = [r for r in rows if (r["confidence"] or 0.0) >= settings.min_confidence]
-            closed = closed_frame(sure)
-        if closed is None or not 0 <= closed < count:
-            raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
-        pressure = curve(float(valve.times[closed]))
-    return choose_frames(
-        valve,
-        rows,
-        STAND_IN_MMHG if pressure is None else pressure,
-        open_=settings.open_frame,
-        closed=closed,
-        held_out={frame: float(value) for frame, value in settings.held_out},
-        min_confidence=settings.min_confidence,
-    )
-
-
-def _thinned(count: int, wanted: int) -> IntArray:
-    """Numbers of evenly spread samples of the errors, at most ``wanted``."""
-    return np.unique(np.linspace(0, count - 1, wanted).round().astype(np.int64))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import TIPS, ValveSequence
+from mvest.reading.text import write_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.clinical import (
     MeasuredLeaflets,
@@ -159,7 +159,7 @@ def closed_frame(rows: Sequence[Row]) -> int | None:
 def measure_meaning(name: str) -> tuple[str, str]:
     """Unit (empty for pure numbers) and meaning of an entry of `measure_sequence`.
 
-    Or of a bound of one (`mvest.cases.from_images.errors_in_world`).
+    Or of a bound of one (`mvest.cases.from_images.detector_errors`).
     """
     for end, words in BOUNDS.items():
         if name.endswith(f"_{end}"):
@@ -190,18 +190,12 @@ def write_measures(folder: Path, rows: Sequence[Row]) -> list[Path]:
         raise InputError(f"{folder}: no frames to write, expected at least one")
     table, document = folder / "measures.csv", folder / "measures.json"
 
-    def write_csv(file: Path) -> None:
-        with file.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(rows[0])
-            writer.writerows([_cell(row[key]) for key in rows[0]] for row in rows)
-
+    cells = [["" if row[key] is None else f"{row[key]:.7g}" for key in rows[0]] for row in rows]
     meanings = {
         key: dict(zip(("unit", "meaning"), measure_meaning(key), strict=True)) for key in rows[0]
     }
     text = json.dumps({"measures": meanings, "frames": list(rows)}, indent=1, allow_nan=False)
-    return [write_atomically(table, write_csv), write_atomically(document, text + "\n")]
-
-
-def _cell(value: float | None) -> str:
-    return "" if value is None else f"{value:.7g}"
+    return [
+        write_atomically(table, lambda file: write_columns(file, list(rows[0]), cells)),
+        write_atomically(document, text + "\n"),
+    ]

@@ -11,9 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.chord_layout import FAMILIES
 from mvest.cases.rims import two_loops
-from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.tissue import FAMILIES, GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
 from mvest.exchange.importing.joining import (
     REGIONS,

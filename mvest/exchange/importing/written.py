@@ -12,10 +12,9 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.chord_layout import FAMILIES
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
-from mvest.cases.tissue import CHORD_COLUMNS
+from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES
 from mvest.errors import MvestError
 from mvest.exchange.regions import RegionSurface
 from mvest.exchange.surfaces import write_surface

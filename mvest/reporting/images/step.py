@@ -67,7 +67,7 @@ def write_image_step(
     Returns
     -------
     dict
-        As `mvest.cases.from_images.image_step` has it.
+        As `mvest.cases.from_images.detected.image_step` has it.
     """
     files = write_detected(detected, folder)
     volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
@@ -100,9 +100,9 @@ def measures_figure(
     Parameters
     ----------
     rows : sequence of mapping
-        From `mvest.cases.from_images.measure_sequence`: for each frame ``time_s``, ``confidence``
+        From `mvest.cases.from_images.measures.measure_sequence`: for each frame ``time_s``, ``confidence``
         and the measures; None leaves a gap. Of those that have bounds
-        (`mvest.cases.from_images.with_bands`) the band is drawn, too.
+        (`mvest.cases.from_images.detector_errors.with_bands`) the band is drawn, too.
     title : str
     low_confidence : float
         Frames below this are drawn hollow.

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mvest.cases.from_images import write_for_slicer, write_landmarks, write_surfaces
+from mvest.cases.from_images.files import write_for_slicer, write_landmarks, write_surfaces
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface

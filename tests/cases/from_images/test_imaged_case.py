@@ -7,18 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import SEEN_CLOSURE
 from mvest.cases.folder import read_case
-from mvest.cases.from_images import (
-    CaseFrames,
-    CaseTexts,
-    case_of_sequence,
-    choose_frames,
-    measure_sequence,
+from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
+from mvest.cases.from_images.detector_errors import (
     samples_in_world,
     valve_axes,
     without_expected_error,
 )
+from mvest.cases.from_images.measures import measure_sequence
+from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -115,7 +112,7 @@ def test_errors_go_with_what_they_are_in_a_mirror():
     rng = np.random.default_rng(0)
     errors, tips = rng.standard_normal((4, 2, LAYOUT.size, 3)), rng.standard_normal((4, 2, 2, 3))
     seen = sequence()
-    found = samples_in_world(seen, FRAMES, errors, tips)
+    found = samples_in_world(seen, FRAMES, np.concatenate([errors, tips], axis=2))
     np.testing.assert_array_equal(found.source, [0, 1, 2, 3, 0, 1, 2, 3])
     axes = valve_axes(seen, 2)
     own, mirrored = found.vertices[:4, 1] @ axes, found.vertices[4:, 1] @ axes
@@ -167,7 +164,7 @@ def test_errors_become_displacements_back_to_where_it_may_have_been():
     tips = np.zeros((4, 2, 2, 3))
     tips[2, 1, 0, 0] = 1.5
     seen = sequence(TURN)
-    found = samples_in_world(seen, FRAMES, errors, tips)
+    found = samples_in_world(seen, FRAMES, np.concatenate([errors, tips], axis=2))
     assert found.vertices.shape == (8, 3, LAYOUT.size, 3)
     atrium = valve_axes(seen, 0)[:, 2]
     np.testing.assert_allclose(found.vertices[1, 0], np.tile(-0.7 * atrium, (LAYOUT.size, 1)))
@@ -178,7 +175,7 @@ def test_errors_become_displacements_back_to_where_it_may_have_been():
     case = case_of_sequence(seen, FRAMES, TEXTS, error_samples=found)
     assert case.error_samples is found
     with pytest.raises(InputError, match="errors of shape"):
-        samples_in_world(seen, FRAMES, errors[:, :, :5], tips)
+        samples_in_world(seen, FRAMES, errors[:, :, :5])
 
 
 def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
@@ -191,15 +188,15 @@ def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
     tip_spread -= tip_spread.mean(axis=0)
     seen = sequence(TURN)
     accuracy = DetectionAccuracy(np.ones(LAYOUT.size), 9.0, bias + spread, tip_bias + tip_spread)
-    found, errors, tips = without_expected_error(seen, FRAMES, accuracy)
+    found, errors = without_expected_error(seen, FRAMES, accuracy)
     for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
         axes = valve_axes(seen, number)
         off = (seen.vertices[number] - found.vertices[number]) @ axes
         np.testing.assert_allclose(off, bias[which], atol=1e-9)
         off = (seen.tips[number] - found.tips[number]) @ axes
         np.testing.assert_allclose(off, tip_bias[which], atol=1e-9)
-    np.testing.assert_allclose(errors, np.sqrt(7 / 5) * spread, atol=1e-9)
-    np.testing.assert_allclose(tips, np.sqrt(7 / 5) * tip_spread, atol=1e-9)
+    about = np.concatenate([spread, tip_spread], axis=2)
+    np.testing.assert_allclose(errors, np.sqrt(7 / 5) * about, atol=1e-9)
     untouched = set(range(len(seen.times))) - set(FRAMES.in_order)
     for number in untouched:
         np.testing.assert_array_equal(found.vertices[number], seen.vertices[number])

@@ -1,11 +1,14 @@
 """Bands of measures over time, from errors whose effect on a measure is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mvest.cases.from_images import measure_meaning, measure_sequence, valve_axes, with_bands
-from mvest.cases.from_images.errors_in_world import BANDED
+from mvest.cases.from_images.detector_errors import BANDED, valve_axes, with_bands
+from mvest.cases.from_images.measures import measure_meaning, measure_sequence
 from mvest.errors import InputError
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from tests import made_up_sequence
 
@@ -37,12 +40,12 @@ def swollen(valve, shares):
         share = np.asarray(shares)[:, which, None, None]
         errors[:, which] = share * ((valve.vertices[frame] - centre) @ axes)
         tips[:, which] = share * ((valve.tips[frame] - centre) @ axes)
-    return errors, tips
+    return DetectionAccuracy(np.ones(LAYOUT.size), 5.0, errors, tips)
 
 
 def test_a_valve_seen_larger_or_smaller_gives_lengths_a_band_of_that_share(valve, rows):
     shares = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
-    banded = with_bands(valve, rows, *swollen(valve, np.stack([shares, 0 * shares], axis=1)))
+    banded = with_bands(valve, rows, swollen(valve, np.stack([shares, 0 * shares], axis=1)))
     # Student's bound of four degrees of freedom, for one further number (any table of it).
     half = 2.776 * np.std(shares, ddof=1) * np.sqrt(1 + 1 / 5)
     for name in LENGTHS:
@@ -56,7 +59,7 @@ def test_a_valve_seen_larger_or_smaller_gives_lengths_a_band_of_that_share(valve
 
 
 def test_a_band_lies_where_the_valve_is_without_the_mean_error(valve, rows):
-    banded = with_bands(valve, rows, *swollen(valve, np.full((3, 2), 0.1)))
+    banded = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))
     for row, own in zip(rows, banded, strict=True):
         assert own["annulus_area_mm2_low"] == pytest.approx(0.9**2 * row["annulus_area_mm2"])
         assert own["annulus_area_mm2_high"] == pytest.approx(0.9**2 * row["annulus_area_mm2"])
@@ -66,7 +69,7 @@ def test_a_frame_without_a_valve_has_no_band():
     valve = made_up_sequence.sequence((1.0, 1.0), LAYOUT)
     valve.frame_confidence[1] = 0.0
     rows = measure_sequence(valve, 1.0)
-    empty = with_bands(valve, rows, *swollen(valve, np.full((3, 2), 0.1)))[1]
+    empty = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))[1]
     assert {empty[f"{name}_{end}"] for name in BANDED for end in ("low", "high")} == {None}
 
 
@@ -77,9 +80,8 @@ def test_a_bound_has_the_unit_of_what_it_bounds():
 
 
 def test_errors_of_one_valve_and_of_another_layout_are_refused(valve, rows):
-    errors, tips = swollen(valve, np.zeros((1, 2)))
+    one, two = (swollen(valve, np.zeros((count, 2))) for count in (1, 2))
     with pytest.raises(InputError, match="two samples or more"):
-        with_bands(valve, rows, errors, tips)
-    two = np.concatenate([errors, errors])[:, :, 1:], np.concatenate([tips, tips])
+        with_bands(valve, rows, one)
     with pytest.raises(InputError, match="expected"):
-        with_bands(valve, rows, *two)
+        with_bands(valve, rows, replace(two, samples=two.samples[:, :, 1:]))

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from mvest.cases.from_images import (
+from mvest.cases.from_images.measures import (
     closed_frame,
     contact_distance,
     measure_meaning,

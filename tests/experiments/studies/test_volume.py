@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.folder import read_case
-from mvest.cases.from_images import valve_axes
+from mvest.cases.from_images.detector_errors import valve_axes
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
 from mvest.exchange.segmentations import write_sequence_nrrd

@@ -1,0 +1,362 @@
+"""Errors of detectors on other valves: what is expected of them, and what they make of a case.
+
+Detectors are drawn to what they were trained on: what they are off by depends on how far from it a
+valve is, and so on what they find. The errors of S valves are regressed on the shapes in which
+these were found, linearly, with a penalty on the square of the coefficients that is chosen by
+leaving each valve out (ridge regression: Hoerl and Kennard, Technometrics 12, 1970; what is left of
+a valve that is left out, r / (1 - h): Allen, Technometrics 16, 1974). As a Gaussian process with a
+linear kernel (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sec. 2.1) it
+also says how much wider the error of one more valve varies about what is expected of it.
+
+Valves and detectors are nearly alike in a mirror across the middle of the leaflets, so what is even
+in it and what is odd are regressed apart: neither tells of the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import t as student_t
+
+from mvest.cases.case import ErrorSamples
+from mvest.cases.from_images.build import CaseFrames
+from mvest.cases.from_images.measures import BOUNDS, Row, is_open, leaflets_of
+from mvest.errors import InputError
+from mvest.imaging.detection.pose import pose_of
+from mvest.imaging.detection.trained_model import DetectionAccuracy
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.accuracy import share_within
+from mvest.imaging.valve_sequence import ValveSequence
+from mvest.typing import FloatArray
+from mvest.valve.measure.clinical import annulus_and_tips
+
+PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
+"""Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
+
+
+BANDED = (
+    "ap_diameter_mm",
+    "commissural_diameter_mm",
+    "annulus_height_mm",
+    "annulus_area_mm2",
+    "tip_depth_mm",
+    "tip_separation_mm",
+)
+"""Measures that get a band: of annulus and tips, which take no fine detail of leaflets.
+
+Detected leaflets are smoother than true ones, and differences between the two rougher than either:
+areas of leaflets that are moved by them would say more of the roughness than of the area.
+"""
+
+
+def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
+    """Errors of leaflets and, after them, tips ``(K, 2, n + 2, 3)`` mm, their shapes checked."""
+    errors, tips = accuracy.samples, accuracy.tip_samples
+    count, n = len(errors), layout.size
+    if count < 2:
+        raise InputError(f"errors of {count} valves, expected two samples or more")
+    if errors.shape != (count, 2, n, 3) or tips.shape != (count, 2, 2, 3):
+        raise InputError(
+            f"errors of shape {errors.shape} and of tips {tips.shape}, expected (samples, 2, {n}, "
+            "3) and (samples, 2, 2, 3)"
+        )
+    return np.concatenate([errors, tips], axis=2)
+
+
+def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Axes of the valve in a frame, the columns of ``(3, 3)``, in which errors are measured."""
+    pose = pose_of(sequence.vertices[frame], sequence.tips[frame], sequence.layout)
+    return np.asarray(pose.rotation[0])
+
+
+def samples_in_world(
+    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray
+) -> ErrorSamples:
+    """Errors measured on other valves, as displacements in the frames of a case.
+
+    With each of them goes what it would be on the other side, as in a mirror: valves are nearly
+    alike on both sides of the middle of their leaflets, and so is what is wrong with how they are
+    seen. Few samples stand for twice as many, though not for as many that are independent.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    frames : CaseFrames
+    errors : (K, 2, n + 2, 3) mm
+        Of leaflets and, after them, tips: found less true, in the axes of each valve, in its open
+        and its closed frame.
+
+    Raises
+    ------
+    InputError
+        They are not of this layout.
+    """
+    points, count = sequence.layout.size + 2, len(errors)
+    if errors.shape[1:] != (2, points, 3):
+        raise InputError(f"errors of shape {errors.shape}, expected (samples, 2, {points}, 3)")
+    moves = np.concatenate([errors, in_mirror(sequence.layout, errors)])
+    which = [int(number != frames.open) for number in frames.in_order]
+    axes = np.stack([valve_axes(sequence, number) for number in frames.in_order])
+    # Where it may have been is where it was found less the error.
+    moves = -np.einsum("fij,kfnj->kfni", axes, moves[:, which])
+    return ErrorSamples(moves[:, :, :-2], moves[:, :, -2:], np.tile(np.arange(count), 2))
+
+
+def without_expected_error(
+    sequence: ValveSequence, frames: CaseFrames, accuracy: DetectionAccuracy
+) -> tuple[ValveSequence, FloatArray]:
+    """The valve less the error that is expected of it, and errors of other valves about theirs.
+
+    What detectors are off by on average where they find such a valve (`expected_error`), no spread
+    of errors can make up for: closed free edges that lie where most do, for instance. Only the
+    frames of the case are changed: the open one by the error of open frames, the others by that of
+    closed ones.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    frames : CaseFrames
+    accuracy : DetectionAccuracy
+        Of the detectors; errors about what is expected are as wide as is stated of a volume of this
+        confidence.
+
+    Returns
+    -------
+    sequence : ValveSequence
+    errors : (K, 2, n + 2, 3) mm
+        Of leaflets and, after them, tips.
+
+    Raises
+    ------
+    InputError
+        They are not of this layout, or of fewer than two valves.
+    """
+    shape = np.stack(
+        [
+            (_points(sequence, n) - sequence.annulus[n].mean(axis=0)) @ valve_axes(sequence, n)
+            for n in (frames.open, frames.closed)
+        ]
+    )
+    expected, samples = expected_error(sequence.layout, accuracy, shape)
+    vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
+    for number in frames.in_order:
+        off = expected[int(number != frames.open)] @ valve_axes(sequence, number).T
+        vertices[number] -= off[:-2]
+        tips[number] -= off[-2:]
+    samples *= accuracy.factor(sequence.confidence)
+    return replace(sequence, vertices=vertices, tips=tips), samples
+
+
+def _points(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Leaflets and, after them, tips ``(n + 2, 3)`` mm."""
+    return np.concatenate([sequence.vertices[frame], sequence.tips[frame]])
+
+
+def with_bands(
+    sequence: ValveSequence, rows: Sequence[Row], accuracy: DetectionAccuracy
+) -> list[Row]:
+    """Measures of every frame, and between which bounds 95 % of true ones are expected.
+
+    The valve of each frame is moved back by every error of the detectors on another valve, and
+    measured again: a band is where one more of these values is expected (Student's bounds for one
+    further normal number). It lies about where the valve is without the mean error, and so not
+    always about what was measured. Errors are known of open and of closed frames; what is neither
+    quite takes those of the nearer by its orifice (`OPEN_SHARE`).
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    rows : sequence of dict
+        Its measures, from `mvest.cases.from_images.measures.measure_sequence`.
+    accuracy : DetectionAccuracy
+        Of the detectors in a volume of this confidence.
+
+    Returns
+    -------
+    list of dict
+        The rows with ``NAME_low`` and ``NAME_high`` of each of `BANDED`; None where the measure is.
+
+    Raises
+    ------
+    InputError
+        They are of fewer than two valves, or not of this layout.
+    """
+    errors, annulus = _errors_of(sequence.layout, accuracy), sequence.layout.annulus
+    count = len(errors)
+    surface = leaflets_of(sequence.layout, 1.0)  # whose thickness these measures do not ask for
+    reach = float(student_t.ppf(0.975, count - 1)) * np.sqrt(1.0 + 1.0 / count)
+    banded = []
+    for t, row in enumerate(rows):
+        bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in BOUNDS)
+        if row[BANDED[0]] is not None:
+            which, axes = (0 if is_open(row) else 1), valve_axes(sequence, t)
+            moved = _points(sequence, t) - errors[:, which] @ axes.T
+            again = [annulus_and_tips(x[:-2], surface, x[annulus], x[-2:]) for x in moved]
+            for name in BANDED:
+                values = np.array([one.get(name, np.nan) for one in again], dtype=np.float64)
+                middle, half = values.mean(), reach * values.std(ddof=1)
+                if np.isfinite(half):
+                    bounds[f"{name}_low"] = float(middle - half)
+                    bounds[f"{name}_high"] = float(middle + half)
+        banded.append(dict(row) | bounds)
+    return banded
+
+
+def expected_error(
+    layout: ValveLayout, accuracy: DetectionAccuracy, shape: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The error that is expected of detectors, and how it may vary, in a volume of confidence 1.
+
+    Parameters
+    ----------
+    layout : ValveLayout
+    accuracy : DetectionAccuracy
+    shape : (2, n + 2, 3) mm
+        Leaflets and, after them, papillary tips of the open and the closed frame, each as it was
+        found and in its own axes.
+
+    Returns
+    -------
+    expected : (2, n + 2, 3) mm
+        Found less true, in the valve's axes.
+    samples : (S, 2, n + 2, 3) mm
+        See `error_at_shape`; what of their size is owed to confidence is `accuracy.factor`.
+
+    Raises
+    ------
+    InputError
+        Errors are of fewer than two valves, or not of this layout.
+    """
+    errors = _errors_of(layout, accuracy)
+    shapes = None
+    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
+        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
+    return error_at_shape(layout, errors, shapes, shape)
+
+
+def coverage(
+    layout: ValveLayout,
+    accuracy: DetectionAccuracy,
+    errors: FloatArray,
+    shapes: FloatArray,
+    confidence: FloatArray,
+) -> list[dict[str, float]]:
+    """How true the stated errors are of valves that were not among the samples, by frame.
+
+    Parameters
+    ----------
+    layout : ValveLayout
+    accuracy : DetectionAccuracy
+    errors : (S, 2, n, 3) mm
+        Found less true, in the open and the closed frame.
+    shapes : (S, 2, n + 2, 3) mm
+        Where the valves were found; see `expected_error`.
+    confidence : (S,)
+        Of each volume.
+
+    Returns
+    -------
+    list of dict
+        For each frame ``within_95`` (% of coordinates within 1.96 of the stated deviations),
+        ``rms`` and ``stated`` (mm, the actual and the stated root mean square); and the same
+        ``..._handed_on``, less the error that is expected of such a shape.
+    """
+    n = layout.size
+    factors = np.array([accuracy.factor(one) for one in confidence])[:, None, None, None]
+    expected, samples = zip(
+        *(expected_error(layout, accuracy, shape) for shape in shapes), strict=True
+    )
+    left = (errors - np.stack(expected)[:, :, :n]) / factors
+    spread = np.stack([np.sqrt((one[:, :, :n] ** 2).mean(axis=(0, 3))) for one in samples])
+    rows = []
+    for k in range(2):
+        own = errors[:, k : k + 1]
+        handed_on = share_within(left[:, k] / spread[:, k, :, None], np.ones(n))
+        rows.append(
+            {
+                "within_95": 100 * share_within(own / factors, accuracy.std_mm),
+                "rms": _rms(own),
+                "stated": _rms(accuracy.std_mm) * _rms(factors),
+                "within_95_handed_on": 100 * handed_on,
+                "rms_handed_on": _rms(factors[:, 0] * left[:, k]),
+                "stated_handed_on": _rms(factors[:, 0, 0] * spread[:, k]),
+            }
+        )
+    return rows
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def error_at_shape(
+    layout: ValveLayout, errors: FloatArray, shapes: FloatArray | None, shape: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The error that is expected where a valve is found so, and how it may vary about that.
+
+    Parameters
+    ----------
+    layout : ValveLayout
+    errors : (S, F, n + 2, 3) mm
+        Of leaflets and, after them, papillary tips, of S >= 2 other valves in F frames.
+    shapes : (S, F, n + 2, 3) mm, optional
+        Where these valves were found, in the axes of each. None: not known, and nothing is learned
+        of them.
+    shape : (F, n + 2, 3) mm
+        Where the valve was found, in its own axes.
+
+    Returns
+    -------
+    expected : (F, n + 2, 3) mm
+    samples : (S, F, n + 2, 3) mm
+        The other valves' errors about what is expected of each, as large as those of one more valve
+        of this shape: without shapes, sqrt((S + 1) / (S - 1)) times those about the mean.
+    """
+    if shapes is None:
+        shapes, shape = np.zeros_like(errors), np.zeros_like(shape)
+    expected, samples = np.zeros_like(shape), np.zeros_like(errors)
+    for sign in (1.0, -1.0):
+        e, z, own = (
+            0.5 * (part + sign * in_mirror(layout, part)) for part in (errors, shapes, shape)
+        )
+        mean, about = _ridge(z.reshape(len(z), -1), e.reshape(len(e), -1), own.ravel())
+        expected += mean.reshape(shape.shape)
+        samples += about.reshape(errors.shape)
+    return expected, samples
+
+
+def in_mirror(layout: ValveLayout, moves: FloatArray) -> FloatArray:
+    """Leaflets and tips ``(..., n + 2, 3)``, in a valve's axes, as they are in a mirror."""
+    rows, columns = np.divmod(np.arange(layout.size), layout.columns)
+    other = rows * layout.columns + np.mod(layout.columns // 2 - columns, layout.columns)
+    swapped = np.append(other, [layout.size + 1, layout.size])
+    return np.asarray(moves[..., swapped, :] * np.array([-1.0, 1.0, 1.0]))
+
+
+def _ridge(Z: FloatArray, E: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Expected error ``(m,)`` at features ``z (q,)``, and samples ``(S, m)`` about it.
+
+    ``Z (S, q)`` and ``E (S, m)`` are those of the other valves. With a constant that is not
+    penalised, the covariance of their residuals r is that of one error times 1 - h.
+    """
+    count = len(Z)
+    Z_mean, E_mean = Z.mean(axis=0), E.mean(axis=0)
+    Z, z = Z - Z_mean, z - Z_mean
+    eigenvalues, U = np.linalg.eigh(Z @ Z.T)
+    eigenvalues = np.maximum(eigenvalues, 0.0)
+    scale = eigenvalues.mean() or 1.0
+    rotated = U.T @ (E - E_mean)
+    best = np.inf
+    for penalty in scale * PENALTIES:
+        left = 1.0 / (1.0 + eigenvalues / penalty)
+        free = U**2 @ left - 1.0 / count
+        residual = U @ (left[:, None] * rotated)
+        cost = float((residual**2 / free[:, None] ** 2).sum())
+        if cost <= best:
+            best, chosen = cost, (penalty, left, residual / np.sqrt(free)[:, None])
+    penalty, left, standard = chosen
+    weights = (U.T @ (Z @ z)) * left / penalty
+    spread = 1.0 + 1.0 / count + (z @ z - weights @ (U.T @ (Z @ z))) / penalty
+    return E_mean + weights @ rotated, np.sqrt(spread) * standard
