@@ -39,17 +39,23 @@ VALUE_OBJECTS = (
 )
 
 FILES = (
-    "mvest.exchange.child",
     "mvest.exchange.surfaces",
     "mvest.exchange.regions",
     "mvest.exchange.volumes",
-    "mvest.exchange._images",
-    "mvest.exchange._nrrd",
-    "mvest.exchange._plausible",
     "mvest.exchange.segmentations",
     "mvest.exchange.markups",
 )
-"""Of the exchange of files, what knows no case."""
+"""Of the exchange of files, what cases are read by."""
+IMPORT_AND_EXPORT = (
+    *LEAVES,
+    "mvest.valve",
+    "mvest.mechanics",
+    "mvest.imaging",
+    "mvest.closure",
+    "mvest.problem",
+    "mvest.cases",
+    "mvest.exchange",
+)
 
 # What each room of mvest may import from mvest, itself aside: the longest name that fits counts.
 # What is not listed has no place.
@@ -94,9 +100,9 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.imaging",
         "mvest.estimation",
         "mvest.closure",
-        "mvest.problem",
-        "mvest.cases",
     ),
+    "mvest.exchange.importing": IMPORT_AND_EXPORT,
+    "mvest.exchange.exporting": IMPORT_AND_EXPORT,
     "mvest.personalisation": (
         *LEAVES,
         "mvest.valve",

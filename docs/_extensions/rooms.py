@@ -17,22 +17,28 @@ INK, PAPER, FILE = "0.25", ("#f4f6f8", "#e3eaf1", "#d0dce8"), "#2f6f9f"
 LEAVES = ("errors", "units", "typing", "elements", "provenance", "quantities")
 
 
+def room_of(module: str) -> str:
+    """The room of a module of mvest; importers and exporters of cases are one of their own."""
+    _, room, *rest = module.split(".")
+    with_cases = room == "exchange" and rest[:1] in (["importing"], ["exporting"])
+    return "import, export" if with_cases else room
+
+
 def imports_of(path: Path) -> Iterable[str]:
     """Rooms of mvest that a module imports from."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mvest."):
-            yield node.module.split(".")[1]
-        if isinstance(node, ast.Import):
-            yield from (a.name.split(".")[1] for a in node.names if a.name.startswith("mvest."))
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+        yield from (room_of(name) for name in names if name.startswith("mvest."))
 
 
 def import_graph() -> dict[str, set[str]]:
     """Room -> rooms that it imports, ``experiments`` as one room."""
     graph: dict[str, set[str]] = {}
-    for folder in sorted((ROOT / "mvest").iterdir()):
-        if (folder / "__init__.py").is_file():
-            found = {name for path in folder.rglob("*.py") for name in imports_of(path)}
-            graph[folder.name] = found - {folder.name, *LEAVES}
+    for path in sorted((ROOT / "mvest").glob("*/**/*.py")):
+        room = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
+        graph.setdefault(room, set()).update(set(imports_of(path)) - {room, *LEAVES})
     used = {name for path in (ROOT / "experiments").rglob("*.py") for name in imports_of(path)}
     graph["experiments"] = used - set(LEAVES)
     return {room: {name for name in names if name in graph} for room, names in graph.items()}

@@ -100,8 +100,8 @@ def measures_figure(
     Parameters
     ----------
     rows : sequence of mapping
-        From `mvest.cases.from_images.measures.measure_sequence`: for each frame ``time_s``, ``confidence``
-        and the measures; None leaves a gap. Of those that have bounds
+        From `mvest.cases.from_images.measures.measure_sequence`: for each frame ``time_s``,
+        ``confidence`` and the measures; None leaves a gap. Of those that have bounds
         (`mvest.cases.from_images.detector_errors.with_bands`) the band is drawn, too.
     title : str
     low_confidence : float
