@@ -112,7 +112,11 @@ def check_array(
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in sizes)
     if not fits or array.dtype.kind not in {"i": "iu"}.get(kind, kind):
         wanted = {"i": "integers", "f": "finite numbers", "U": "text"}[kind]
-        raise InputError(f"{where} is {array.dtype} of shape {array.shape}, expected {wanted}")
+        lengths = ", ".join("any" if want is None else str(want) for want in shape)
+        raise InputError(
+            f"{where} is {array.dtype} of shape {array.shape}, expected {wanted} of shape "
+            f"({lengths}{',' if len(shape) == 1 else ''})"
+        )
     if kind == "f" and not np.isfinite(array).all():
         raise InputError(f"{where} has values that are not finite")
     return array if kind == "U" else array.astype({"f": np.float64, "i": np.int64}[kind])
