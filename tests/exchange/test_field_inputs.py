@@ -13,6 +13,7 @@ import nrrd
 import numpy as np
 import pytest
 import SimpleITK
+import slicerio
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkTriangleFilter
 from vtkmodules.vtkIOGeometry import vtkOBJReader
@@ -190,6 +191,15 @@ def test_labels_are_as_nibabel_and_pynrrd_read_them(name: str) -> None:
     np.testing.assert_array_equal(found.frames, values)
     np.testing.assert_allclose(found.direction * found.spacing, matrix[:3, :3], atol=1e-6)
     np.testing.assert_allclose(found.origin, matrix[:3, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["overlapping.seg.nrrd", "overlapping_empty_layer.seg.nrrd"])
+def test_segments_are_those_of_slicerio(name: str) -> None:
+    path = field_input(name)
+    expected = slicerio.read_segmentation(str(path), skip_voxels=True)["segments"]
+    assert [(s.name, s.label, s.layer) for s in read_labels(path).segments] == [
+        (s["name"], s["labelValue"], s["layer"]) for s in expected
+    ]
 
 
 def imported(kind: str, name: str, folder: Path, *options: str) -> ValveCase:

@@ -4,8 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-import trimesh
-from vtkmodules import vtkIOGeometry, vtkIOLegacy, vtkIOPLY, vtkIOXML
+from vtkmodules import vtkIOLegacy, vtkIOXML
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkStringArray
 from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkStripper, vtkTriangleFilter
@@ -83,33 +82,6 @@ def check_sphere(path, sphere):
     assert read.space == "LPS"
 
 
-ENCODINGS = ("ascii", "binary", "appended", "raw")
-COMPRESSORS = ("None", "ZLib", "LZ4", "LZMA")
-
-
-@pytest.mark.parametrize(
-    ("number", "encoding", "compressor"),
-    [(k, *pair) for k, pair in enumerate(itertools.product(ENCODINGS, COMPRESSORS))],
-)
-@pytest.mark.parametrize("suffix", ["vtp", "vtu"])
-def test_every_encoding_of_vtk_xml(tmp_path, sphere, suffix, number, encoding, compressor):
-    if suffix == "vtp":
-        writer, data = vtkIOXML.vtkXMLPolyDataWriter(), sphere
-    else:
-        writer = vtkIOXML.vtkXMLUnstructuredGridWriter()
-        data = output(vtkAppendFilter(), sphere)
-        data.GetFieldData().ShallowCopy(sphere.GetFieldData())
-    # Sizes of numbers and their order take turns.
-    getattr(writer, f"SetHeaderTypeToUInt{(32, 64)[number % 2]}")()
-    getattr(writer, f"SetByteOrderTo{('Big', 'Little')[number // 2 % 2]}Endian")()
-    getattr(writer, f"SetIdTypeToInt{(64, 32)[number // 4 % 2]}")()
-    getattr(writer, f"SetCompressorTypeTo{compressor}")()
-    mode = min(ENCODINGS.index(encoding), 2)
-    file = tmp_path / f"a.{suffix}"
-    settings = {"DataMode": mode, "EncodeAppendedData": encoding != "raw", "BlockSize": 4096}
-    check_sphere(written(writer, file, data, **settings), sphere)
-
-
 @pytest.mark.parametrize(("version", "kind"), list(itertools.product((42, 51), (1, 2))))
 @pytest.mark.parametrize("grid", [False, True])
 def test_legacy_vtk_as_text_and_binary(tmp_path, sphere, version, kind, grid):
@@ -174,31 +146,6 @@ def test_cells_other_than_triangles_are_named(tmp_path):
     assert read_mesh(tmp_path / "a.vtk").others == {"tetra": 1}
     with pytest.raises(GeometryError, match="cells of type tetra; expected triangles only"):
         read_surface(tmp_path / "a.vtk")
-
-
-@pytest.mark.parametrize(
-    ("name", "reader"),
-    [
-        ("cells_idtype.vtk", vtkIOLegacy.vtkPolyDataReader),
-        ("pv_region_uint8_ascii.vtk", vtkIOLegacy.vtkPolyDataReader),
-        ("obj_tabs.obj", vtkIOGeometry.vtkOBJReader),
-        ("ply_ascii_tex.ply", vtkIOPLY.vtkPLYReader),
-    ],
-)
-def test_files_from_the_field(name, reader):
-    path = FIELD_INPUTS / name
-    if not path.is_file():
-        pytest.skip(f"needs {name} of the shared data")
-    of_vtk = reader()
-    of_vtk.SetFileName(str(path))
-    if name.endswith("ply"):
-        of_vtk.SetDuplicatePointsForFaceTexture(False)
-    expected = output(of_vtk)
-    read = read_surface(path)
-    np.testing.assert_allclose(read.vertices, vtk_to_numpy(expected.GetPoints().GetData()))
-    np.testing.assert_allclose(read.vertices[read.triangles], corners(expected))
-    if not name.endswith("ply"):
-        assert np.bincount(read_regions(path, REGIONS).region).min() > 0
 
 
 STL = (
@@ -283,18 +230,6 @@ def test_ply_with_properties_lists_and_quadrilaterals(tmp_path, form, nl, faces)
     if faces == TRIANGLES.tolist():
         np.testing.assert_array_equal(read.triangles, TRIANGLES)
     assert set(read.cell_data) == {"region"}
-
-
-@pytest.mark.parametrize("suffix", ["stl", "ply", "obj", "glb"])
-@pytest.mark.parametrize("coloured", [False, True])
-def test_what_trimesh_writes(tmp_path, suffix, coloured):
-    mesh = trimesh.creation.icosphere(3)
-    if coloured and suffix != "stl":
-        mesh.visual.vertex_colors = np.arange(4 * len(mesh.vertices)).reshape(-1, 4) % 256
-    mesh.export(tmp_path / f"a.{suffix}")
-    read = read_surface(tmp_path / f"a.{suffix}")
-    assert len(read.vertices) == len(mesh.vertices)
-    np.testing.assert_allclose(read.vertices[read.triangles], mesh.triangles, atol=1e-6)
 
 
 VERTICES = "".join(f"v {x} {y} {z} 0.5 0.5 0.5\n" for x, y, z in POINTS.tolist())
