@@ -255,7 +255,7 @@ def test_a_truth_is_made_anew_after_one_line_of_what_makes_it_was_changed(truth,
 def test_a_truth_outlives_what_has_no_part_in_it(truth):
     code = truth.code
     edit(code / "mvest" / "estimation" / "filters" / "iterated.py", "max_iterations", "max_loops")
-    edit(code / "mvest" / "reporting" / "style.py", "import", "X = 1\nimport")
+    edit(code / "mvest" / "reporting" / "figures.py", "import", "X = 1\nimport")
     (code / "mvest" / "mechanics" / "another.py").write_text("VISCOSITY = 1.0\n")
     assert not truth()
     # That is, until it is used.

@@ -190,7 +190,6 @@ def test_seeds_give_the_same_alone_and_in_a_batch(configuration, tmp_path) -> No
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("repeats=0", "repeats = 0"),
         ("truth.reading=Z", "expected one of A, C"),
         ("+truth.ratio.septal=1.0", "region 'septal'"),
         ("+truth.fixed.presure_scale=1.1", "truth.fixed: unknown parameter 'presure_scale'"),
