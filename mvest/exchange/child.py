@@ -81,19 +81,24 @@ def in_child(
             _child = Program(python(__name__), env=alone, stdin=PIPE, stdout=PIPE)
             _owner = os.getpid()
         program = _child
-        timer = threading.Timer(seconds, program.end)
+        late = threading.Event()
+
+        def expire() -> None:
+            late.set()
+            program.end()
+
+        timer = threading.Timer(seconds, expire)
         timer.daemon = True
         timer.start()
         try:
             answer = _answer_of(program, call)
         except BaseException as error:
             _child = None
-            late = not timer.is_alive()
             program.close()
             if not isinstance(error, OSError | EOFError):
                 raise
             code: int = program.process.returncode
-            how = f"more than {seconds:g} s" if late else ending(code)
+            how = f"more than {seconds:g} s" if late.is_set() else ending(code)
             raise InputError(
                 f"{path}: damaged, or too large: its reader stopped: {how} (limits "
                 f"{memory_gb:g} GiB, {seconds:g} s)"
