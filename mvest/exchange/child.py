@@ -105,6 +105,10 @@ def in_child(
             ) from error
         finally:
             timer.cancel()
+            timer.join()
+        if late.is_set():  # just after the answer
+            _child = None
+            program.close()
     if "error" in answer:
         words = answer["message"].removeprefix(f"{path.resolve()}: ")
         kind: type[MvestError] = getattr(errors, answer["error"])
