@@ -29,11 +29,11 @@ from .mechanics.law.moduli import TransverselyIsotropic as TransverselyIsotropic
 from .mechanics.settings import ClosureProtocol as ClosureProtocol
 from .mechanics.settings import MechanicsSettings as MechanicsSettings
 from .mechanics.settings import TissueSettings as TissueSettings
-from .personalisation.chain import default_settings as default_settings
 from .personalisation.chain import personalise as personalise
 from .personalisation.record import record_of_case as record_of_case
 from .personalisation.settings import PersonaliseSettings as PersonaliseSettings
 from .personalisation.settings import Prior as Prior
+from .personalisation.settings import default_settings as default_settings
 from .problem.estimate import estimate as estimate
 from .problem.problem import Problem as Problem
 from .problem.synthetic import simulate_observation as simulate_observation

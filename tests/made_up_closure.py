@@ -15,9 +15,12 @@ import numpy as np
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation import Prediction
+from mvest.estimation.noise_family import ErrorColumns
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalisation import CaseMesh, PersonaliseSettings, Prior, Treatment
+from mvest.personalisation.geometry import GeometryModes
+from mvest.personalisation.sources import LAW, ErrorSource
 from mvest.problem.registration import REGISTRATION, displace
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
@@ -248,6 +251,14 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
 
     monkeypatch.setattr("mvest.personalisation.estimation.build_model", build)
     monkeypatch.setattr("mvest.personalisation.design.build_model", build)
-    monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_modes", lambda *_: ())
-    monkeypatch.setattr("mvest.personalisation.observation_errors.law_columns", lambda *_: ())
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_modes", lambda *_: ())
+    monkeypatch.setattr("mvest.personalisation.errors.law_sources", lambda *_: ())
     return built
+
+
+def error_source(rows: np.ndarray, modes: GeometryModes | None = None) -> ErrorSource:
+    """An error of the geometry, or of the law, that moves the closed valve by ``rows (3 n, q)``."""
+    name, factor = (LAW, 1.0) if modes is None else (modes.name, modes.factor)
+    moved = rows.reshape(-1, 3, rows.shape[1])
+    moves = np.stack([np.zeros_like(moved), moved])
+    return ErrorSource(ErrorColumns(name, rows, factor), rows, moves, modes)

@@ -31,7 +31,7 @@ from mvest.estimation.information.design import Design, together
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.considered_geometry import ConsideredGeometry
+from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.design import (
     HALF,
     KINDS,

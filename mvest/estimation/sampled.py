@@ -47,10 +47,20 @@ Without one of them it is not independent of the others any more, and counts wit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledPosterior:
-    """Covariance of an estimate, and the part of it that the samples account for, ``(p, p)``."""
+    """Covariance of an estimate ``(p, p)``, and what the samples contribute.
+
+    Attributes
+    ----------
+    covariance, from_samples : (p, p)
+        In all, and of the samples.
+    moved : (p, K)
+        By what each sample moves the estimate, with a gain that has not seen it; scaled so that
+        ``moved @ moved.T`` is ``from_samples``.
+    """
 
     covariance: FloatArray
     from_samples: FloatArray
+    moved: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,12 +156,13 @@ class SampledErrors:
             scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(sources))
             / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
         ) ** 2
-        part = widened / self.count * moved @ moved.T
+        moved *= np.sqrt(widened / self.count)
+        part = moved @ moved.T
         covariance = rest @ P @ rest.T + part
         if self.beside is not None:
-            moved = K @ self.base.whiten(self.beside)
-            covariance = covariance + moved @ moved.T
-        return SampledPosterior(covariance, part)
+            beside = K @ self.base.whiten(self.beside)
+            covariance = covariance + beside @ beside.T
+        return SampledPosterior(covariance, part, moved)
 
     def _seen(self) -> tuple[FloatArray, FloatArray]:
         """Orthonormal directions ``(n, r)`` of whitened columns, and their parts in them.

@@ -1,4 +1,3 @@
-from .chain import default_settings as default_settings
 from .chain import personalise as personalise
 from .design import FrameDesigns as FrameDesigns
 from .design import design_case as design_case
@@ -14,3 +13,4 @@ from .settings import PersonaliseSettings as PersonaliseSettings
 from .settings import PressureErrors as PressureErrors
 from .settings import Prior as Prior
 from .settings import Treatment as Treatment
+from .settings import default_settings as default_settings

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import Role, ValveCase
-from mvest.closure.frames import ERROR, OFFSET, SCALE
+from mvest.closure.frames import ERROR, OFFSET, SCALE, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.estimation.information.design import Design, together
 from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.prediction import predict
-from mvest.personalisation.estimation import CaseEstimation
+from mvest.personalisation.errors import FrameErrors, linearise
+from mvest.personalisation.estimation import CaseProblem, linearised
 from mvest.personalisation.model import build_model
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors, Treatment
 from mvest.problem.expectation import Expectation, expect
@@ -265,11 +266,12 @@ def expect_case(
     model : ClosureModel, optional
         As `build_model` makes it; one that has closed already need not do so again.
     """
-    estimation = CaseEstimation(case, settings, None, None, model=model)
-    generic = estimation.shared(estimation.shared.start)
-    if generic.converged:
-        estimation.errors.consider(estimation.shared.start, generic.y)
-    return expect(estimation.problem(estimation.filter), estimation.errors.observation())
+    problem = CaseProblem.of(case, settings, model=model)
+    generic = problem.generic()
+    if generic.prediction.converged:
+        generic = linearised(generic, problem)
+    plain = problem.filter(settings.tolerance)
+    return expect(problem.problem(problem.stated, plain), generic.errors.observation())
 
 
 def design_case(
@@ -299,28 +301,33 @@ def design_case(
     # As unknowns they are differentiated by; how large they are is for the designs to say.
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
     differentiated = PressureErrors(1.0, 1.0) if SCALE in free else None
-    estimation = CaseEstimation(
-        case, replace(settings, pressures=differentiated), None, None, model=model
-    )
-    start, errors, fitted = estimation.shared.start, estimation.errors, estimation.fitted
-    generic = estimation.registered(start)
+    problem = CaseProblem.of(case, replace(settings, pressures=differentiated), model=model)
+    registered, start = problem.stated.registered, problem.start
+    generic = registered(start)
     if not generic.converged:
         return generic.reason
-    errors.consider(start, generic.y)
-    observation, knowledge = fitted.observation(), estimation.knowledge()
+    errors = linearise(FrameErrors(problem.fitted), registered, start, generic.y)
+    observation, columns = problem.fitted.observation(), errors.columns()
+    # Prior standard deviations: relative of what is positive, 1 of the geometry's modes.
+    knowledge = {
+        u.name: u.std / (u.mean if u.is_positive else 1.0)
+        for u in problem.unknowns
+        if not is_frame_pressure(u.name)
+    }
+    modes = [f"geometry.{k}" for k in range(sum(own.shape[1] for own in columns.values()))]
+    knowledge |= dict.fromkeys(modes, 1.0)
     H = predict(observation.of(lambda _: generic), start, derivatives=True).jacobian
-    H = np.concatenate([H, *(own.columns for own in errors.considered)], axis=1)
-    values = [u.mean if u.is_positive else 1.0 for u in estimation.unknowns]
-    at = np.array([*values, *(1.0 for _ in errors.modes)])
-    names = (*estimation.names, *errors.modes)
-    noise = errors.noise(without=errors.kinds)
+    H = np.concatenate([H, *columns.values()], axis=1)
+    at = np.array([u.mean if u.is_positive else 1.0 for u in problem.unknowns] + [1.0] * len(modes))
+    names = (*problem.names, *modes)
+    noise = errors.single_noise()
     # Errors of different frames are independent: without the others' rows a frame is by itself.
-    of_frame = np.repeat([int(frame.name) for frame in fitted.frames], observation.sizes)
+    of_frame = np.repeat([int(frame.name) for frame in problem.fitted.frames], observation.sizes)
     return FrameDesigns(
         pressures,
         tuple(
             Design.of(np.where(of_frame[:, None] == k, H, 0.0), noise, at, names)
-            for k in range(len(fitted.frames))
+            for k in range(len(problem.fitted.frames))
         ),
         knowledge,
         StatedErrors(knowledge.get(SCALE, 0.0), stated.offset_mmHg, stated.each_mmHg),

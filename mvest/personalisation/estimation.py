@@ -1,4 +1,9 @@
-"""The estimation of a case: model, unknowns, prior and filter, and the estimates made with them."""
+"""Estimation of a case: what is estimated of it, and the steps from a generic valve to an estimate.
+
+Read from `estimate_all` on. Each step takes a `Place`, a closed valve about which its errors are
+linearised, and returns another one or an estimate; no object changes. Only the closures remember
+something, where they were closed last: that saves time and changes no number.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.cases.case import Role, ValveCase
-from mvest.closure.frames import FramesModel, is_frame_pressure
+from mvest.cases.case import ValveCase
+from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
@@ -23,17 +28,32 @@ from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.wrappers import SharedStart, of_some
 from mvest.mechanics.valve_system import HeldState
-from mvest.personalisation.considered_geometry import displacement
+from mvest.personalisation.errors import (
+    FrameErrors,
+    WeighedObservation,
+    linearise,
+    with_samples,
+)
 from mvest.personalisation.fitted_frames import FittedFrames
-from mvest.personalisation.geometry_errors import WeighedObservation
+from mvest.personalisation.geometry import displacement
 from mvest.personalisation.joint import JointPosterior, damped_step
-from mvest.personalisation.model import build_model, frames_model, held_state, with_pressures
-from mvest.personalisation.observation_errors import ObservationErrors
-from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Treatment
+from mvest.personalisation.model import build_model, frames_model, with_pressures
+from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Prior, Treatment
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
+
+ROUGH = 0.05
+"""Relative tolerance of an estimate about which the geometry is linearised."""
+
+LEARNED = 4
+"""Iterates at which errors are learned beside those of the geometry, from an estimate without."""
+
+SETTLED = 0.25
+"""Standard deviations of a modulus within which an estimate is where the geometry is linearised."""
+
+OnStep = Callable[[float, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,45 +120,96 @@ class Place:
     """Moduli and geometry at which a valve was closed, and about which errors are linearised."""
 
     closure: CaseClosure
-    errors: ObservationErrors
+    errors: FrameErrors
     m: FloatArray
     prediction: Prediction
 
 
-ROUGH = 0.05
-"""Relative tolerance of an estimate about which the geometry is linearised."""
-
-LEARNED = 4
-"""Iterates at which errors are learned beside what is considered, from an estimate without it."""
-
-SETTLED = 0.25
-"""Standard deviations of a modulus within which an estimate is where the geometry is linearised."""
-
-OnStep = Callable[[float, int], None]
-
-
-class CaseEstimation:
-    """The objects that the parts of one personalisation share.
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseEstimate:
+    """The estimate of all unknowns of a case.
 
     Attributes
     ----------
+    result : StudyResult
+    place : Place
+        About which the last estimate is linearised.
     moved : float or None
-        Standard deviations of a modulus, at most, by which the estimate about the last renewed
-        linearisation of the geometry is away from there; None without one.
+        Standard deviations of a modulus, at most, by which the estimate is away from there; None
+        where the geometry was linearised about what was seen alone.
+    unaccounted : tuple of str
+        Why some errors of geometry or law are not in the intervals.
     """
 
-    def __init__(
-        self,
+    result: StudyResult
+    place: Place
+    moved: float | None = None
+    unaccounted: tuple[str, ...] = ()
+
+    @property
+    def errors(self) -> FrameErrors:
+        """Errors beside the unknowns."""
+        return self.place.errors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseProblem:
+    """What is estimated of a case.
+
+    Attributes
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+        With the errors of the pressures of several frames among the unknowns.
+    unknowns : tuple of Prior, (p,)
+        Those that are estimated: those of the closure in its order, then the displacement.
+    prior : Gaussian
+        Of these.
+    transform : Log
+    fitted : FittedFrames
+    stated : CaseClosure
+        Of the valve as the case states it.
+    on_iterate : callable or None
+    """
+
+    case: ValveCase
+    settings: PersonaliseSettings
+    unknowns: tuple[Prior, ...]
+    prior: Gaussian
+    transform: Log
+    fitted: FittedFrames
+    stated: CaseClosure
+    on_iterate: OnIterate | None = None
+
+    @classmethod
+    def of(
+        cls,
         case: ValveCase,
         settings: PersonaliseSettings,
-        store: Path | None,
-        on_step: OnStep | None,
+        store: Path | None = None,
+        on_step: OnStep | None = None,
         on_iterate: OnIterate | None = None,
         model: ClosureModel | None = None,
-    ) -> None:
-        self.case, self.settings = case, with_pressures(case, settings)
-        settings = self.settings
-        self.closed = case.frame(Role.CLOSED)
+    ) -> CaseProblem:
+        """The estimation of a case.
+
+        Parameters
+        ----------
+        case : ValveCase
+        settings : PersonaliseSettings
+        store : Path, optional
+            Where an unstructured mesh and closed states are kept.
+        on_step, on_iterate : callable, optional
+            See `personalise`.
+        model : ClosureModel, optional
+            As `build_model` makes it; one that has closed already need not do so again.
+
+        Raises
+        ------
+        InputError
+            If an unknown is not one of the case's, or error samples meet several fitted frames.
+        """
+        settings = with_pressures(case, settings)
         if case.fitted and case.error_samples is not None:
             raise InputError(
                 f"case {case.name}: error samples and several fitted frames; expected one closed "
@@ -147,302 +218,318 @@ class CaseEstimation:
         if model is None:
             model = build_model(case, settings, store)
             model.on_step = on_step
-        self.on_iterate = on_iterate
         free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]
-        # Those of the closure first, in its order; then the displacement.
         own = [u for u in free if u.name not in REGISTRATION]
-        rigid = [u for u in free if u.name in REGISTRATION]
-        self.unknowns = (*own, *rigid)
-        self.names = tuple(u.name for u in self.unknowns)
-        self.prior = Gaussian.from_variance(
-            np.array([u.mean for u in self.unknowns]),
-            np.array([u.std for u in self.unknowns]) ** 2,
+        unknowns = (*own, *(u for u in free if u.name in REGISTRATION))
+        prior = Gaussian.from_variance(
+            np.array([u.mean for u in unknowns]), np.array([u.std for u in unknowns]) ** 2
         )
-        self.transform = Log(tuple(u.is_positive for u in self.unknowns))
-        start = self.transform.inverse(self.transform.forward(self.prior.mean))
+        transform = Log(tuple(u.is_positive for u in unknowns))
+        # Not the prior's mean, which may differ from where filters start by its last bit.
+        start = transform.inverse(transform.forward(prior.mean))
         several = frames_model(case, settings, model)
-        self._stated = CaseClosure.of(model, several, self.names, start)
-        self._closure = self._stated
-        names = None if several is None else several.frames
-        self.fitted = FittedFrames(case, settings, model.valve, names)
-        self.errors = ObservationErrors(self.fitted, self.registered)
-        self.filter = self._filter(settings.tolerance)
-        self.moved: float | None = None
+        names = tuple(u.name for u in unknowns)
+        stated = CaseClosure.of(model, several, names, start)
+        shown = None if several is None else several.frames
+        fitted = FittedFrames(case, settings, model.valve, shown)
+        return cls(case, settings, unknowns, prior, transform, fitted, stated, on_iterate)
 
-    def _filter(
-        self, tolerance: float, start: tuple[float, ...] | None = None, *, final: bool = True
-    ) -> Filter:
-        """The filter of all unknowns, to a relative tolerance; where it starts, if it iterates.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the unknowns that are estimated, ``(p,)``."""
+        return tuple(u.name for u in self.unknowns)
+
+    @property
+    def start(self) -> FloatArray:
+        """Values ``(p,)`` of the generic valve, at which every estimation begins."""
+        return self.stated.shared.start
+
+    @property
+    def moduli(self) -> list[int]:
+        """Which unknowns are moduli."""
+        return [k for k, u in enumerate(self.unknowns) if u.is_modulus]
+
+    def generic(self) -> Place:
+        """The generic valve, with the errors that are known before it is closed."""
+        prediction = self.stated.shared(self.start)
+        return Place(self.stated, FrameErrors(self.fitted), self.start, prediction)
+
+    def filter(
+        self, tolerance: float, start: FloatArray | None = None, *, final: bool = True
+    ) -> IteratedFilter:
+        """The filter of all unknowns, to a relative tolerance, from ``start (p,)`` if given.
 
         ``final``: something is read from its covariance, which is to be that of the posterior.
         """
         plain = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
         if start is None:
             return plain
-        return replace(plain, start=start, max_learned=LEARNED, second_order=final)
+        return replace(plain, start=tuple(start.tolist()), max_learned=LEARNED, second_order=final)
 
-    def knowledge(self) -> dict[str, float]:
-        """Prior standard deviations, relative of what is positive, but of pressures' errors."""
-        own = {
-            u.name: u.std / (u.mean if u.is_positive else 1.0)
-            for u in self.unknowns
-            if not is_frame_pressure(u.name)
-        }
-        return own | dict.fromkeys(self.errors.modes, 1.0)
-
-    def estimate_all(self) -> StudyResult:
-        """All unknowns, with what is considered about an estimate without it.
-
-        What its errors do depends on the moduli: with a modulus half as large the derivatives are
-        off by a quarter. So all unknowns are estimated without them first, roughly.
-        """
-        if not self.errors.considers:
-            return self.estimate(self.filter, self.errors.observation())
-        began = time.perf_counter()
-        rough = self.estimate(
-            self._filter(max(ROUGH, self.settings.tolerance)), self.errors.rough_observation()
-        )
-        at = self.shared.start if rough.estimate is None else rough.estimate
-        prediction = self.shared(at)
-        if not prediction.converged:
-            self.errors.unconsidered = (prediction.reason,)
-            return rough
-        self.errors.consider(at, prediction.y)
-        place = Place(self._closure, self.errors, at, prediction)
-        if self.errors.samples is not None:
-            # They say what is likely of the geometry; nothing is expected of it.
-            self.errors.sample_geometry(at, prediction.y)
-        elif self.errors.known is not None and self.errors.known.modes:
-            place = self._expected(place)
-        return replace(self._estimate_about(place), seconds=time.perf_counter() - began)
-
-    def _estimate_about(self, place: Place, *, final: bool = True) -> StudyResult:
-        """All unknowns from ``place`` on, where closure and errors are linearised."""
-        tolerance = self.settings.tolerance if final else max(ROUGH, self.settings.tolerance)
-        filter_ = self._filter(tolerance, tuple(place.m.tolist()), final=final)
-        return self.estimate(filter_, self.errors.observation())
-
-    def _expected(self, place: Place) -> Place:
-        """Where estimate and geometry are expected: from now on all is linearised there.
-
-        Steps of Gauss and Newton for parameters and geometry together: the closure is that of a
-        displaced valve, and the prior of the geometry's errors stays about what was seen.
-        """
-        assert self.settings.considered_geometry is not None
-        result = None
-        for _ in range(self.settings.considered_geometry.renewals):
-            before = result or self._estimate_about(place, final=False)
-            found = self._nearer(before, place)
-            if found is place:
-                self.moved = self._step(before, place)
-                break
-            renewed = found if isinstance(found, str) else self._renewed(found)
-            if isinstance(found, str) or isinstance(renewed, str):
-                self._use(place)
-                self.errors.unconsidered += (f"about the geometry that is expected: {renewed}",)
-                break
-            place, result = found, renewed
-            self.moved = self._step(renewed, place)
-            if self.moved < SETTLED:
-                break
-        return place
-
-    def _step(self, result: StudyResult, place: Place) -> float:
-        """Standard deviations of a modulus, at most, from a place to the estimate about it."""
-        assert result.filtered is not None
-        found, z = result.filtered.transformed, self.transform.forward(place.m)
-        moduli = [name.startswith("E_f.") for name in result.filtered.names]
-        return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
-
-    def _renewed(self, place: Place) -> StudyResult | str:
-        """A rough estimate about a place, with its closure and errors, or why there is none."""
-        self._use(place)
-        self.errors.consider(place.m, place.prediction.y)
-        if self.errors.unconsidered:
-            return "; ".join(self.errors.unconsidered)
-        result = self._estimate_about(place, final=False)
-        return f"{result.reason} ({result.detail})" if result.estimate is None else result
-
-    def _nearer(self, result: StudyResult, place: Place) -> Place | str:
-        """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
-
-        On the way from ``place`` to them (`damped_step`); ``place`` itself, if it is as good.
-        """
-        filtered, observation, known = result.filtered, result.observation, place.errors.known
-        posterior = self.joint(result, place.errors)
-        if posterior is None or known is None or observation is None:
-            return result.reason
-        assert filtered is not None
-        assert filtered.prediction is not None
-
-        def improbability(there: Place) -> float:
-            modes = there.errors.displaced_by
-            return posterior.improbability_of(there.m, there.prediction, modes)
-
-        z = filtered.transformed.mean
-        H = filtered.prediction.jacobian * self.transform.derivative(z)
-        end, residual = posterior.stepped(z, observation.y - filtered.prediction.y, H)
-        modes = posterior.expected(residual)
-        begin = self.transform.forward(place.m)
-        was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
-        here = improbability(place)
-        promised = here - posterior.improbability(end, residual - known.offset(modes), modes)
-
-        def trial(share: float) -> tuple[float, Place] | str:
-            there = self._displaced(
-                tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
-                self.transform.inverse(begin + share * (end - begin)),
-                posterior,
-            )
-            return there if isinstance(there, str) else (improbability(there), there)
-
-        found = damped_step(trial, here, promised)
-        if found == "" and promised < SETTLED**2:
-            # To first order a gain is the square of a distance in standard deviations.
-            return place
-        return found or "no step to it makes what was seen more probable"
-
-    def joint(self, result: StudyResult, errors: ObservationErrors) -> JointPosterior | None:
-        """Of the parameters and the geometry, to first order about an estimate made with errors.
-
-        None without an estimate, or where nothing of the geometry is considered.
-        """
-        filtered = result.filtered
-        known = errors.known
-        if filtered is None or filtered.prediction is None or known is None or not known.modes:
-            return None
-        return JointPosterior(
-            to_filter(self.transform, self.prior),
-            self.transform,
-            self.fitted.observation(),
-            errors,
-            filtered.learned,
-        )
-
-    def _displaced(
-        self, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
-    ) -> Place | str:
-        """The valve with a geometry displaced by modes, or why it does not close.
-
-        It is closed at ``m (p,)``, and from there with what fits best to this geometry.
-        """
-        known = posterior.errors.known
-        assert known is not None
-        try:
-            closure = self._stated.displaced(displacement(known.modes, modes), m)
-        except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
-            return str(error)
-        first = closure.shared(m)
-        if not first.converged:
-            return first.reason
-        errors = self.errors.about(closure.registered, modes, self._stated.model)
-        better = posterior.refitted(m, first)
-        again = predict(closure.shared, better)
-        found = [Place(closure, errors, m, first)]
-        if again.converged:
-            found.append(Place(closure, errors, better, again))
-        return min(found, key=lambda one: posterior.improbability_of(one.m, one.prediction, modes))
-
-    def take_as_stated(self) -> None:
-        """From now on with geometry and law as they are stated, known exactly."""
-        self._closure = self._stated
-        self.errors = self.errors.as_stated(self.registered)
-
-    def _use(self, place: Place) -> None:
-        self._closure, self.errors = place.closure, place.errors
-
-    @property
-    def model(self) -> ClosureModel:
-        """The closure of the valve, displaced to the geometry that is expected if there is one."""
-        return self._closure.model
-
-    @property
-    def frames(self) -> FramesModel | None:
-        """All closed frames that are fitted, if they are several."""
-        return self._closure.frames
-
-    def held_out(self) -> dict[str, HeldState]:
-        """The loads of frames that are not fitted, their annulus and tips off as those fitted."""
-        return {
-            frame.name: self._closure.held(held_state(self._stated.model, frame))
-            for frame in self.case.held_out
-        }
-
-    @property
-    def registered(self) -> RegisteredModel:
-        """The same, displaced as a whole before it is seen."""
-        return self._closure.registered
-
-    @property
-    def shared(self) -> SharedStart[ClosedState]:
-        """The same, for many estimations."""
-        return self._closure.shared
-
-    def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
-        """All unknowns."""
-        result = estimate(self.problem(filter_), observation, on_iterate=self.on_iterate)
-        return self._widened(result, observation)
-
-    def problem(self, filter_: Filter) -> Problem:
+    def problem(self, closure: CaseClosure, filter_: Filter) -> Problem:
         """The estimation of all unknowns, without its observation."""
         return Problem(
             self.names,
-            self.shared,
+            closure.shared,
             self.prior,
             filter_,
             self.transform,
             self.settings.mechanics.tissue,
         )
 
+    def estimate(self, place: Place, filter_: Filter, observation: Observed) -> StudyResult:
+        """All unknowns by one run of a filter, with the closure and the errors of a place."""
+        result = estimate(
+            self.problem(place.closure, filter_), observation, on_iterate=self.on_iterate
+        )
+        return self._widened(result, observation, place.errors)
+
     def estimate_moduli(
-        self, filter_: Filter, observation: Observed, *, log: bool, variance: float | None = None
+        self,
+        place: Place,
+        filter_: Filter,
+        observation: Observed,
+        *,
+        log: bool,
+        variance: float | None = None,
     ) -> StudyResult:
         """The moduli alone, everything else at its prior mean, and no tissue that stiffens."""
-        moduli = np.array([k for k, u in enumerate(self.unknowns) if u.is_modulus])
+        moduli, shared = np.array(self.moduli), place.closure.shared
         stiffens = [u.name.startswith("stiffening.") for u in self.unknowns]
-        known = np.where(stiffens, 0.0, self.shared.start)
+        known = np.where(stiffens, 0.0, shared.start)
         prior = Gaussian(self.prior.mean[moduli], self.prior.covariance[np.ix_(moduli, moduli)])
         if variance is not None:
             prior = Gaussian.from_variance(prior.mean, variance)
         problem = Problem(
             tuple(self.names[k] for k in moduli),
-            of_some(self.shared, known, moduli, snap=1e-14),
+            of_some(shared, known, moduli, snap=1e-14),
             prior,
             filter_,
             Log() if log else Log((False,) * len(moduli)),
             self.settings.mechanics.tissue,
         )
         result = estimate(problem, observation, on_iterate=self.on_iterate)
-        return self._widened(result, observation)
+        return self._widened(result, observation, place.errors)
 
-    def estimate_as_paper(self, paper: PaperSettings) -> StudyResult:
+    def estimate_as_paper(self, place: Place, paper: PaperSettings) -> StudyResult:
         """The moduli alone, with the paper's filter and its independent R."""
         filter_ = PaperFilter(paper.Q, max_iterations=paper.max_iterations)
         observation = self.fitted.as_in_paper(paper)
-        return self.estimate_moduli(filter_, observation, log=False, variance=paper.P0)
+        return self.estimate_moduli(place, filter_, observation, log=False, variance=paper.P0)
 
-    def _widened(self, result: StudyResult, observation: Observed) -> StudyResult:
+    def _widened(
+        self, result: StudyResult, observation: Observed, errors: FrameErrors
+    ) -> StudyResult:
         """The result with the covariance that the error samples give it, if there are any."""
         filtered = result.filtered
-        weighed = self.errors.samples is not None and isinstance(observation, WeighedObservation)
+        weighed = errors.samples is not None and isinstance(observation, WeighedObservation)
         if not weighed or filtered is None or filtered.prediction is None:
             return result
         covariances = np.array(filtered.transformed_iterate_covariances)
-        covariances[-1] = self.sampled_posterior(filtered).covariance
+        covariances[-1] = sampled_posterior(filtered, errors).covariance
         widened = replace(filtered, transformed_iterate_covariances=covariances)
         return replace(result, filtered=widened)
 
-    def sampled_posterior(self, filtered: Estimate) -> SampledPosterior:
-        """Covariance of an estimate in filter coordinates, from the error samples."""
-        samples = self.errors.samples
-        assert samples is not None
-        assert filtered.prediction is not None
-        z = filtered.transformed_iterates[-1]
-        H = filtered.prediction.jacobian * filtered.transform.derivative(z)
-        prior = to_filter(filtered.transform, filtered.prior)
-        learned = filtered.learned
-        if learned is None:
-            return samples.posterior(H, prior.covariance, filtered.curvature)
-        errors = self.errors.weighing(samples, learned)
-        posterior = errors.posterior(H, prior.covariance, filtered.curvature)
-        return replace(posterior, covariance=posterior.covariance + learned.covariance)
+
+def sampled_posterior(filtered: Estimate, errors: FrameErrors) -> SampledPosterior:
+    """Covariance of an estimate in filter coordinates, from the error samples."""
+    samples, learned = errors.samples, filtered.learned
+    assert samples is not None
+    prior = to_filter(filtered.transform, filtered.prior)
+    H = slopes(filtered)
+    if learned is None:
+        return samples.posterior(H, prior.covariance, filtered.curvature)
+    posterior = errors.weighing(samples, learned).posterior(H, prior.covariance, filtered.curvature)
+    return replace(posterior, covariance=posterior.covariance + learned.covariance)
+
+
+def slopes(filtered: Estimate) -> FloatArray:
+    """Derivatives ``(k, p)`` of the observation at an estimate, in filter coordinates."""
+    assert filtered.prediction is not None
+    z = filtered.transformed_iterates[-1]
+    return np.asarray(filtered.prediction.jacobian * filtered.transform.derivative(z))
+
+
+def estimate_all(problem: CaseProblem, generic: Place) -> CaseEstimate:
+    """All unknowns, with the errors of geometry and law about an estimate without them.
+
+    What these errors do depends on the moduli: with a modulus half as large the derivatives are off
+    by a quarter. So all unknowns are estimated without them first, roughly.
+
+    Parameters
+    ----------
+    problem : CaseProblem
+    generic : Place
+        With what error samples do, if the case has any.
+    """
+    settings = problem.settings
+    if settings.considered_geometry is None and not settings.considered_law:
+        plain = problem.filter(settings.tolerance)
+        result = problem.estimate(generic, plain, generic.errors.observation())
+        return CaseEstimate(result, generic)
+    began = time.perf_counter()
+    rough = problem.estimate(
+        generic,
+        problem.filter(max(ROUGH, settings.tolerance)),
+        generic.errors.rough_observation(),
+    )
+    at = problem.start if rough.estimate is None else rough.estimate
+    prediction = generic.closure.shared(at)
+    if not prediction.converged:
+        return CaseEstimate(rough, generic, unaccounted=(prediction.reason,))
+    place = linearised(
+        replace(generic, errors=FrameErrors(problem.fitted), m=at, prediction=prediction), problem
+    )
+    moved, unaccounted = None, place.errors.unaccounted
+    if problem.case.error_samples is not None:
+        # They say what is likely of the geometry; nothing is expected of it.
+        place = sampled(place)
+    elif place.errors.geometry:
+        place, moved, more = _expected(problem, place)
+        unaccounted = place.errors.unaccounted + more
+    result = _estimate_about(problem, place)
+    result = replace(result, seconds=time.perf_counter() - began)
+    return CaseEstimate(result, place, moved, unaccounted)
+
+
+def linearised(place: Place, problem: CaseProblem) -> Place:
+    """A place with its errors of geometry and law."""
+    seen = problem.stated.model if place.errors.displaced_by else None
+    errors = linearise(place.errors, place.closure.registered, place.m, place.prediction.y, seen)
+    return replace(place, errors=errors)
+
+
+def sampled(place: Place) -> Place:
+    """A place with what the error samples of its case do."""
+    errors = with_samples(place.errors, place.closure.registered, place.m, place.prediction.y)
+    return replace(place, errors=errors)
+
+
+def _estimate_about(problem: CaseProblem, place: Place, *, final: bool = True) -> StudyResult:
+    """All unknowns from ``place`` on, where closure and errors are linearised."""
+    tolerance = problem.settings.tolerance
+    filter_ = problem.filter(tolerance if final else max(ROUGH, tolerance), place.m, final=final)
+    return problem.estimate(place, filter_, place.errors.observation())
+
+
+def _expected(problem: CaseProblem, place: Place) -> tuple[Place, float | None, tuple[str, ...]]:
+    """Where estimate and geometry are expected, how far the estimate is from there, and doubts.
+
+    Steps of Gauss and Newton for parameters and geometry together: the closure is that of a
+    displaced valve, and the prior of the geometry's errors stays about what was seen.
+    """
+    considered = problem.settings.considered_geometry
+    assert considered is not None
+    result, moved = None, None
+    for _ in range(considered.renewals):
+        before = result or _estimate_about(problem, place, final=False)
+        found = _nearer(problem, before, place)
+        if found is place:
+            return place, _step(problem, before, place), ()
+        renewed = found if isinstance(found, str) else _renewed(problem, found)
+        if isinstance(renewed, str):
+            return place, moved, (f"about the geometry that is expected: {renewed}",)
+        place, result = renewed
+        moved = _step(problem, result, place)
+        if moved < SETTLED:
+            break
+    return place, moved, ()
+
+
+def _step(problem: CaseProblem, result: StudyResult, place: Place) -> float:
+    """Standard deviations of a modulus, at most, from a place to the estimate about it."""
+    assert result.filtered is not None
+    found, z = result.filtered.transformed, problem.transform.forward(place.m)
+    moduli = problem.moduli
+    return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
+
+
+def _renewed(problem: CaseProblem, place: Place) -> tuple[Place, StudyResult] | str:
+    """A place with its errors and a rough estimate about it, or why there is none."""
+    place = linearised(place, problem)
+    if place.errors.unaccounted:
+        return "; ".join(place.errors.unaccounted)
+    result = _estimate_about(problem, place, final=False)
+    return f"{result.reason} ({result.detail})" if result.estimate is None else (place, result)
+
+
+def _nearer(problem: CaseProblem, result: StudyResult, place: Place) -> Place | str:
+    """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
+
+    On the way from ``place`` to them (`damped_step`); ``place`` itself, if it is as good.
+    """
+    filtered, observation = result.filtered, result.observation
+    posterior = joint(problem, result, place.errors)
+    if posterior is None or observation is None:
+        return result.reason
+    assert filtered is not None
+    assert filtered.prediction is not None
+
+    def improbability(there: Place) -> float:
+        return posterior.improbability_of(there.m, there.prediction, there.errors.displaced_by)
+
+    z = filtered.transformed.mean
+    H = filtered.prediction.jacobian * problem.transform.derivative(z)
+    end, residual = posterior.stepped(z, observation.y - filtered.prediction.y, H)
+    modes = posterior.expected(residual)
+    begin = problem.transform.forward(place.m)
+    was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
+    here = improbability(place)
+    offset = place.errors.offset(modes)
+    promised = here - posterior.improbability(end, residual - offset, modes)
+
+    def trial(share: float) -> tuple[float, Place] | str:
+        there = _displaced(
+            problem,
+            tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
+            problem.transform.inverse(begin + share * (end - begin)),
+            posterior,
+        )
+        return there if isinstance(there, str) else (improbability(there), there)
+
+    found = damped_step(trial, here, promised)
+    if found == "" and promised < SETTLED**2:
+        # To first order a gain is the square of a distance in standard deviations.
+        return place
+    return found or "no step to it makes what was seen more probable"
+
+
+def joint(problem: CaseProblem, result: StudyResult, errors: FrameErrors) -> JointPosterior | None:
+    """Of the parameters and the geometry, to first order about an estimate made with errors.
+
+    None without an estimate, or where nothing of the geometry is in doubt.
+    """
+    filtered = result.filtered
+    if filtered is None or filtered.prediction is None or not errors.geometry:
+        return None
+    return JointPosterior(
+        to_filter(problem.transform, problem.prior),
+        problem.transform,
+        problem.fitted.observation(),
+        errors,
+        filtered.learned,
+    )
+
+
+def _displaced(
+    problem: CaseProblem, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
+) -> Place | str:
+    """The valve with a geometry displaced by modes, or why it does not close.
+
+    It is closed at ``m (p,)``, and from there with what fits best to this geometry.
+    """
+    kinds = [source.modes for source in posterior.errors.geometry if source.modes is not None]
+    try:
+        closure = problem.stated.displaced(displacement(kinds, modes), m)
+    except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
+        return str(error)
+    first = closure.shared(m)
+    if not first.converged:
+        return first.reason
+    errors = posterior.errors.displaced(modes)
+    better = posterior.refitted(m, first)
+    again = predict(closure.shared, better)
+    found = [Place(closure, errors, m, first)]
+    if again.converged:
+        found.append(Place(closure, errors, better, again))
+    return min(found, key=lambda one: posterior.improbability_of(one.m, one.prediction, modes))

@@ -14,7 +14,7 @@ from mvest.estimation.information.consistency import moran
 from mvest.estimation.transform import to_filter
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
-from mvest.personalisation.geometry_errors import WeighedObservation
+from mvest.personalisation.errors import WeighedObservation
 from mvest.personalisation.result import Personalised
 from mvest.problem.problem import Observed
 from mvest.problem.verdict import APPROXIMATION, Held, Indications
@@ -38,14 +38,17 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
     result, closed = fit.result, fit.case.frame(Role.CLOSED)
     found = doubts(fit.case)
     mistakes = tuple(str(doubt) for doubt in found if doubt.mistake)
-    doubtful = tuple(str(doubt) for doubt in found if not doubt.mistake) + tuple(
-        f"what is not known of geometry or law is not in the intervals: {reason}"
-        for reason in fit.unconsidered
-    )
+    doubtful = tuple(str(doubt) for doubt in found if not doubt.mistake)
     filtered = result.filtered
     if filtered is None or result.estimate is None:
         ended = f"{result.reason} ({result.detail})" if result.detail else result.reason
-        return Indications(estimated=False, ended=ended, mistakes=mistakes, doubts=doubtful)
+        return Indications(
+            estimated=False,
+            ended=ended,
+            mistakes=mistakes,
+            doubts=doubtful,
+            unaccounted=fit.unaccounted,
+        )
     prior, after = to_filter(filtered.transform, filtered.prior), filtered.transformed
     moved = dict(zip(filtered.names, ((after.mean - prior.mean) / prior.std).tolist(), strict=True))
     if filtered.learned is not None:
@@ -54,10 +57,7 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
             f"{q.name} of the errors": q.stretch if q.name == LENGTH else max(q.stretch, 0.0)
             for q in filtered.learned.quantities
         }
-    moved |= {f"{own.name} of the valve": own.stretch for own in fit.expected_geometry}
-    ratio = after.std / prior.std
-    by_frame = {one.frame: one for one in fit.distances}
-    shown = [one for one in fit.distances if one.seen] if closed.name in by_frame else []
+    moved |= {f"{own.name} of the valve": own.stretch for own in fit.known.geometry}
     innovation = filtered.innovation
     return Indications(
         estimated=True,
@@ -72,17 +72,10 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
             innovation.nis_band[1] / innovation.size,
         ),
         stretch=moved,
-        narrowing={
-            name: float(ratio[k])
-            for k, name in enumerate(filtered.names)
-            if name.startswith("E_f.")
-        },
+        data_alone={one.parameter: one.prior_stds for one in fit.known.data_alone},
         alike=None
         if innovation is None or result.observation is None
         else _alike(result.observation, innovation.standardised),
-        # Of all that were fitted, which have one displacement in common.
-        residual_mm=_mean([one.personalised for one in shown]),
-        generic_mm=_mean([one.registered for one in shown]),
         held_out=tuple(
             Held(
                 one.frame,
@@ -99,7 +92,8 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         again=None if fit.confirmed_mm is None else fit.confirmed_mm <= SAME_MM,
         gate=gate,
         moved=fit.moved,
-        law=fit.law_share,
+        law=fit.known.law_share,
+        unaccounted=fit.unaccounted,
         mistakes=mistakes,
         doubts=doubtful,
     )
@@ -110,11 +104,6 @@ def _approximation(check: ApproximationCheck | None) -> str | None:
     if check is None:
         return None
     return "" if check.value <= APPROXIMATION * check.limit else check.sentence
-
-
-def _mean(distances: list[FloatArray]) -> float | None:
-    """Mean distance over frames, None without any."""
-    return float(np.mean([np.nanmean(one) for one in distances])) if distances else None
 
 
 def _alike(observation: Observed, standardised: FloatArray) -> float | None:

@@ -15,7 +15,7 @@ from mvest.estimation.noise import ObservationNoise, low_rank_noise
 from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
-from mvest.personalisation.observation_errors import ObservationErrors
+from mvest.personalisation.errors import FrameErrors
 from mvest.problem.problem import Observed
 from mvest.typing import FloatArray
 
@@ -39,7 +39,7 @@ class JointPosterior:
     transform : Transform
     observation : Observed
         As it was seen.
-    errors : ObservationErrors
+    errors : FrameErrors
         With what the geometry does.
     learned : LearnedNoise or None
         By which they are known; None: as they are stated.
@@ -48,15 +48,14 @@ class JointPosterior:
     prior: Gaussian
     transform: Transform
     observation: Observed
-    errors: ObservationErrors
+    errors: FrameErrors
     learned: LearnedNoise | None
 
     @cached_property
     def noise(self) -> ObservationNoise:
         """Of the observation of a valve with a known geometry."""
-        assert self.errors.known is not None
-        kinds = [own.name for own in self.errors.known.modes]
-        return self.errors.noise(self.learned, without=kinds)
+        geometry = [source.name for source in self.errors.geometry]
+        return self.errors.noise(self.learned, without=geometry)
 
     @cached_property
     def marginal(self) -> ObservationNoise:
@@ -66,9 +65,8 @@ class JointPosterior:
     @cached_property
     def _sized(self) -> tuple[FloatArray, ...]:
         """The observation by modes of unit variance, of each kind ``(k, q)``."""
-        assert self.errors.known is not None
-        sizes = self.errors.sizes(self.learned)
-        return tuple(s * rows for s, rows in zip(sizes, self.errors.known.rows, strict=True))
+        sizes = self.errors.geometry_sizes(self.learned)
+        return tuple(s * own.rows for s, own in zip(sizes, self.errors.geometry, strict=True))
 
     def expected(self, residual: FloatArray) -> tuple[FloatArray, ...]:
         """Most probable modes ``(q,)`` of each kind, where the parameters are as estimated.
@@ -81,7 +79,7 @@ class JointPosterior:
         white = self.marginal.whiten(residual)
         return tuple(
             s * (self.marginal.whiten(rows).T @ white)
-            for s, rows in zip(self.errors.sizes(self.learned), self._sized, strict=True)
+            for s, rows in zip(self.errors.geometry_sizes(self.learned), self._sized, strict=True)
         )
 
     def improbability(
@@ -100,7 +98,7 @@ class JointPosterior:
         """
         moved, white = z - self.prior.mean, self.noise.whiten(residual)
         own = moved @ np.linalg.solve(self.prior.covariance, moved)
-        sizes = self.errors.sizes(self.learned) if modes else ()
+        sizes = self.errors.geometry_sizes(self.learned) if modes else ()
         beside = sum(np.sum((q / s) ** 2) for q, s in zip(modes, sizes, strict=True))
         return float(own + white @ white + beside)
 

@@ -9,16 +9,19 @@ name           columns of a row
 about          (one row) description, source, licence, sha256, regions, derived, implausible,
                std_mm and correlation_length_mm of an observed coordinate, confirmed_mm (largest
                distance of the fitted closed valve from the one closed anew), law_share (how far
-               the tissue is expected to be on its way from the linear law to an exponential one)
+               the tissue is expected to be on its way from the linear law to an exponential one),
+               error_samples (how many entered)
 settings       setting, value
 check          (one row) compared, value, limit: `mvest.estimation.check.ApproximationCheck`
 errors         name, unit (empty: a factor), believed, believed_low, believed_high, learned, low,
                high, stretch: what was learned of the errors of the closed frame
 geometry       name, unit, size, stretch: `mvest.personalisation.result.GeometryShift`
 whiteness      name, statistic, p_value: tests of the standardised innovation
-narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
-image_errors   parameter, samples, share_of_variance (None: they did not enter)
-budget         part, modulus, without, alone: `mvest.personalisation.error_budget.BudgetRow`
+known          name, unit, estimate, low, high, generic: what follows from the estimate
+               (`mvest.personalisation.known.Quantity`)
+data_alone     parameter, estimate, low, high, prior_stds: moduli without their priors
+shares         source, parameter, share: where the variance of a modulus' logarithm comes from
+narrower       what, parameter, std_now, std_then: SD of the logarithm of a modulus
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
 seconds        part, seconds: wall-clock time
@@ -28,7 +31,7 @@ image_step     with image_frames and pictures: `mvest.cases.from_images.detected
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
@@ -166,11 +169,17 @@ def _details(fit: Personalised) -> Iterator[tuple[str, Iterator[Row]]]:
         row = {"compared": check.compared, "value": finite(check.value), "limit": check.limit}
         yield "check", iter([row])
     yield "errors", _errors(fit.result)
-    yield "geometry", (_fields(own) for own in fit.expected_geometry)
     yield "whiteness", _whiteness(fit)
-    yield "narrower", _narrower(fit)
-    yield "image_errors", _image_errors(fit)
-    yield "budget", (_fields(row) | {"part": label_of(row.part)} for row in fit.budget)
+    known = fit.known
+    rows: dict[str, Sequence[Any]] = {
+        "geometry": known.geometry,
+        "known": known.quantities,
+        "data_alone": known.data_alone,
+        "narrower": known.narrower,
+    }
+    for name, own in rows.items():
+        yield name, map(_fields, own)
+    yield "shares", (_fields(row) | {"source": label_of(row.source)} for row in known.shares)
     yield "measurements", _measurements(fit)
     yield "seconds", ({"part": part, "seconds": s} for part, s in fit.seconds.items())
 
@@ -188,7 +197,8 @@ def _about(fit: Personalised) -> Row:
         "std_mm": case.uncertainty.typical_mm,
         "correlation_length_mm": case.uncertainty.correlation_length_mm,
         "confirmed_mm": fit.confirmed_mm,
-        "law_share": fit.law_share,
+        "law_share": fit.known.law_share,
+        "error_samples": fit.error_samples,
     }
 
 
@@ -252,37 +262,6 @@ def _adjacency(n: int, triangles: IntArray) -> sparse.csr_array:
     a, b = surface_edges(triangles).T
     rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
     return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-
-
-def _moduli(fit: Personalised) -> list[str]:
-    return [name for name in fit.names if name.startswith("E_f.")]
-
-
-def _narrower(fit: Personalised) -> Iterator[Row]:
-    """The SD of each modulus if something more were known."""
-    for what, values in fit.narrower.items():
-        if what == "now":
-            continue
-        for k, name in enumerate(_moduli(fit)):
-            yield {
-                "what": f"{label_of(name)}, {what}",
-                "parameter": name,
-                "std_now": float(fit.narrower["now"][k]),
-                "std_if_known": float(values[k]),
-            }
-
-
-def _image_errors(fit: Personalised) -> Iterator[Row]:
-    """What errors of the frames that the model was built from do to the estimate."""
-    if fit.geometry is None:
-        return
-    share = fit.image_share
-    for k, name in enumerate(_moduli(fit)):
-        yield {
-            "parameter": name,
-            "samples": len(fit.geometry),
-            "share_of_variance": None if share is None else float(share[k]),
-        }
 
 
 def _measurements(fit: Personalised) -> Iterator[Row]:

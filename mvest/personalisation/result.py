@@ -1,9 +1,9 @@
-"""What is found out about a case, and what its estimate says of the marginalised parts."""
+"""What is found out about a case, and what its estimate expects of geometry and law."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,12 +11,11 @@ from mvest.cases.case import ValveCase
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
-from mvest.personalisation.considered_geometry import displacement
-from mvest.personalisation.considered_law import LAW
-from mvest.personalisation.error_budget import BudgetRow
-from mvest.personalisation.estimation import CaseEstimation
-from mvest.personalisation.geometry_errors import GeometryErrors
+from mvest.personalisation.estimation import CaseEstimate, CaseProblem, joint, slopes
+from mvest.personalisation.geometry import displacement
+from mvest.personalisation.known import DataAlone, Narrower, Quantity, VarianceShare
 from mvest.personalisation.settings import PersonaliseSettings
+from mvest.personalisation.sources import LAW
 from mvest.problem.estimate import StudyResult
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
@@ -53,48 +52,50 @@ class GeometryShift:
     stretch: float
 
 
-def geometry_shifts(estimation: CaseEstimation, result: StudyResult) -> tuple[GeometryShift, ...]:
+def geometry_shifts(problem: CaseProblem, estimate: CaseEstimate) -> tuple[GeometryShift, ...]:
     """What the estimate expects of each kind of the geometry, to first order about it.
 
-    Empty where nothing of the geometry was considered, or samples of its errors say what it is.
+    Empty where nothing of the geometry is in doubt, or samples of its errors say what it is.
     """
-    posterior, filtered = estimation.joint(result, estimation.errors), result.filtered
-    if posterior is None or estimation.errors.samples is not None:
+    errors, result = estimate.errors, estimate.result
+    posterior, filtered = joint(problem, result, errors), result.filtered
+    if posterior is None or errors.samples is not None:
         return ()
     assert filtered is not None
     assert filtered.prediction is not None
     assert result.observation is not None
-    assert posterior.errors.known is not None
     expected = posterior.expected(result.observation.y - filtered.prediction.y)
-    scales = posterior.errors.sizes(filtered.learned)
+    scales = errors.geometry_sizes(filtered.learned)
     shifts = []
-    for own, modes, scale in zip(posterior.errors.known.modes, expected, scales, strict=True):
+    for source, modes, scale in zip(errors.geometry, expected, scales, strict=True):
+        assert source.modes is not None
         # What else follows, as rest lengths do where tips are elsewhere, is not told.
-        part = next(iter(own.parts))
-        moved = displacement((own,), (modes,))[part]
+        part = next(iter(source.modes.parts))
+        moved = displacement((source.modes,), (modes,))[part]
         unit, factor = _UNITS[part]
         square = np.sum(moved**2, axis=-1) if moved.ndim > 1 else moved**2
         size = factor * float(np.sqrt(np.mean(square)))
-        shifts.append(GeometryShift(own.name, unit, size, float(np.max(np.abs(modes)) / scale)))
+        shifts.append(GeometryShift(source.name, unit, size, float(np.max(np.abs(modes)) / scale)))
     return tuple(shifts)
 
 
-def law_share(estimation: CaseEstimation, result: StudyResult) -> float | None:
-    """How far all tissue is on its way from the linear law to the other that is considered.
+def law_share(estimate: CaseEstimate) -> float | None:
+    """How far all tissue is on its way from the linear law to the other that may be right.
 
     Where what was seen is most probable, to first order about the estimate. It rests on the same
-    errors and priors as the estimate. None where no law was considered, or there is no estimate.
+    errors and priors as the estimate. None where no other law was given, or there is no estimate.
     """
-    errors, filtered = estimation.errors, result.filtered
-    columns = [own.columns for own in errors.considered if own.name == LAW]
-    if not columns or filtered is None or filtered.prediction is None:
+    errors, result = estimate.errors, estimate.result
+    filtered = result.filtered
+    rows = [source.rows for source in errors.sources if source.name == LAW]
+    if not rows or filtered is None or filtered.prediction is None:
         return None
     assert result.observation is not None
-    way, samples = columns[0].sum(axis=1), errors.samples
+    way, samples = rows[0].sum(axis=1), errors.samples
     beside = None if samples is None else samples.columns
     noise = errors.noise(filtered.learned, without=(LAW,), beside=beside)
     prior, z = to_filter(filtered.transform, filtered.prior), filtered.transformed.mean
-    H = filtered.prediction.jacobian * filtered.transform.derivative(z)
+    H = slopes(filtered)
     innovation = result.observation.y - filtered.prediction.y + H @ (z - prior.mean)
 
     def misfit(e: FloatArray) -> float:
@@ -103,6 +104,34 @@ def law_share(estimation: CaseEstimation, result: StudyResult) -> float | None:
     whole = misfit(way)
     # A parabola through its values with either law.
     return 0.5 + 0.5 * (misfit(innovation) - misfit(innovation - way)) / whole if whole else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """What an estimate knows beside its unknowns, and what limits it; empty without an estimate.
+
+    Attributes
+    ----------
+    quantities : tuple of Quantity
+        Ratio of the moduli, moduli for the stated pressure, strains.
+    data_alone : tuple of DataAlone
+        Moduli without their priors.
+    shares : tuple of VarianceShare
+        Where the variance of each modulus comes from.
+    narrower : tuple of Narrower
+        What may be measured besides, and what it gains.
+    geometry : tuple of GeometryShift
+        By how much the geometry is expected to differ from what was seen.
+    law_share : float or None
+        How far the tissue is expected to be on its way from the linear law to another.
+    """
+
+    quantities: tuple[Quantity, ...] = ()
+    data_alone: tuple[DataAlone, ...] = ()
+    shares: tuple[VarianceShare, ...] = ()
+    narrower: tuple[Narrower, ...] = ()
+    geometry: tuple[GeometryShift, ...] = ()
+    law_share: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +156,7 @@ class FrameDistance:
     personalised: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Personalised:
     """All that is found out about a case.
 
@@ -149,29 +178,19 @@ class Personalised:
         Empty if there is no estimate.
     generic, registered, fitted : mapping of str to (n, 3) mm
         Frame -> predicted vertices; fitted as they are seen.
-    narrower : mapping of str to (q,)
-        What if something were known: standard deviation of the logarithm of each modulus, under
-        ``now``, ``pressure measured to ±2.4 mmHg``, ``4 beats averaged`` and so on.
     confirmed_mm : float or None
         Largest distance of the fitted closed valve from the one closed anew.
     seconds : mapping of str to float
         Wall-clock time of each part.
-    geometry : GeometryErrors or None
-        What the case's error samples do to the prediction; None if it has none.
-    image_share : (q,) or None
-        Share of the variance of the logarithm of each modulus that these account for; None where
-        they did not enter.
-    unconsidered : tuple of str
-        Why what is to be considered of geometry and law was not.
-    budget : tuple of BudgetRow
-        What each part of what is not known costs the moduli, where error samples are given.
+    known : Known
+        What follows from the estimate, and what limits it.
+    error_samples : int
+        How many error samples of the frames entered.
+    unaccounted : tuple of str
+        Why some errors of geometry or law are not in the intervals.
     moved : float or None
         Standard deviations of a modulus, at most, by which the estimate is away from where geometry
         and moduli were linearised anew for the last time; None where they were not.
-    expected_geometry : tuple of GeometryShift
-        By how much the geometry is expected to differ from what was seen.
-    law_share : float or None
-        How far the tissue is expected to be on its way from the linear law to another.
     """
 
     case: ValveCase
@@ -186,16 +205,12 @@ class Personalised:
     generic: Mapping[str, FloatArray]
     registered: Mapping[str, FloatArray]
     fitted: Mapping[str, FloatArray]
-    narrower: Mapping[str, FloatArray]
     confirmed_mm: float | None
     seconds: Mapping[str, float]
-    geometry: GeometryErrors | None = None
-    image_share: FloatArray | None = None
-    unconsidered: tuple[str, ...] = ()
-    budget: tuple[BudgetRow, ...] = ()
+    known: Known = field(default_factory=Known)
+    error_samples: int = 0
+    unaccounted: tuple[str, ...] = ()
     moved: float | None = None
-    expected_geometry: tuple[GeometryShift, ...] = ()
-    law_share: float | None = None
 
     def __str__(self) -> str:
         distances = [

@@ -2,11 +2,17 @@
 
 That a filter has converged says that its iterations have ended. Whether moduli follow from what was
 seen is another question, and none of its answers need the truth: what is left over by the fit has
-the size and the looks of noise, nothing known beforehand had to be stretched, the fitted valve does
-what the observed one does, and the data have moved what was believed. Each is a `Ground` with its
-number and its limit. Limits are choices. Some were set anew on simulated valves (seeds above 9000)
-in worlds that are not as the estimator assumes, where right estimates failed them; calibration on
-other valves says what they are worth.
+the size and the looks of noise, nothing known beforehand had to be stretched, and the fitted valve
+does what the observed one does. Each answer that speaks against an estimate is a `Ground` with its
+number and its limit. One doubtful ground makes an estimate doubtful. Two doubtful grounds, or one
+grave one, leave no estimate to believe.
+
+Which grounds there are, and how many are too many, was set on the even seeds of fifteen simulated
+ways in which a model may be wrong (300 moduli) and judged on the odd ones (298): intervals missed
+the truth in 1 of 164, 2 of 72 and 13 of 62, median errors were 0.11, 0.13 and 0.20 of a logarithm,
+and the area under the curve for a missed interval was 0.85. Two grounds told nothing and are gone:
+how far the fitted valve is from the closed frame (36 moduli, no interval missed), and how much the
+data narrow the prior (28, none).
 """
 
 from __future__ import annotations
@@ -106,13 +112,10 @@ class Indications:
         Where 95 % of such numbers lie.
     stretch : mapping
         What was known beforehand -> by how many of its standard deviations it was moved.
-    narrowing : mapping
-        Modulus -> standard deviation of its logarithm after over before.
+    data_alone : mapping
+        Modulus -> where the data alone have it, in the prior's standard deviations from its mean.
     alike : float or None
         Correlation of what is left over at neighbouring points, standardised (Moran's I).
-    residual_mm, generic_mm : float or None
-        Mean distance of the closed frame from the fitted valve, and from the generic one laid
-        rigidly on it.
     held_out : tuple of Held
     orifice_mm2, observed_orifice_mm2 : float or None
         Free in the line of sight, of the fitted valve and of the observed one.
@@ -127,6 +130,8 @@ class Indications:
         How far the tissue is expected to be on its way from the linear law to an exponential one.
     doubts, mistakes : tuple of str
         About the case itself, see `mvest.cases.plausibility`.
+    unaccounted : tuple of str
+        Why some errors of geometry or law are not in the intervals.
     unlike : str
         How the volume that the case is from is unlike those that detectors were trained on; empty
         where it is not, or where there is no volume.
@@ -139,10 +144,8 @@ class Indications:
     nis: float | None = None
     nis_band: tuple[float, float] | None = None
     stretch: Mapping[str, float] = field(default_factory=dict)
-    narrowing: Mapping[str, float] = field(default_factory=dict)
+    data_alone: Mapping[str, float] = field(default_factory=dict)
     alike: float | None = None
-    residual_mm: float | None = None
-    generic_mm: float | None = None
     held_out: tuple[Held, ...] = ()
     orifice_mm2: float | None = None
     observed_orifice_mm2: float | None = None
@@ -152,6 +155,7 @@ class Indications:
     law: float | None = None
     doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
+    unaccounted: tuple[str, ...] = ()
     unlike: str = ""
 
 
@@ -162,28 +166,22 @@ failed by less."""
 MOVED = 0.5
 """Standard deviations of a modulus by which an estimate may be away from where the geometry was
 linearised last: twice what is taken for the end of such steps."""
-LAW = 0.2
-"""Share of the way to an exponential law beyond which moduli of the linear one are doubtful. Of six
-simulated valves it was 0.23 to 0.96 where the tissue was exponential, and where it was linear at
-most 0.06 but for one with 0.46: moduli make up for much of a law that is not theirs."""
+LAW = (0.2, 0.3)
+"""Share of the way to an exponential law beyond which moduli of the linear one are doubtful, and
+beyond which there are none: moduli make up for much of a law that is not theirs."""
+FAR = 2.0
+"""Standard deviations of the prior beyond which the data alone contradict it."""
 STRETCH = (2.5, 3.5)
 """Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
 ones are), beyond the second it is contradicted (1 in 2000)."""
 NIS_FACTOR = 1.5
 """Beyond its band by this factor the normalised innovation contradicts what is believed of errors:
 after they were learned, nothing but a model that cannot do what was seen takes it there."""
-NARROWING = (0.7, 0.9)
-"""Standard deviation after over before: above the first the estimate is half what was believed
-beforehand (0.7 squared), above the second the data have added next to nothing."""
 ALIKE = 0.25
 """Correlation of whitened residuals at neighbouring points above which there is structure."""
 LEAK = (10.0, 30.0)
 """mm² by which the fitted valve may be more open than the observed one: about the error of such an
 area from a jagged edge, and what no closed valve has."""
-FARTHER = (1.25, 2.0)
-"""Distance of the closed frame, fitted over generic, that is doubtful, and that contradicts. The
-generic valve is laid on the frame freely, and takes smooth errors up with that; the fitted one is
-held by what is believed of its displacement. Where all is as assumed it comes out 1 % farther."""
 WORSE = 1.05
 """Distance of a held-out frame, fitted over generic, that counts as farther."""
 
@@ -194,7 +192,7 @@ minutes; that it was not is no ground against an estimate, and is said."""
 
 
 def judge(seen: Indications) -> Verdict:
-    """The verdict that indications lead to: the worst that any check admits."""
+    """The verdict that indications lead to: one doubtful check is doubtful, two are none."""
     grounds: list[Ground] = []
     passed: list[str] = []
     missing: list[str] = []
@@ -210,7 +208,8 @@ def judge(seen: Indications) -> Verdict:
         if not against:
             passed.append(check)
     grounds.sort(key=lambda ground: -RANK[ground.trust])
-    trust = max((ground.trust for ground in grounds), key=lambda t: RANK[t], default=TRUSTWORTHY)
+    weight = sum({ground.check: RANK[ground.trust] for ground in reversed(grounds)}.values())
+    trust = (TRUSTWORTHY, DOUBTFUL, NONE)[min(weight, 2)]
     return Verdict(trust, tuple(grounds), tuple(passed), tuple(missing))
 
 
@@ -263,14 +262,15 @@ def _linear(e: Indications) -> Seen:
 
 
 def _stiffens(e: Indications) -> Seen:
+    doubtful, grave = LAW
     if e.law is None:
         yield None
-    elif e.law > LAW:
+    elif e.law > doubtful:
         yield Ground(
             "law",
-            DOUBTFUL,
+            NONE if e.law > grave else DOUBTFUL,
             f"what was seen puts the tissue at {e.law:.2f} of the way from the linear law to an "
-            f"exponential one, expected at most {LAW:g}: it probably stiffens",
+            f"exponential one, expected at most {doubtful:g}: it probably stiffens",
             "estimate how far each leaflet stiffens (personal=stiffening); moduli of the linear "
             "law are those of its stretch alone",
         )
@@ -283,6 +283,16 @@ def _plausible(e: Indications) -> Seen:
         yield Ground("case", NONE, e.unlike, "record another volume, or segment it by other means")
     for text in e.doubts:
         yield Ground("case", DOUBTFUL, text, "look at this part of the case")
+
+
+def _accounted(e: Indications) -> Seen:
+    for reason in e.unaccounted:
+        yield Ground(
+            "errors left out",
+            DOUBTFUL,
+            f"what is not known of geometry or law is not in the intervals: {reason}",
+            "close the valve with a finer mesh, or state these errors smaller",
+        )
 
 
 def _innovation(e: Indications) -> Seen:
@@ -331,35 +341,19 @@ def _stretched(e: Indications) -> Seen:
             )
 
 
-def _informed(e: Indications) -> Seen:
-    if not e.narrowing:
+def _contradicts(e: Indications) -> Seen:
+    if not e.data_alone:
         yield None
-    half, nothing = NARROWING
-    for modulus, ratio in e.narrowing.items():
-        if ratio > half:
+    for modulus, prior_stds in e.data_alone.items():
+        if abs(prior_stds) > FAR:
             yield Ground(
-                "what the data add",
-                NONE if ratio > nothing else DOUBTFUL,
-                f"the data narrow {modulus} to {100 * ratio:.0f} % of what was believed "
-                f"beforehand, expected at most {100 * half:.0f} %: the estimate is mostly that "
-                "belief",
-                "add closed frames under other pressures, or see what would narrow the interval",
+                "data against prior",
+                DOUBTFUL,
+                f"the data alone have {modulus} {abs(prior_stds):.1f} of its prior's standard "
+                f"deviations from the prior's mean, expected at most {FAR:g}: the estimate lies "
+                "between the two",
+                "see the estimate by the data alone; widen the prior if such a modulus may be",
             )
-
-
-def _fits(e: Indications) -> Seen:
-    if e.residual_mm is None or e.generic_mm is None:
-        yield None
-        return
-    doubtful, contradicted = FARTHER
-    if e.residual_mm > doubtful * e.generic_mm:
-        yield Ground(
-            "distance",
-            NONE if e.residual_mm > contradicted * e.generic_mm else DOUBTFUL,
-            f"the fitted valve is farther from the closed frame ({e.residual_mm:.2f} mm) than the "
-            f"generic one laid rigidly on it ({e.generic_mm:.2f} mm)",
-            "errors or priors contradict the frame: check units, pressure and correspondence",
-        )
 
 
 def _predicts(e: Indications) -> Seen:
@@ -424,11 +418,11 @@ CHECKS = {
     "geometry": _linear,
     "law": _stiffens,
     "case": _plausible,
+    "errors left out": _accounted,
     "size of what is left over": _innovation,
     "pattern of what is left over": _structure,
     "what was known beforehand": _stretched,
-    "what the data add": _informed,
-    "distance": _fits,
+    "data against prior": _contradicts,
     "frames held out": _predicts,
     "closure": _closes,
     "closed anew": _repeated,
@@ -439,7 +433,5 @@ CHECKS = {
 NEEDED = (
     "size of what is left over",
     "what was known beforehand",
-    "what the data add",
-    "distance",
 )
 """Checks without which no estimate is trustworthy."""

@@ -11,7 +11,7 @@ from mvest.cases.folder import read_case
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import CaseMesh, PersonaliseSettings, personalise
-from mvest.personalisation.considered_geometry import ConsideredGeometry
+from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_model
 from mvest.valve.mesh.given import GivenValve
 from tests.made_up_closure import unknowns

@@ -8,8 +8,8 @@ import pytest
 from mvest.cases.case import Role
 from mvest.closure.frames import SCALE
 from mvest.personalisation import PressureErrors, design_case, expect_case
-from mvest.personalisation.considered_geometry import ConsideredGeometry, GeometryModes
 from mvest.personalisation.design import ERRORS_MMHG, HALF, KINDS, StatedErrors, design_text
+from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
 from tests.made_up_closure import FIELDS, PRESSURE, made_up_case, settings, unknowns, use
 
 STATED = PressureErrors(offset_mmHg=4.0, each_mmHg=3.0)
@@ -86,11 +86,9 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
     moved = np.zeros((6, *CASE.surface.vertices.shape, 2))
     moved[1:, ..., 0] = 1.0
     two = GeometryModes("one", {"fibres": np.eye(2)})
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_modes", lambda *_: (two,))
     monkeypatch.setattr(
-        "mvest.personalisation.observation_errors.geometry_modes", lambda *_: (two,)
-    )
-    monkeypatch.setattr(
-        "mvest.personalisation.considered_geometry.RestVariation.joined", lambda modes: modes[0]
+        "mvest.personalisation.sources.RestVariation.joined", lambda modes: modes[0]
     )
 
     class Rest:
@@ -104,7 +102,7 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
             assert len(states) == 4
             return moved.copy()
 
-    monkeypatch.setattr("mvest.personalisation.considered_geometry.RestGeometry", Rest)
+    monkeypatch.setattr("mvest.personalisation.sources.RestGeometry", Rest)
     exact = design_case(CASE, settings(pressures=STATED))
     doubted = design_case(
         CASE, settings(pressures=STATED, considered_geometry=ConsideredGeometry())

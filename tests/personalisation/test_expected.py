@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.estimation.noise_family import ErrorColumns
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.personalisation import personalise
-from mvest.personalisation.considered_geometry import (
-    ConsideredGeometry,
-    GeometryColumns,
-    GeometryModes,
-)
+from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
 from mvest.personalisation.indications import indications_of
-from mvest.problem.verdict import DOUBTFUL, judge
-from tests.made_up_closure import BASE, FIELDS, made_up_case, settings, use
+from mvest.problem.verdict import NONE, judge
+from tests.made_up_closure import BASE, FIELDS, error_source, made_up_case, settings, use
 
 STD = 0.3
 CURVES = dict.fromkeys(("anterior", "posterior"), ExponentialTissue(0.06, 4.325, 1446.5))
@@ -56,8 +51,8 @@ def dense(result):
 def stiffening(monkeypatch):
     use(monkeypatch)
     monkeypatch.setattr(
-        "mvest.personalisation.observation_errors.law_columns",
-        lambda *_: (ErrorColumns("law", OTHER),),
+        "mvest.personalisation.errors.law_sources",
+        lambda *_: (error_source(OTHER),),
     )
 
     def run(share):
@@ -74,17 +69,17 @@ def test_the_law_is_told_from_what_was_seen(stiffening, share):
     e, S = dense(fit.result)
     information = way @ np.linalg.solve(S, way)
     expected = way @ np.linalg.solve(S, e) / information
-    assert fit.law_share == pytest.approx(expected, abs=1e-6)
-    assert fit.law_share == pytest.approx(share, abs=2.5 / np.sqrt(information))
+    assert fit.known.law_share == pytest.approx(expected, abs=1e-6)
+    assert fit.known.law_share == pytest.approx(share, abs=2.5 / np.sqrt(information))
     grounds = {g.check: g.trust for g in judge(indications_of(fit)).grounds}
-    assert grounds.get("law") == (DOUBTFUL if share else None)
+    assert grounds.get("law") == (NONE if share else None)
 
 
 def test_nothing_is_told_of_a_law_that_is_not_considered(monkeypatch):
     use(monkeypatch)
     fit = personalise(made_up_case(STD), settings())
-    assert fit.law_share is None
-    assert fit.expected_geometry == ()
+    assert fit.known.law_share is None
+    assert fit.known.geometry == ()
     assert "law" in judge(indications_of(fit)).missing
 
 
@@ -100,11 +95,8 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
     rows = [0.5 * each.reshape(-1, 1) for each in flat]
     rows = (rows[0], np.hstack(rows[1:3]), np.hstack(rows[3:5]))
 
-    def columns(*_):
-        each = zip(kinds, rows, strict=True)
-        return GeometryColumns(kinds, rows, tuple(ErrorColumns(k.name, r) for k, r in each))
-
-    monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
+    sources = tuple(error_source(own, kind) for kind, own in zip(kinds, rows, strict=True))
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", lambda *_: sources)
     sizes = (2.0, -1.0, 0.5, 0.0, -2.8)
     moved = sum(q * r for q, r in zip(sizes, np.hstack(rows).T, strict=True)).reshape(-1, 3)
     fit = personalise(
@@ -114,7 +106,7 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
     G = np.hstack(rows)
     modes = G.T @ np.linalg.solve(S + G @ G.T, e)
     assert modes == pytest.approx(sizes, abs=0.6)
-    shape, thickness, fibres = fit.expected_geometry
+    shape, thickness, fibres = fit.known.geometry
     assert (shape.name, shape.unit) == ("open shape", "mm")
     assert shape.stretch == pytest.approx(modes[0], abs=0.01)
     assert shape.size == pytest.approx(modes[0] * 0.4 * np.sqrt(2.5), rel=0.01)
@@ -136,4 +128,4 @@ def test_a_geometry_of_which_nothing_is_in_doubt_is_not_told(monkeypatch):
     fit = personalise(
         made_up_case(STD), settings(considered_geometry=ConsideredGeometry(renewals=1))
     )
-    assert fit.expected_geometry == ()
+    assert fit.known.geometry == ()

@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.case import Role, Uncertainty
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation import personalise
-from mvest.personalisation.estimation import CaseEstimation
+from mvest.personalisation.estimation import CaseProblem
 from mvest.personalisation.indications import _alike, indications_of
 from mvest.problem.verdict import NONE, TRUSTWORTHY, judge
 from tests.made_up_closure import PRIORS, made_up_case, settings, use
@@ -37,9 +37,8 @@ def test_a_world_as_stated_is_trusted(fit):
     assert found.result.filtered.check is not None
     assert seen.nis_band[0] <= seen.nis <= seen.nis_band[1]
     assert abs(seen.alike) < 0.1
-    assert seen.residual_mm < seen.generic_mm
     assert [held.frame for held in seen.held_out] == ["late"]
-    assert set(seen.narrowing) == {"E_f.anterior", "E_f.posterior"}
+    assert set(seen.data_alone) == {"E_f.anterior", "E_f.posterior"}
     # Of a factor, estimated by its logarithm: a prior of 1.00 and 10 %.
     k = found.names.index("pressure_scale")
     moved = np.log(found.result.estimate[k]) / np.sqrt(np.log(1.01))
@@ -85,8 +84,8 @@ def test_of_several_surfaces_the_last_is_looked_at(monkeypatch, smooth):
     closed = case.frame(Role.CLOSED)
     early = replace(closed, name="early", role=Role.FITTED, time=closed.time - 0.1)
     frames = sorted((*case.frames, early), key=lambda frame: frame.time)
-    seen = CaseEstimation(
-        replace(case, frames=tuple(frames)), settings(correspondence=False), None, None
+    seen = CaseProblem.of(
+        replace(case, frames=tuple(frames)), settings(correspondence=False)
     ).fitted.observation()
     values = np.random.default_rng(7).standard_normal(len(seen.y))
     first = smooth * seen.sizes[0]

@@ -7,7 +7,6 @@ import numpy as np
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import low_rank_noise, observation_noise
 from mvest.estimation.transform import Log
-from mvest.personalisation.considered_geometry import GeometryColumns, GeometryModes
 from mvest.personalisation.joint import JointPosterior, damped_step
 
 K, Q, SIZE = 40, 6, 4.0
@@ -18,12 +17,11 @@ def test_a_step_of_parameters_and_modes_is_that_of_least_squares():
     rng = np.random.default_rng(3)
     std, rows = 0.5, rng.normal(0.0, 0.1, (K, Q))
     H, beside = rng.normal(0.0, 1.0, (K, 3)), rng.normal(0.0, 0.3, (K, 1))
-    modes = (GeometryModes("open shape", {"shape": np.zeros((Q, 1, 3))}),)
     base = observation_noise(std**2, K)
     errors = SimpleNamespace(
         # Of a low rank as small as can be: the filter may leave out what modes are asked for.
-        known=GeometryColumns(modes, (rows,), ()),
-        sizes=lambda learned: (SIZE,),
+        geometry=(SimpleNamespace(name="open shape", rows=rows),),
+        geometry_sizes=lambda learned: (SIZE,),
         noise=lambda learned, *, without: low_rank_noise(base, beside),
     )
     prior = Gaussian.from_variance(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.5, 0.4]) ** 2)

@@ -8,8 +8,6 @@ import pytest
 from mvest.cases.case import ErrorSamples, Role, Uncertainty
 from mvest.errors import GeometryError, InputError
 from mvest.estimation import Prediction, observation_noise
-from mvest.estimation.noise_family import ErrorColumns
-from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ClosureProtocol, ExponentialTissue
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.learned import ErrorBeliefs
@@ -23,11 +21,11 @@ from mvest.personalisation import (
     build_model,
     personalise,
 )
-from mvest.personalisation.error_budget import EVERYTHING, IMAGES, MOTION
-from mvest.personalisation.estimation import CaseEstimation
+from mvest.personalisation.estimation import CaseProblem, sampled
 from mvest.personalisation.fitted_frames import _thinned
-from mvest.personalisation.geometry_errors import GeometryErrors
+from mvest.personalisation.known import IMAGES
 from mvest.personalisation.model import held_state
+from mvest.personalisation.samples import FrameSamples
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.valve.anatomy.valve import LeafletSurface
 from tests.made_up_closure import (
@@ -38,6 +36,7 @@ from tests.made_up_closure import (
     PRIORS,
     TRUE,
     MadeUpClosure,
+    error_source,
     made_up_case,
     settings,
     unknowns,
@@ -133,8 +132,8 @@ def test_unknowns_may_come_in_any_order(monkeypatch):
 def test_a_closed_frame_is_observed_as_the_case_says(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0)
-    estimation = CaseEstimation(case, settings(), None, None)
-    R = estimation.errors.observation().R
+    estimation = CaseProblem.of(case, settings())
+    R = estimation.generic().errors.observation().R
     # Whitening white noise of the told covariance: R = 0.09 mm² and 8 mm along the leaflets.
     points = case.surface.vertices
     gap = np.linalg.norm(points[0] - points[1])
@@ -144,7 +143,7 @@ def test_a_closed_frame_is_observed_as_the_case_says(monkeypatch):
     assert 0.5 * 0.09 < whole[0, 3] < 0.09
     assert gap < 8.0
     np.testing.assert_array_equal(
-        estimation.errors.observation().positions[0], case.frame(Role.CLOSED).vertices
+        estimation.generic().errors.observation().positions[0], case.frame(Role.CLOSED).vertices
     )
 
 
@@ -162,8 +161,8 @@ def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, corr
     std = np.random.default_rng(3).uniform(0.2, 0.5, n)
     told = replace(case, uncertainty=Uncertainty(std, length))
     wanted = settings(correspondence=correspondence)
-    one = CaseEstimation(case, wanted, None, None).errors.observation()
-    own = CaseEstimation(told, wanted, None, None).errors.observation()
+    one = CaseProblem.of(case, wanted).generic().errors.observation()
+    own = CaseProblem.of(told, wanted).generic().errors.observation()
     if not correspondence:
         # Points that noise may put beyond the border are left out where it is large.
         assert all(len(o.seen[0].points) > 100 for o in (one, own))
@@ -181,9 +180,7 @@ def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, corr
     np.testing.assert_allclose(R[1], scale[:, None] * R[0] * scale, atol=1e-7)
     # The same for all is the one number, whatever it is called.
     alike = replace(case, uncertainty=Uncertainty(np.full(n, 0.3), length))
-    same = observation_noise(
-        CaseEstimation(alike, wanted, None, None).errors.observation().R, 3 * n
-    )
+    same = observation_noise(CaseProblem.of(alike, wanted).generic().errors.observation().R, 3 * n)
     np.testing.assert_allclose(covariance(same), R[0], rtol=1e-9, atol=1e-12)
 
 
@@ -234,65 +231,6 @@ def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
     assert "late" not in found.fitted
 
 
-def test_what_would_narrow_is_the_linear_update_by_hand(monkeypatch):
-    use(monkeypatch)
-    case = made_up_case(0.3, noise=np.random.default_rng(2))
-    found = personalise(case, settings())
-    narrower, filtered = found.narrower, found.result.filtered
-    now = narrower["now"]
-    # P+ = (P^-1 + H^T H / s^2)^-1 in logarithms; a known unknown is a column less.
-    P = to_filter(filtered.transform, found.prior).covariance
-    H = filtered.prediction.jacobian * filtered.transform.derivative(
-        filtered.transformed_iterates[-1]
-    )
-    by_log = filtered.prediction.jacobian[:, 0] * found.result.estimate[0]
-    np.testing.assert_allclose(H[:, 0], by_log)
-
-    def by_hand(better=(), std=0.3):
-        share = np.where(np.isin(found.names, better), 1 / 5, 1.0)
-        information = np.linalg.inv(P * np.outer(share, share)) + H.T @ H / std**2
-        return np.sqrt(np.diag(np.linalg.inv(information)))[:2]
-
-    np.testing.assert_allclose(now, by_hand(), rtol=1e-6)
-    np.testing.assert_allclose(now, filtered.transformed.std[:2], rtol=1e-6)
-    together = "all of these measured 5 times as well"
-    np.testing.assert_allclose(narrower[together], by_hand(found.names[2:]), rtol=1e-6)
-    prior = dict(zip(found.names, found.prior.std, strict=True))
-    mmhg = prior["pressure_scale"] * case.frame(Role.CLOSED).pressure_mmHg / 5
-    measured = {
-        f"pressure measured to ±{mmhg:.2g} mmHg": ("pressure_scale",),
-        f"rest lengths of the chordae measured to ±{20 * prior['chord_rest_length']:.2g} %": (
-            "chord_rest_length",
-        ),
-        f"stiffness of the chordae measured to ±{20 * prior['chord_stiffness']:.2g} %": (
-            "chord_stiffness",
-        ),
-        "annulus placed 5 times as well": REGISTRATION,
-    }
-    for words, names in measured.items():
-        np.testing.assert_allclose(narrower[words], by_hand(names), rtol=1e-6, err_msg=words)
-        assert np.all(narrower[together] <= narrower[words] * (1 + 1e-12))
-        assert np.all(narrower[words] <= now * (1 + 1e-12))
-    half = narrower["4 beats averaged"]
-    np.testing.assert_allclose(half, by_hand(std=0.15), rtol=1e-6)
-    assert np.all(narrower["any number of beats averaged"] < half)
-    assert np.all(half < now)
-    assert set(narrower) == {
-        "now", *measured, together, "4 beats averaged", "any number of beats averaged"
-    }  # fmt: skip
-
-
-def test_nothing_is_said_of_unknowns_that_a_case_does_not_have(monkeypatch):
-    use(monkeypatch)
-    given = [u for u in unknowns() if u.name in (*MODULI, "pressure_scale")]
-    found = personalise(made_up_case(0.3), settings(*given))
-    assert not [words for words in found.narrower if "annulus" in words or "chordae" in words]
-    np.testing.assert_array_equal(
-        found.narrower["all of these measured 5 times as well"],
-        found.narrower["pressure measured to ±2 mmHg"],
-    )
-
-
 def test_the_paper_s_filter_sees_the_moduli_and_independent_errors(monkeypatch):
     use(monkeypatch)
     paper = PaperSettings(P0=1.0, Q=0.01, R=1e-4, max_iterations=30)
@@ -326,7 +264,7 @@ def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, l
     assert abs(found.result.estimate[2]) < 0.01
     assert [len(d.personalised) for d in found.distances] == [288, 288]
     assert all(d.personalised.max() < 0.05 < d.generic.max() for d in found.distances)
-    assert found.narrower["now"].shape == (2,)
+    assert {row.parameter for row in found.known.narrower} == set(MODULI)
     assert found.moduli_only.estimate is not None
     assert found.paper.observation.correlation_length_mm == 0.0
     np.testing.assert_array_equal(found.registered["closed"], found.generic["closed"])
@@ -334,8 +272,8 @@ def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, l
 
 def test_points_on_the_line_between_leaflets_are_of_either(monkeypatch):
     use(monkeypatch)
-    estimation = CaseEstimation(made_up_case(0.3), settings(correspondence=False), None, None)
-    (seen,) = estimation.errors.observation().seen
+    estimation = CaseProblem.of(made_up_case(0.3), settings(correspondence=False))
+    (seen,) = estimation.generic().errors.observation().seen
     column = np.arange(len(seen.region)) % 32
     np.testing.assert_array_equal(seen.region == UNKNOWN, (column == 0) | (column == 16))
     assert set(seen.region[(column > 0) & (column < 16)]) == {0}
@@ -359,7 +297,7 @@ def test_a_valve_that_does_not_close_is_a_result_with_its_reason(monkeypatch):
     assert not found.result.converged
     assert "no equilibrium" in found.result.detail
     assert found.distances == ()
-    assert found.narrower == {}
+    assert found.known.quantities == found.known.narrower == ()
     assert found.confirmed_mm is None
     assert found.moduli_only is not None
     assert not found.moduli_only.converged
@@ -473,13 +411,13 @@ def test_the_model_has_the_pressure_and_the_boundary_of_the_case():
 
 def test_a_further_frame_s_annulus_is_laid_on_the_samples_of_contact():
     case = made_up_case()
-    estimation = CaseEstimation(case, replace(settings(), mesh=SMALL), None, None)
-    contact = estimation.model.contact_valve
+    estimation = CaseProblem.of(case, replace(settings(), mesh=SMALL))
+    contact = estimation.stated.model.contact_valve
     assert len(contact.annulus) == 60
     # The closed frame held is the closed frame.
-    closed = held_state(estimation.model, case.frame(Role.CLOSED))
+    closed = held_state(estimation.stated.model, case.frame(Role.CLOSED))
     np.testing.assert_allclose(closed.annulus, contact.motion.annulus[-1], atol=1e-9)
-    late = held_state(estimation.model, case.held_out[0])
+    late = held_state(estimation.stated.model, case.held_out[0])
     np.testing.assert_allclose(late.annulus - closed.annulus, [[0.1, -0.2, 0.5]] * 60, atol=1e-9)
     assert late.pressure_mmHg == 70.0
 
@@ -547,11 +485,15 @@ def use_geometry(monkeypatch):
     """The formula, moved along with the open shape twice as far as this is moved."""
     use(monkeypatch)
 
-    def sample(case, registered, m, vertices=None, tips=None):
-        given = case.error_samples.vertices if vertices is None else vertices
-        return GeometryErrors(2.0 * given[:, 0], given[:, 1])
+    def sample(case, model, m, states, vertices, tips):
+        return FrameSamples(2.0 * vertices[:, 0], vertices[:, 1], vertices[:, 0])
 
-    monkeypatch.setattr("mvest.personalisation.observation_errors.sample_geometry", sample)
+    monkeypatch.setattr("mvest.personalisation.errors.sample_frames", sample)
+
+
+def share_of(fit, source):
+    """Share of the variance of each modulus that a source accounts for."""
+    return np.array([row.share for row in fit.known.shares if row.source == source])
 
 
 @pytest.mark.parametrize(("correspondence", "std"), [(True, 0.3), (False, 0.02)])
@@ -561,18 +503,12 @@ def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence,
     wanted = settings(*right_nuisances(), correspondence=correspondence)
     plain = personalise(case, wanted)
     told = personalise(seen_in_error(case, std=4 * std), wanted)
-    assert plain.image_share is None
-    assert plain.geometry is None
+    assert not share_of(plain, IMAGES).size
+    assert (plain.error_samples, told.error_samples) == (0, 12)
     assert told.result.converged
     assert np.all(told.result.std > 1.5 * plain.result.std)
-    assert np.all((told.image_share > 0.5) & (told.image_share <= 1.0))
-    exact = told.narrower["geometry known exactly"]
-    # Of the linear model at another estimate, 4 std of the frame's errors away; with the noise that
-    # filters weigh with instead of the stated one, it would be 0.4 of this.
-    ratio = exact / plain.narrower["now"]
-    assert np.all((ratio > 0.5) & (ratio < 2.0))
-    assert np.all(exact < 0.7 * told.narrower["now"])
-    np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)
+    images = share_of(told, IMAGES)
+    assert np.all((images > 0.5) & (images <= 1.0))
 
 
 def test_without_nuisances_moduli_alone_have_the_errors_of_the_frames_too(monkeypatch):
@@ -587,59 +523,34 @@ def test_a_law_that_is_not_known_is_not_averaged_away_beside_error_samples(monke
     use_geometry(monkeypatch)
     column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
     monkeypatch.setattr(
-        "mvest.personalisation.observation_errors.law_columns",
-        lambda *_: (ErrorColumns("law", column),),
+        "mvest.personalisation.errors.law_sources", lambda *_: (error_source(column),)
     )
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
     law = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
     given = settings(*right_nuisances(), considered_law=law)
     told = personalise(case, given)
-    alone = personalise(replace(case, error_samples=None), given)
     known = personalise(case, settings(*right_nuisances()))
     assert told.result.std[0] > 1.05 * known.result.std[0]
-    # Of the linear model at another estimate.
-    averaged = [one.narrower["any number of beats averaged"][0] for one in (told, alone)]
-    assert averaged[0] == pytest.approx(averaged[1], rel=0.3)
+    assert share_of(told, "law")[0] > 0.05
 
 
 def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
     # Prediction and frame move as one: nothing is learnt or lost by it.
     use_geometry(monkeypatch)
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
-    estimation = CaseEstimation(case, settings(*right_nuisances()), None, None)
-    start = estimation.shared.start
-    estimation.errors.sample_geometry(start, estimation.shared(start).y)
+    estimation = CaseProblem.of(case, settings(*right_nuisances()))
+    errors = sampled(estimation.generic()).errors
     each = case.error_samples.vertices[:, 1]
-    np.testing.assert_allclose(estimation.errors.geometry.predicted, 2.0 * each, atol=1e-9)
-    np.testing.assert_allclose(
-        estimation.errors.samples.samples.T, each.reshape(len(each), -1), atol=1e-9
-    )
+    np.testing.assert_allclose(errors.frame_samples.predicted, 2.0 * each, atol=1e-9)
+    np.testing.assert_allclose(errors.samples.samples.T, each.reshape(len(each), -1), atol=1e-9)
 
 
 def test_errors_of_frames_that_cannot_be_told_are_an_error(monkeypatch):
     use_geometry(monkeypatch)
-    monkeypatch.setattr(
-        "mvest.personalisation.observation_errors.sample_geometry", lambda *_: "no equilibrium"
-    )
+    monkeypatch.setattr("mvest.personalisation.errors.sample_frames", lambda *_: "no equilibrium")
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
     with pytest.raises(GeometryError, match="error samples do: no equilibrium"):
         personalise(case, settings(*right_nuisances()))
-
-
-def test_a_budget_says_what_the_errors_of_the_frames_cost(monkeypatch):
-    use_geometry(monkeypatch)
-    case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1), displaced=False))
-    found = personalise(case, settings(*right_nuisances()))
-    of = {(row.part, row.modulus): row for row in found.budget}
-    for modulus in MODULI:
-        everything, images = of[EVERYTHING, modulus], of[IMAGES, modulus]
-        assert everything.alone < images.alone
-        assert images.without < everything.without
-        # They are the same in both frames, so that nothing is wrong with the motion between these.
-        assert of[MOTION, modulus].without == pytest.approx(everything.without, rel=1e-9)
-        assert of[MOTION, modulus].alone < 0.01 * images.alone
-    plain = replace(case, error_samples=None)
-    assert personalise(plain, settings(*right_nuisances())).budget == ()
 
 
 # --- errors that are learned --------------------------------------------------------------------
@@ -677,7 +588,8 @@ def test_errors_rougher_than_stated_are_learned(monkeypatch, correspondence):
     assert np.sqrt(np.mean(z**2)) < 1.6
     # What would be known if more were known starts from what is.
     moduli = [found.names.index(name) for name in MODULI]
-    np.testing.assert_allclose(found.narrower["now"], learned.transformed.std[moduli], rtol=1e-6)
+    now = [row.std_now for row in found.known.narrower[:2]]
+    np.testing.assert_allclose(now, learned.transformed.std[moduli], rtol=1e-6)
 
 
 def test_learned_errors_and_error_samples_widen_together(monkeypatch):
@@ -686,8 +598,7 @@ def test_learned_errors_and_error_samples_widen_together(monkeypatch):
     wanted = settings(*right_nuisances(), errors=ErrorBeliefs())
     plain = personalise(case, wanted)
     told = personalise(seen_in_error(case, std=1.2), wanted)
-    assert told.result.filtered.learned.names[-1] == "geometry"
+    assert told.result.filtered.learned.names[-1] == "error samples"
     assert np.all(told.result.std > 1.5 * plain.result.std)
-    np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)
     rough = [r.result.filtered.learned.quantities[2].learned.median for r in (plain, told)]
     np.testing.assert_allclose(rough, np.hypot(0.3, 0.3), rtol=0.1)

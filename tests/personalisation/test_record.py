@@ -89,14 +89,18 @@ def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(record):
     assert rows[0]["orifice_mm2"] > 100
 
 
-def test_what_would_narrow_is_said_of_each_modulus(fit, record):
-    # The prior's 10 % of 100 mmHg, five times as well.
-    measured = "pressure measured to ±2 mmHg"
-    rows = [row for row in record.details["narrower"] if row["what"].endswith(measured)]
-    assert [row["parameter"] for row in rows] == ["E_f.anterior", "E_f.posterior"]
-    for k, row in enumerate(rows):
-        assert row["std_if_known"] == fit.narrower[measured][k]
-        assert row["std_now"] == fit.narrower["now"][k] > row["std_if_known"]
+def test_what_is_known_and_would_narrow_it_is_in_the_record(fit, record):
+    for name, rows in (
+        ("narrower", fit.known.narrower),
+        ("known", fit.known.quantities),
+        ("data_alone", fit.known.data_alone),
+    ):
+        assert [tuple(row.values()) for row in record.details[name]] == [
+            tuple(getattr(one, key) for key in record.details[name][0]) for one in rows
+        ]
+    assert {"pressure (factor)", "chordal stiffness (factor)"} < {
+        row["source"] for row in record.details["shares"]
+    }
 
 
 def test_gate_and_images_speak_in_the_verdict(fit, record):

@@ -7,11 +7,10 @@ import pytest
 from mvest.problem.verdict import (
     ALIKE,
     DOUBTFUL,
-    FARTHER,
+    FAR,
     LAW,
     LEAK,
     MOVED,
-    NARROWING,
     NEEDED,
     NIS_FACTOR,
     NONE,
@@ -29,10 +28,8 @@ GOOD = Indications(
     nis=1.01,
     nis_band=(0.96, 1.04),
     stretch={"pressure_scale": -1.2, "smooth part of the errors": 0.4},
-    narrowing={"E_f.anterior": 0.4, "E_f.posterior": 0.3},
+    data_alone={"E_f.anterior": 1.4, "E_f.posterior": -0.3},
     alike=0.05,
-    residual_mm=0.9,
-    generic_mm=1.6,
     held_out=(Held("late", 1.5, 1.1),),
     orifice_mm2=3.0,
     observed_orifice_mm2=2.0,
@@ -57,7 +54,9 @@ CASES = {
     "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
     "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
     "not linear": ({"moved": 1.1 * MOVED}, DOUBTFUL, "is 0.55 of its standard deviations from"),
-    "stiffening": ({"law": 1.2 * LAW}, DOUBTFUL, "0.24 of the way from the linear law"),
+    "stiffening": ({"law": 1.2 * LAW[0]}, DOUBTFUL, "0.24 of the way from the linear law"),
+    "another law": ({"law": 1.2 * LAW[1]}, NONE, "0.36 of the way from the linear law"),
+    "left out": ({"unaccounted": ("no law",)}, DOUBTFUL, "not in the intervals: no law"),
     "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
     "an unlike volume": ({"unlike": "seen with 0.7"}, NONE, "seen with 0.7"),
     "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),
@@ -66,10 +65,11 @@ CASES = {
     "structure": ({"alike": 1.1 * ALIKE}, DOUBTFUL, "alike at neighbouring points"),
     "stretched": ({"stretch": {"pressure_scale": -1.01 * STRETCH[0]}}, DOUBTFUL, "pressure_scale"),
     "contradicted": ({"stretch": {"chord_rest_length": 3.7}}, NONE, "3.7 of its standard"),
-    "half believed": ({"narrowing": {"E_f.anterior": 0.8}}, DOUBTFUL, "80 % of what was believed"),
-    "nothing added": ({"narrowing": {"E_f.anterior": 1.01 * NARROWING[1]}}, NONE, "91 %"),
-    "farther": ({"residual_mm": 2.1}, DOUBTFUL, "farther from the closed frame"),
-    "much farther": ({"residual_mm": 1.61 * FARTHER[1]}, NONE, "laid rigidly on it (1.60 mm)"),
+    "against the prior": (
+        {"data_alone": {"E_f.anterior": -1.1 * FAR}},
+        DOUBTFUL,
+        "E_f.anterior 2.2",
+    ),
     "held out": ({"held_out": (Held("late", 1.0, 1.06),)}, DOUBTFUL, "frame late"),
     "ajar": ({"orifice_mm2": 2.1 + LEAK[0]}, DOUBTFUL, "leaves 12 mm"),
     "open": ({"orifice_mm2": 121.0}, NONE, "leaves 121 mm² free, the observed one 2 mm²"),
@@ -93,13 +93,12 @@ def test_each_ground_counts_and_says_its_number(changes, trust, words):
     [
         {"nis": 0.3},
         {"moved": MOVED},
-        {"law": LAW},
+        {"law": LAW[0]},
         {"law": -1.0},
         {"nis": 1.04},
         {"stretch": {"x": STRETCH[0]}},
-        {"narrowing": {"x": NARROWING[0]}},
+        {"data_alone": {"x": FAR}},
         {"alike": -ALIKE},
-        {"residual_mm": 1.6 * FARTHER[0]},
         {"held_out": (Held("late", 1.0, 1.05),)},
         {"orifice_mm2": 2.0 + LEAK[0]},
         {"orifice_mm2": 0.0, "observed_orifice_mm2": 80.0},
@@ -118,11 +117,17 @@ def test_the_worst_ground_decides_and_stands_first():
 
 def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
     verdict = judge(Indications(estimated=True))
-    assert len(verdict.missing) == 12
-    # Of these, four are needed.
-    assert verdict.trust == DOUBTFUL
+    assert len(verdict.missing) == 11
+    # Two of these are needed, and two grounds are one too many.
+    assert verdict.trust == NONE
     assert [ground.check for ground in verdict.grounds] == list(NEEDED)
     assert judge(replace(GOOD, alike=None, gate=None, held_out=())).trust == TRUSTWORTHY
     assert judge(replace(GOOD, gate=None)).missing == (ONE_STATE,)
     assert set(verdict.missing).isdisjoint(verdict.passed)
-    assert "what the data add" in verdict.missing
+    assert "data against prior" in verdict.missing
+
+
+def test_two_doubtful_checks_are_none_and_two_grounds_of_one_are_doubtful():
+    assert judge(replace(GOOD, alike=0.5)).trust == DOUBTFUL
+    assert judge(replace(GOOD, alike=0.5, moved=1.0)).trust == NONE
+    assert judge(replace(GOOD, doubts=("thick", "wide"))).trust == DOUBTFUL

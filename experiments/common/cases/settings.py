@@ -11,7 +11,7 @@ from experiments.common.schema import InputFile, Reads, contents
 from mvest.cases.from_images.settings import ImagedSettings
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalisation.considered_geometry import ConsideredGeometry
+from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.settings import CaseMesh, PaperSettings, PressureErrors
 from mvest.quantities import Count, Logarithm, Tolerance, Value
 

@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 
 from mvest.closure.model import ClosureModel
-from mvest.estimation.noise_family import ErrorColumns
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
 from mvest.personalisation import personalise
-from mvest.personalisation.considered_law import law_change, law_columns
 from mvest.personalisation.indications import indications_of
+from mvest.personalisation.sources import law_change, law_sources
 from mvest.problem.registration import RegisteredModel
 from mvest.problem.verdict import judge
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, TISSUE, model_of
-from tests.made_up_closure import FIELDS, made_up_case, settings, use
+from tests.made_up_closure import FIELDS, error_source, made_up_case, settings, use
 
 STIFFENING = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
 
@@ -63,11 +62,11 @@ def test_columns_are_turned_as_the_valve_is_seen(model):
     m = np.array([*AT, 90.0])
     n = len(model.valve.surface.vertices)
     seen = Observation(("closed",), np.zeros((1, n, 3)), np.array(1.0))
-    (law,) = law_columns(STIFFENING, registered, seen, m, registered(m).y)
-    assert (law.name, law.factor) == ("law", 1.0)
+    (law,) = law_sources(STIFFENING, registered, seen, m, registered(m).y)
+    assert (law.name, law.columns.factor) == ("law", 1.0)
     change = law_change(model, AT, [], STIFFENING)[1, ..., 0]
     turned = np.stack([-change[:, 1], change[:, 0], change[:, 2]], axis=1)
-    np.testing.assert_allclose(law.columns[:, 0], turned.ravel(), atol=1e-6)
+    np.testing.assert_allclose(law.columns.columns[:, 0], turned.ravel(), atol=1e-6)
 
 
 def test_a_law_without_an_equilibrium_is_said(model, monkeypatch):
@@ -82,25 +81,25 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
     monkeypatch.setattr(
-        "mvest.personalisation.observation_errors.law_columns",
-        lambda *_: (ErrorColumns("law", column),),
+        "mvest.personalisation.errors.law_sources",
+        lambda *_: (error_source(column),),
     )
     known = personalise(case, settings(moduli_only=True))
     doubtful = personalise(case, settings(moduli_only=True, considered_law=STIFFENING))
     anterior = doubtful.names.index("E_f.anterior")
     assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
-    assert doubtful.narrower["now"][0] > 1.3 * doubtful.narrower["law known exactly"][0]
+    shares = {row.source: row.share for row in doubtful.known.shares[::2]}
+    assert shares["law"] > 0.3
+    assert sum(shares.values()) == pytest.approx(1.0)
     np.testing.assert_allclose(doubtful.moduli_only.std, known.moduli_only.std, rtol=1e-6)
-    assert doubtful.unconsidered == ()
+    assert doubtful.unaccounted == ()
 
 
 def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    monkeypatch.setattr(
-        "mvest.personalisation.observation_errors.law_columns", lambda *_: "it did not close"
-    )
+    monkeypatch.setattr("mvest.personalisation.errors.law_sources", lambda *_: "it did not close")
     fit = personalise(case, settings(considered_law=STIFFENING))
-    assert fit.unconsidered == ("it did not close",)
-    grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "case"]
+    assert fit.unaccounted == ("it did not close",)
+    grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "errors left out"]
     assert any(text.endswith("is not in the intervals: it did not close") for text in grounds)

@@ -1,11 +1,8 @@
-"""What is not known of a case's geometry, as an error of what a model predicts.
+"""What is not known of the geometry that the model of a case is built from.
 
-The model of a case is built from its open shape, its annulus and papillary tips, a thickness and a
-direction of fibres, all as they were seen or stated. Each is uncertain: independent smooth modes
-with a standard deviation. Derivatives of the closed valve by the modes
-(`mvest.closure.rest_geometry`) times their standard deviations are columns C of the observation,
-which add C Cᵀ to the covariance of its errors. To first order that is the same as to estimate all
-modes with the parameters, and to report the parameters alone.
+That is its open shape, annulus and papillary tips, thickness and direction of fibres, all as they
+were seen or stated. Each is uncertain: independent modes, one standard deviation each. What they do
+to a prediction is in `mvest.personalisation.sources`.
 """
 
 from __future__ import annotations
@@ -14,31 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role, ValveCase
-from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError, require_numbers
-from mvest.estimation.noise import ObservationNoise
-from mvest.estimation.noise_family import ErrorColumns, smooth_basis
-from mvest.estimation.prediction import Prediction, predict
-from mvest.mechanics.reference import RestVariation
-from mvest.mechanics.valve_system import HeldState
-from mvest.problem.problem import Observed
-from mvest.problem.registration import RegisteredModel, registration_of
+from mvest.estimation.noise_family import smooth_basis
 from mvest.quantities import Angle, Count, Factor, Length, Share, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
-
-SEEN = 0.3
-"""Standard deviations of the stated noise below which a combination of columns is left out."""
-
-TOLERANCE = 1e-4
-"""Of derivatives, relative, far below what is known of the size of errors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,28 +106,6 @@ class GeometryModes:
         return len(next(iter(self.parts.values())))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GeometryColumns:
-    """What modes of a geometry's error do to an observation, to first order.
-
-    Attributes
-    ----------
-    modes : tuple of GeometryModes
-    rows : tuple of (k, q)
-        Of each kind: the observation by its modes.
-    columns : tuple of ErrorColumns
-        The same of low rank, as far as it can be told from noise.
-    """
-
-    modes: tuple[GeometryModes, ...]
-    rows: tuple[FloatArray, ...]
-    columns: tuple[ErrorColumns, ...]
-
-    def offset(self, modes: Sequence[FloatArray]) -> FloatArray:
-        """What modes ``(q,)`` of each kind do to the observation ``(k,)``."""
-        return np.sum([rows @ z for rows, z in zip(self.rows, modes, strict=True)], axis=0)
-
-
 def displacement(
     modes: Sequence[GeometryModes], sizes: Sequence[FloatArray]
 ) -> dict[str, FloatArray]:
@@ -154,79 +115,6 @@ def displacement(
         for part, moves in own.parts.items():
             total[part] = total.get(part, 0.0) + np.tensordot(z, moves, 1)
     return total
-
-
-def geometry_columns(
-    modes: Sequence[GeometryModes],
-    registered: RegisteredModel,
-    observation: Observed,
-    noise: ObservationNoise,
-    m: FloatArray,
-    predicted: FloatArray,
-    seen: ClosureModel | None = None,
-) -> GeometryColumns | str:
-    """Errors of an observation from those of the geometry, one kind after another, or why none.
-
-    Parameters
-    ----------
-    modes : sequence of GeometryModes
-    registered : RegisteredModel
-        Of the case; its last closed state is gone on from.
-    observation : Observed
-        Of the case.
-    noise : ObservationNoise
-        Of the observation as it is stated, without what the geometry adds.
-    m : (p,)
-        Parameters at which the model is linearised.
-    predicted : array
-        All frames as predicted at ``m``, stacked.
-    seen : ClosureModel, optional
-        Of the valve as it was seen, whose errors these are, if that of ``registered`` is displaced.
-    """
-    if not modes:
-        return GeometryColumns((), (), ())
-    model, at, states = closure_at(registered, m)
-    geometry = RestGeometry(model, seen)
-    joined = RestVariation.joined([geometry.variation(own.parts) for own in modes])
-    change = geometry.change(at, joined, states, TOLERANCE)
-    if isinstance(change, str):
-        return change
-    rows = observed_change(registered, observation, m, predicted, change)
-    ends = np.cumsum([len(own) for own in modes])[:-1]
-    split = tuple(np.split(rows, ends, axis=1))
-    columns = tuple(
-        ErrorColumns(own.name, of_low_rank(members, noise), own.factor)
-        for own, members in zip(modes, split, strict=True)
-    )
-    return GeometryColumns(tuple(modes), split, columns)
-
-
-def closure_at(
-    registered: RegisteredModel, m: FloatArray
-) -> tuple[ClosureModel, FloatArray, list[HeldState]]:
-    """The closure of a model, its parameters at ``m (p,)``, and what further frames are held by."""
-    model = registered.model
-    if not isinstance(model, FramesModel):
-        return model, registered.mechanical(m), []
-    return model.model, registered.mechanical(m), model.under(registered.own(m), model.states)
-
-
-def observed_change(
-    registered: RegisteredModel,
-    observation: Observed,
-    m: FloatArray,
-    predicted: FloatArray,
-    change: FloatArray,
-) -> FloatArray:
-    """What changes ``(f, n, 3, q)`` mm of the valve do to an observation ``(k, q)``.
-
-    ``predicted`` are all frames at ``m (p,)``, stacked.
-    """
-    turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
-    turned = np.concatenate([change[:1], np.einsum("ij,fnjq->fniq", turn, change[1:])])
-    jacobian = turned.reshape(len(predicted), -1)
-    linear = observation.of(lambda _: Prediction(predicted, jacobian))
-    return predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
 
 
 def geometry_modes(
@@ -336,9 +224,3 @@ def rest_lengths_by_ends(
         away = np.where(by_closed, in_closed, away)
         moves = np.where(by_closed, closed_moves, open_moves)
     return np.asarray(np.einsum("qci,ci->qc", moves, away) / np.sum(away**2, axis=1))
-
-
-def of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
-    """Fewer columns with nearly the same C Cᵀ, as far as that can be told from noise."""
-    _, s, Vt = np.linalg.svd(noise.whiten(columns), full_matrices=False)
-    return np.asarray(columns @ Vt[s > SEEN].T)

@@ -15,26 +15,30 @@ from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
-from mvest.estimation.noise_family import ErrorColumns
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Log, to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import Treatment, personalise
-from mvest.personalisation.considered_geometry import (
+from mvest.personalisation import Treatment, estimation, personalise
+from mvest.personalisation.chain import predicted_frames
+from mvest.personalisation.estimation import (
+    SETTLED,
+    CaseClosure,
+    CaseProblem,
+    linearised,
+)
+from mvest.personalisation.geometry import (
     ConsideredGeometry,
-    GeometryColumns,
     GeometryModes,
     displacement,
-    geometry_columns,
     geometry_modes,
     rest_lengths_by_ends,
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.estimation import SETTLED, CaseClosure, CaseEstimation
 from mvest.personalisation.indications import indications_of
+from mvest.personalisation.sources import geometry_sources
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.problem.verdict import MOVED
 from tests.cases.test_uncertainty import corresponding
@@ -44,6 +48,7 @@ from tests.made_up_closure import (
     PRIORS,
     TRUE,
     MadeUpClosure,
+    error_source,
     made_up_case,
     settings,
     shape,
@@ -91,7 +96,8 @@ def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_i
     def columns_of(std=1e-3, case=case, **changes):
         modes = geometry_modes(case, replace(NONE, **changes), model)
         noise = observation_noise(std**2, 3 * n)
-        return geometry_columns(modes, registered, seen, noise, m, predicted.y).columns
+        sources = geometry_sources(modes, registered, seen, noise, m, predicted.y)
+        return tuple(source.columns for source in sources)
 
     assert columns_of() == ()
     (fibres,) = columns_of(fibre_degrees=10.0)
@@ -208,13 +214,13 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     where = []
 
-    def columns(modes, registered, observation, noise, m, predicted, seen):
+    def sources(modes, registered, observation, noise, m, predicted, seen):
         # As if the anterior belly were not known by 0.2 mm.
         where.append(m)
         belly = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
-        return GeometryColumns((MODE,), (belly,), (ErrorColumns(MODE.name, belly),))
+        return (error_source(belly, MODE),)
 
-    monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
     for errors in (None, settings().errors):
         known = personalise(case, settings(errors=errors))
         doubtful = personalise(
@@ -222,16 +228,19 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
         )
         anterior = doubtful.names.index("E_f.anterior")
         assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
-        exact = doubtful.narrower["open shape known exactly"]
-        assert doubtful.narrower["now"][0] > 1.3 * exact[0]
+        shares = {row.source: row.share for row in doubtful.known.shares[::2]}
+        assert shares["open shape"] > 0.3
         # Averaging leaves the errors of the geometry as they are.
-        assert (
-            doubtful.narrower["any number of beats averaged"][0]
-            > 5 * known.narrower["any number of beats averaged"][0]
-        )
+        averaged = [anterior_if(one, "mean of 4 beats") for one in (known, doubtful)]
+        assert averaged[1] > 1.5 * averaged[0]
     # Once for each, about an estimate without them.
     assert len(where) == 2
     np.testing.assert_allclose(where[1], known.result.estimate, rtol=0.05, atol=0.2)
+
+
+def anterior_if(fit, what):
+    """Standard deviation of the anterior modulus' logarithm if something were measured."""
+    return next(row.std_then for row in fit.known.narrower if row.what == what)
 
 
 BENT, CURVED = FIELDS["loose"].ravel(), FIELDS["E_f.anterior"].ravel()
@@ -277,12 +286,12 @@ def bent_case(monkeypatch, curve, std):
     use(monkeypatch)
     monkeypatch.setattr(BentGeometry, "curve", curve)
 
-    def columns(modes, registered, observation, noise, m, predicted, seen):
+    def sources(modes, registered, observation, noise, m, predicted, seen):
         bend = getattr(registered.model, "bend", 0.0)
         slope = (BENT + 2.0 * curve * bend * CURVED)[:, None]
-        return GeometryColumns((MODE,), (slope,), (ErrorColumns(MODE.name, slope),))
+        return (error_source(slope, MODE),)
 
-    monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
     monkeypatch.setattr("mvest.personalisation.estimation.RestGeometry", BentGeometry)
     straight = made_up_case(std, displaced=False)
     closed = straight.frame(Role.CLOSED)
@@ -309,10 +318,10 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
         return np.concatenate([(bent(x, z[2]) - seen) / std, beforehand, z[2:]])
 
     mode = least_squares(objective, [1.5, 1.0, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
-    steps, nearer = [], CaseEstimation._nearer
+    steps, nearer = [], estimation._nearer
 
-    def followed(self, result, place):
-        found = nearer(self, result, place)
+    def followed(problem, result, place):
+        found = nearer(problem, result, place)
         steps.append((place, found))
         return found
 
@@ -320,7 +329,7 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
         bend = place.errors.displaced_by or np.zeros((1, 1))
         return np.sum(objective([*np.log(place.m), bend[0][0]]) ** 2)
 
-    monkeypatch.setattr(CaseEstimation, "_nearer", followed)
+    monkeypatch.setattr(estimation, "_nearer", followed)
     errors = []
     for renewals in (0, 1, 2, 12):
         steps.clear()
@@ -351,14 +360,14 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
 def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
     case, known = bent_case(monkeypatch, curve=0.0, std=0.5)
     monkeypatch.setattr("mvest.personalisation.estimation.ROUGH", 0.0)
-    places, nearer = [], CaseEstimation._nearer
+    places, nearer = [], estimation._nearer
 
-    def followed(self, result, place):
-        found = nearer(self, result, place)
-        places.append((self, result, place, found))
+    def followed(problem, result, place):
+        found = nearer(problem, result, place)
+        places.append((problem, result, place, found))
         return found
 
-    monkeypatch.setattr(CaseEstimation, "_nearer", followed)
+    monkeypatch.setattr(estimation, "_nearer", followed)
     fit = personalise(
         case,
         settings(
@@ -368,14 +377,15 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
         ),
     )
     # Of a straight valley the first step is the last.
-    ((estimation, before, first, last),) = places
+    ((problem, before, first, last),) = places
+    last = linearised(last, problem)
     assert fit.moved < 1e-4
     # As if no other place were better than the last: then it is as good as promised, the first not.
-    monkeypatch.setattr(CaseEstimation, "_displaced", lambda *_: last)
-    assert nearer(estimation, fit.result, last) is last
-    monkeypatch.setattr(CaseEstimation, "_displaced", lambda *_: first)
-    assert nearer(estimation, before, first) == "no step to it makes what was seen more probable"
-    assert fit.unconsidered == ()
+    monkeypatch.setattr(estimation, "_displaced", lambda *_: last)
+    assert nearer(problem, fit.result, last) is last
+    monkeypatch.setattr(estimation, "_displaced", lambda *_: first)
+    assert nearer(problem, before, first) == "no step to it makes what was seen more probable"
+    assert fit.unaccounted == ()
 
 
 def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
@@ -435,8 +445,8 @@ def test_columns_of_a_displaced_valve_are_by_the_same_errors_as_it_was_displaced
 
     registered, predicted = closed(far)
     noise = observation_noise(1e-6, 3 * n)
-    rows = geometry_columns(modes, registered, seen, noise, AT, predicted.y, model).rows
-    for row, way in zip(rows, step * np.eye(4), strict=True):
+    sources = geometry_sources(modes, registered, seen, noise, AT, predicted.y, model)
+    for row, way in zip((source.rows for source in sources), step * np.eye(4), strict=True):
         above, below = (closed(far + sign * way)[1].y.reshape(2, -1)[1] for sign in (1, -1))
         central = (above - below) / (2.0 * step)
         np.testing.assert_allclose(row[:, 0], central, atol=0.02 * np.abs(central).max())
@@ -448,15 +458,17 @@ def test_frames_that_are_not_fitted_are_held_as_the_closed_one_is(monkeypatch):
     later = replace(closed, name="later", time=1.0, role=Role.HELD_OUT)
     case = replace(case, frames=(*case.frames, later))
     parts = {"annulus": np.full(closed.annulus.shape, 0.3), "tips": np.full((1, 3), -0.4)}
-    estimation = CaseEstimation(case, settings(*unknowns(Treatment.FIXED, **known)), None, None)
-    stated = estimation.held_out()["later"]
-    np.testing.assert_array_equal(stated.annulus, closed.annulus)
-    closure = estimation._stated
-    estimation._closure = replace(closure, displacement=parts)
-    held = estimation.held_out()["later"]
-    np.testing.assert_allclose(held.annulus, closed.annulus + 0.3)
-    np.testing.assert_allclose(held.papillary_tips, closed.papillary_tips - 0.4)
-    assert held.pressure_mmHg == closed.pressure_mmHg
+    problem = CaseProblem.of(case, settings(*unknowns(Treatment.FIXED, **known)))
+    stated = problem.generic()
+    off = replace(stated, closure=replace(stated.closure, displacement=parts))
+    for place, by, tips in ((stated, 0.0, 0.0), (off, 0.3, -0.4)):
+        states = problem.stated.model.states
+        states.clear()
+        predicted_frames(problem, place, place.m, place.prediction.y)
+        held = states[-1]
+        np.testing.assert_allclose(held.annulus, closed.annulus + by)
+        np.testing.assert_allclose(held.papillary_tips, closed.papillary_tips + tips)
+        assert held.pressure_mmHg == closed.pressure_mmHg
 
 
 @pytest.mark.parametrize("why", ["no equilibrium", "thickness is -0.1 mm, expected > 0"])
@@ -469,10 +481,10 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
                 raise GeometryError(why)
             return replace(super().displaced(parts), fails_above=0.0)
 
-    def columns(modes, registered, observation, noise, m, predicted, seen):
-        return GeometryColumns((MODE,), (BENT[:, None],), (ErrorColumns(MODE.name, BENT[:, None]),))
+    def sources(modes, registered, observation, noise, m, predicted, seen):
+        return (error_source(BENT[:, None], MODE),)
 
-    monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
+    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
     monkeypatch.setattr("mvest.personalisation.estimation.RestGeometry", Torn)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     plain, torn = (
@@ -481,8 +493,8 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     )
     np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
     assert torn.moved is None
-    assert torn.unconsidered == (f"about the geometry that is expected: {why}",)
-    assert any("about the geometry" in doubt for doubt in indications_of(torn).doubts)
+    assert torn.unaccounted == (f"about the geometry that is expected: {why}",)
+    assert any("about the geometry" in doubt for doubt in indications_of(torn).unaccounted)
 
 
 def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
@@ -509,14 +521,14 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
         for renewals in (0, 2)
     )
     np.testing.assert_array_equal(stuck.result.estimate, plain.result.estimate)
-    (doubt,) = stuck.unconsidered
+    (doubt,) = stuck.unaccounted
     assert doubt.startswith("about the geometry that is expected: ")
     assert "stuck" in doubt
 
 
 def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
-    monkeypatch.setattr("mvest.personalisation.observation_errors.law_columns", lambda *_: "no law")
+    monkeypatch.setattr("mvest.personalisation.errors.law_sources", lambda *_: "no law")
     fit = personalise(
         case,
         settings(
@@ -525,7 +537,7 @@ def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
             considered_law={"anterior": ExponentialTissue(0.06, 4.325, 1446.5)},
         ),
     )
-    assert fit.unconsidered == ("no law", "about the geometry that is expected: no law")
+    assert fit.unaccounted == ("no law", "about the geometry that is expected: no law")
 
 
 @pytest.mark.parametrize(

@@ -9,78 +9,76 @@ in both frames cancels so as far as the valve is the same elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Frame, Role, ValveCase
+from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction, predict
+from mvest.estimation.prediction import Prediction, predict
 from mvest.mechanics.reference import RestVariation
+from mvest.mechanics.valve_system import HeldState
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
-from mvest.personalisation.considered_geometry import (
-    TOLERANCE,
-    closure_at,
-    rest_lengths_by_ends,
-)
+from mvest.personalisation.geometry import rest_lengths_by_ends
+from mvest.personalisation.sources import TOLERANCE
 from mvest.problem.problem import Observed
-from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
 from mvest.valve.geometry.proximity import closest_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GeometryErrors:
-    """Samples of how a prediction moves if the geometry was seen in error.
+class FrameSamples:
+    """Samples of how a prediction moves if the frames it is built from were seen in error.
 
     Attributes
     ----------
     predicted : (K, n, 3) mm
         Displacement of the predicted closed valve.
-    seen : (K, n, 3) mm
-        Displacement of the closed frame in the same samples.
+    seen, opened : (K, n, 3) mm
+        Displacement of the observed closed and of the open frame in the same samples.
     """
 
     predicted: FloatArray
     seen: FloatArray
+    opened: FloatArray
 
     def __len__(self) -> int:
         return len(self.seen)
 
 
-def sample_geometry(
+def sample_frames(
     case: ValveCase,
-    registered: RegisteredModel,
+    model: ClosureModel,
     m: FloatArray,
-    vertices: FloatArray | None = None,
-    tips: FloatArray | None = None,
-) -> GeometryErrors | str:
-    """How far the closed valve moves with every error sample of a case, or why that is not known.
+    states: Sequence[HeldState],
+    vertices: FloatArray,
+    tips: FloatArray,
+) -> FrameSamples | str:
+    """How far the closed valve moves with samples of all frames, or why that is not known.
 
     Parameters
     ----------
     case : ValveCase
-    registered : RegisteredModel
+    model : ClosureModel
         Of the case; its last closed state is gone on from.
     m : (p,)
-        Parameters at which the model is linearised.
-    vertices : (K, f, n, 3) mm, optional
-    tips : (K, f, t, 3) mm, optional
-        Other samples than those of the case.
+        Parameters of the closure at which it is linearised.
+    states : sequence of HeldState
+        What further frames are held by.
+    vertices : (K, f, n, 3) mm
+    tips : (K, f, t, 3) mm
     """
-    if vertices is None or tips is None:
-        assert case.error_samples is not None
-        vertices, tips = case.error_samples.vertices, case.error_samples.tips
-    model, at, states = closure_at(registered, m)
     geometry = RestGeometry(model)
-    change = geometry.change(at, frame_errors(case, geometry, vertices, tips), states, TOLERANCE)
+    change = geometry.change(m, frame_errors(case, geometry, vertices, tips), states, TOLERANCE)
     if isinstance(change, str):
         return change
-    return GeometryErrors(np.moveaxis(change[-1], -1, 0), vertices[:, _numbers(case)[1]])
+    open_, closed = _numbers(case)
+    return FrameSamples(np.moveaxis(change[-1], -1, 0), vertices[:, closed], vertices[:, open_])
 
 
 def frame_errors(
@@ -127,8 +125,8 @@ def _numbers(case: ValveCase) -> tuple[int, int]:
     return roles.index(Role.REFERENCE), roles.index(Role.CLOSED)
 
 
-def errors_of(
-    observation: Observed, closed: Frame, generic: FloatArray, geometry: GeometryErrors
+def errors_of_samples(
+    observation: Observed, closed: Frame, generic: FloatArray, samples: FrameSamples
 ) -> FloatArray:
     """Samples of the error of an observation's innovation ``(k, K)`` mm, one in each column.
 
@@ -139,11 +137,11 @@ def errors_of(
     closed : Frame
     generic : array
         Both frames as they are predicted, stacked.
-    geometry : GeometryErrors
+    samples : FrameSamples
         About this prediction.
     """
     if isinstance(observation, Observation):
-        moved = geometry.predicted - geometry.seen
+        moved = samples.predicted - samples.seen
         return np.asarray(moved[:, observation.seen[0]].reshape(len(moved), -1).T)
     assert isinstance(observation, SurfaceObservation)
     points = observation.seen[-1]
@@ -158,7 +156,7 @@ def errors_of(
 
     first = distances(plain, np.zeros(half))
     columns = []
-    for predicted, seen in zip(geometry.predicted, geometry.seen, strict=True):
+    for predicted, seen in zip(samples.predicted, samples.seen, strict=True):
         there = replace(
             points,
             points=points.points + seen[at],
@@ -166,38 +164,3 @@ def errors_of(
         )
         columns.append(distances(replace(plain, seen=(there,)), predicted) - first)
     return np.stack(columns, axis=1)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WeighedObservation:
-    """An observation with another noise.
-
-    Attributes
-    ----------
-    plain : Observed
-    R : NoiseCovariance
-    offset : (k,) or float
-        Added to what was seen: the mean of the noise, of other sign.
-    """
-
-    plain: Observed
-    R: NoiseCovariance
-    offset: FloatArray | float = 0.0
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Names of the observed frames."""
-        return self.plain.frames
-
-    @property
-    def y(self) -> FloatArray:
-        """The observation ``(k,)``."""
-        return self.plain.y + self.offset
-
-    def of(self, model: ObservationModel, /) -> ObservationModel:
-        """What a model predicts of this observation."""
-        return self.plain.of(model)
-
-    def distance(self, fitted: FloatArray) -> FloatArray:
-        """Distances (mm) of what was seen in the last frame to fitted ``(f, n, 3)``."""
-        return self.plain.distance(fitted)
