@@ -57,13 +57,13 @@ class Narrower:
     what : str
         What is measured and how well; `EXACTLY` is the end of all measuring.
     parameter : str
-    std_now, std_then : float
+    std_now, std_if_known : float
     """
 
     what: str
     parameter: str
     std_now: float
-    std_then: float
+    std_if_known: float
 
 
 EXACTLY = "all that can be measured, known exactly"

@@ -21,7 +21,7 @@ known          name, unit, estimate, low, high, generic: what follows from the e
                (`mvest.personalisation.known.Quantity`)
 data_alone     parameter, estimate, low, high, prior_stds: moduli without their priors
 shares         source, parameter, share: where the variance of a modulus' logarithm comes from
-narrower       what, parameter, std_now, std_then: SD of the logarithm of a modulus
+narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
 seconds        part, seconds: wall-clock time
@@ -175,10 +175,16 @@ def _details(fit: Personalised) -> Iterator[tuple[str, Iterator[Row]]]:
         "geometry": known.geometry,
         "known": known.quantities,
         "data_alone": known.data_alone,
-        "narrower": known.narrower,
     }
     for name, own in rows.items():
         yield name, map(_fields, own)
+    yield (
+        "narrower",
+        (
+            _fields(row) | {"what": f"{label_of(row.parameter)}, {row.what}"}
+            for row in known.narrower
+        ),
+    )
     yield "shares", (_fields(row) | {"source": label_of(row.source)} for row in known.shares)
     yield "measurements", _measurements(fit)
     yield "seconds", ({"part": part, "seconds": s} for part, s in fit.seconds.items())

@@ -240,7 +240,7 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
 
 def anterior_if(fit, what):
     """Standard deviation of the anterior modulus' logarithm if something were measured."""
-    return next(row.std_then for row in fit.known.narrower if row.what == what)
+    return next(row.std_if_known for row in fit.known.narrower if row.what == what)
 
 
 BENT, CURVED = FIELDS["loose"].ravel(), FIELDS["E_f.anterior"].ravel()

@@ -52,7 +52,9 @@ def dense(fit):
 def rows_of(fit):
     """What is measured -> standard deviation of each modulus then."""
     rows = fit.known.narrower
-    return {row.what: np.array([r.std_then for r in rows if r.what == row.what]) for row in rows}
+    return {
+        row.what: np.array([r.std_if_known for r in rows if r.what == row.what]) for row in rows
+    }
 
 
 def test_what_would_narrow_is_the_update_by_hand(monkeypatch):

@@ -90,8 +90,10 @@ def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(record):
 
 
 def test_what_is_known_and_would_narrow_it_is_in_the_record(fit, record):
+    first = record.details["narrower"][0]
+    assert first["what"] == "E_f anterior, pressure measured to ±3 mmHg"
+    assert first["std_if_known"] == fit.known.narrower[0].std_if_known < first["std_now"]
     for name, rows in (
-        ("narrower", fit.known.narrower),
         ("known", fit.known.quantities),
         ("data_alone", fit.known.data_alone),
     ):

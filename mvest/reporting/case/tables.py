@@ -92,16 +92,20 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             stretch="::largest [SD]",
         ),
         "whiteness": table(rows("whiteness"), name="::test", statistic="", p_value=":.2g"),
-        "budget": table(
-            rows("budget"),
-            part="::source of error",
-            modulus="",
-            without="::SD without it",
-            alone="::SD of it alone",
+        "known": table(
+            rows("known"),
+            name="::quantity",
+            unit="",
+            estimate=Column(low="low", high="high", label="estimate (95 % interval)"),
+            generic="::generic valve",
         ),
-        "image_errors": table(
-            rows("image_errors"), parameter="::modulus", samples=HIDDEN, share_of_variance=":.2f"
+        "data_alone": table(
+            rows("data_alone"),
+            parameter="::modulus",
+            estimate=Column("MPa", low="low", high="high", label="by the data alone"),
+            prior_stds=":.1f:from its prior [SD]",
         ),
+        "shares": _shares(rows("shares"), record.moduli),
         "image_frames": _chosen(rows("image_frames")),
         "settings": table(rows("settings")),
     }
@@ -137,6 +141,19 @@ def _narrower(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
         shares.setdefault(what, {})[label] = share
     ordered = sorted(shares.items(), key=lambda one: min(one[1].values()))
     return table(({"what": what, **share} for what, share in ordered), **columns)
+
+
+def _shares(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
+    """A row for each source of variance of the moduli, the largest first; less than 1 % is left out."""
+    labels = {one.name: one.label or one.name for one in moduli}
+    sources: dict[str, dict[str, float]] = {}
+    for row in rows:
+        own = sources.setdefault(row["source"], {})
+        own[labels.get(row["parameter"]) or str(row["parameter"])] = 100.0 * row["share"]
+    ordered = sorted(sources.items(), key=lambda one: -max(one[1].values()))
+    shown = [{"source": name, **own} for name, own in ordered if max(own.values()) >= 1.0]
+    columns = dict.fromkeys((label for own in sources.values() for label in own), "%:.0f")
+    return table(shown, source="::share of the variance", **columns)
 
 
 def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:

@@ -213,6 +213,21 @@ def _record(fields: dict[str, np.ndarray]) -> EstimateRecord:
                     "std_if_known": 0.5,
                 },
             ),
+            "shares": (
+                {"source": "thickness", "parameter": "E_f.anterior", "share": 0.6},
+                {"source": "pressure (factor)", "parameter": "E_f.anterior", "share": 0.395},
+                {"source": "fibres", "parameter": "E_f.anterior", "share": 0.005},
+            ),
+            "known": (
+                {
+                    "name": "ratio of E_f, anterior to posterior",
+                    "unit": "",
+                    "estimate": 2.6,
+                    "low": 2.3,
+                    "high": 3.0,
+                    "generic": 2.98,
+                },
+            ),
             "measurements": (
                 {"frame": "open", "shape": "observed", **shape, "annulus_area_mm2": 801.0},
                 {"frame": "closed", "shape": "observed", **shape},

@@ -266,7 +266,7 @@ def test_an_unusable_place_or_file_is_one_clear_error(case, tmp_path) -> None:
 # --- what is to be believed ---------------------------------------------------------------------
 
 LEAKS = Ground("closure", NONE, "the fitted valve leaves 121 mm² free", "check the chordae")
-WIDE = Ground("what the data add", DOUBTFUL, "the data narrow it to 80 %", "add a frame")
+WIDE = Ground("data against prior", DOUBTFUL, "the data narrow it to 80 %", "add a frame")
 
 
 def judged(case, folder, *arguments) -> tuple[str, str]:
@@ -277,7 +277,7 @@ def judged(case, folder, *arguments) -> tuple[str, str]:
 
 
 def test_no_number_is_stated_of_what_is_not_to_be_believed(case, tmp_path) -> None:
-    page, terminal = judged(case, tmp_path, NONE, (LEAKS, WIDE), ("distance",))
+    page, terminal = judged(case, tmp_path, NONE, (LEAKS, WIDE), ("geometry",))
     assert "No stiffness can be stated: the fitted valve leaves 121 mm² free." in page
     assert "NOT TO BE BELIEVED" in page
     assert "The fitted valve leaves 121 mm² free. Next: check the chordae." in page
@@ -287,14 +287,14 @@ def test_no_number_is_stated_of_what_is_not_to_be_believed(case, tmp_path) -> No
 
 
 def test_a_doubt_stands_before_the_numbers(case, tmp_path) -> None:
-    page, terminal = judged(case, tmp_path, DOUBTFUL, (WIDE,), ("distance",), ("closure",))
+    page, terminal = judged(case, tmp_path, DOUBTFUL, (WIDE,), ("geometry",), ("closure",))
     assert "Doubtful, since the data narrow it to 80 %: E_f anterior 5.8 MPa" in page
     assert "Not checked: closure." in page
     assert terminal.index("narrow it to 80 %") < terminal.index("5.8")
 
 
 def test_what_is_trusted_is_answered_by_its_numbers(case, tmp_path) -> None:
-    page, _ = judged(case, tmp_path, TRUSTWORTHY, (), ("distance", "closure"))
+    page, _ = judged(case, tmp_path, TRUSTWORTHY, (), ("geometry", "closure"))
     assert "Trustworthy: all 2 checks were passed." in page
     assert page.index("E_f anterior 5.8 MPa") < page.index("May it be believed?")
 
@@ -333,6 +333,15 @@ def test_what_narrows_most_stands_first(case) -> None:
     # 0.5 and 0.71 over 0.8, in per cent.
     assert [row["E_f anterior"] for row in rows] == pytest.approx([62.5, 88.75])
     assert rows[0]["what"] == "if the chordae were known"
+
+
+def test_where_the_variance_comes_from_is_told_as_far_as_it_matters(case, html) -> None:
+    rows = report_tables(case[0])["shares"].rows
+    assert [(row["source"], row["E_f anterior"]) for row in rows] == [
+        ("thickness", 60.0),
+        ("pressure (factor)", 39.5),
+    ]
+    assert "ratio of E_f, anterior to posterior" in Page(html).text
 
 
 def test_units_of_measurements_are_read_from_their_names(case) -> None:
