@@ -38,7 +38,7 @@ from mvest.personalisation.sources import (
     ErrorSource,
     closure_at,
     geometry_sources,
-    law_sources,
+    law_and_mesh_sources,
     of_low_rank,
 )
 from mvest.problem.problem import Observed
@@ -301,6 +301,7 @@ def linearise(
     """
     settings, observation = errors.fitted.settings, errors.fitted.observation()
     geometry, laws = settings.considered_geometry, settings.considered_law
+    mesh = settings.mesh.error_share
     if geometry is None and not laws:
         return errors
     if not settings.mechanics.protocol.equilibrium:
@@ -316,8 +317,8 @@ def linearise(
                 errors.modes, registered, observation, errors.noise(), m, predicted, seen
             )
         )
-    if laws:
-        found.append(law_sources(laws, registered, observation, m, predicted))
+    if laws or mesh:
+        found.append(law_and_mesh_sources(laws, mesh, registered, observation, m, predicted))
     return replace(
         errors,
         sources=tuple(own for part in found if not isinstance(part, str) for own in part),

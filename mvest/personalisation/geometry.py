@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from mvest.cases.case import Role, ValveCase
 from mvest.closure.model import ClosureModel
@@ -22,6 +23,8 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.surface_coordinates import surface_coordinates
+from mvest.valve.geometry.triangles import surface_edges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +42,10 @@ class ConsideredGeometry:
         Of each coordinate of the open shape, and over which distance its errors are alike.
     annulus_mm, annulus_length_mm : float
         Of the closed annulus.
+    leaflet_scale, annulus_scale, frame_scale : float
+        Relative: of the length of each leaflet from annulus to free edge in the open frame, of the
+        size of the closed annulus, and of all lengths of all frames together. Errors that are alike
+        over a few millimetres hardly contain them, and an outline drawn too wide is one of them.
     tips_mm : float
         Of each coordinate of a papillary tip.
     insertions_mm : float
@@ -66,6 +73,9 @@ class ConsideredGeometry:
     shape_length_mm: Length = 10.0
     annulus_mm: Length = 0.5
     annulus_length_mm: Length = 20.0
+    leaflet_scale: Share = 0.0
+    annulus_scale: Share = 0.0
+    frame_scale: Share = 0.0
     tips_mm: Length = 1.0
     insertions_mm: Length = 0.5
     rest_lengths: Share = 0.0
@@ -77,8 +87,9 @@ class ConsideredGeometry:
 
     def __post_init__(self) -> None:
         what = "considered geometry"
+        scales = "leaflet_scale", "annulus_scale", "frame_scale"
         sizes = "shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "rest_lengths", "thickness"
-        require_numbers(self, what, *sizes, "fibre_degrees", "renewals", least=0)
+        require_numbers(self, what, *scales, *sizes, "fibre_degrees", "renewals", least=0)
         require_numbers(self, what, "shape_length_mm", "annulus_length_mm")
         require_numbers(self, what, "factor", least=1)
         if not 0.0 < self.share < 1.0:
@@ -131,8 +142,14 @@ def geometry_modes(
             modes = smooth_modes(surface.vertices, considered.shape_length_mm, considered.share)
             moves = considered.shape_mm * _each_way(modes)
             kinds.append(GeometryModes("open shape", {"shape": moves}, considered.factor))
+        if considered.leaflet_scale:
+            moves = considered.leaflet_scale * leaflet_scales(case)
+            kinds.append(GeometryModes("leaflet scale", {"shape": moves}))
+        annulus = model.contact_valve.motion.annulus[-1]
+        if considered.annulus_scale:
+            moves = considered.annulus_scale * (annulus - annulus.mean(axis=0))[None]
+            kinds.append(GeometryModes("annulus scale", {"annulus": moves}))
         if considered.annulus_mm:
-            annulus = model.contact_valve.motion.annulus[-1]
             modes = smooth_modes(annulus, considered.annulus_length_mm, considered.share)
             moves = considered.annulus_mm * _each_way(modes)
             kinds.append(GeometryModes("annulus", {"annulus": moves}, considered.factor))
@@ -153,6 +170,11 @@ def geometry_modes(
     if considered.thickness:
         factors = considered.thickness * _leaflets(surface)
         kinds.append(GeometryModes("thickness", {"thickness": factors}))
+    if considered.frame_scale:
+        # A valve of twice the size under the same pressure has the same shape if it is twice as
+        # thick: all lengths seen too large are leaflets that are too thin.
+        factors = considered.frame_scale * np.ones((1, len(surface.vertices)))
+        kinds.append(GeometryModes("frame scale", {"thickness": factors}))
     if considered.fibre_degrees:
         angles = np.deg2rad(considered.fibre_degrees) * np.eye(len(surface.region_names))
         kinds.append(GeometryModes("fibres", {"fibres": angles}))
@@ -169,6 +191,29 @@ def smooth_modes(points: FloatArray, length: float, share: float) -> FloatArray:
     w = basis.w[order]
     count = int(np.searchsorted(np.cumsum(w), share * len(points))) + 1
     return np.asarray((basis.U[:, order[:count]] * np.sqrt(w[:count])).T)
+
+
+BLEND_STEPS = 10
+"""Averages over neighbours by which the scale of one leaflet fades into that of the next."""
+
+
+def leaflet_scales(case: ValveCase) -> FloatArray:
+    """Displacements ``(regions, n, 3)`` mm that make each leaflet twice as long, from its annulus.
+
+    A vertex moves away from the point of the annulus at the same angle; the annulus stays.
+    """
+    surface = case.surface
+    x, n = surface.vertices, len(surface.vertices)
+    edges = surface_edges(surface.triangles)
+    ends = np.concatenate([edges, edges[:, ::-1]])
+    near = sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n, n))
+    weights = _leaflets(surface).T
+    for _ in range(BLEND_STEPS):
+        weights = 0.5 * (weights + (near @ weights) / near.sum(axis=1)[:, None])
+    theta = surface_coordinates(x, surface.triangles, case.annulus, case.free_edge).theta
+    on = case.annulus[np.argsort(theta[case.annulus])]
+    foot = [np.interp(theta, theta[on], x[on, k], period=2.0 * np.pi) for k in range(3)]
+    return np.asarray(weights.T[:, :, None] * (x - np.stack(foot, axis=1)))
 
 
 def _each_way(modes: FloatArray) -> FloatArray:

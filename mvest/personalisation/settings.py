@@ -139,6 +139,18 @@ class CaseMesh:
     contact_columns: PointsAround = 144
     contact_rows: PointsAlong = 32
 
+    @property
+    def error_share(self) -> float:
+        """Share of its difference from the mesh of the guide by which a mesh is off.
+
+        Of a structured one by the extrapolation of Richardson for errors of second order; of an
+        unstructured one, which is no refinement of the guide, all of it.
+        """
+        if self.source == "structured":
+            finer = self.columns / self.guide_columns
+            return 1.0 / (finer**2 - 1.0) if finer > 1.0 else 0.0
+        return 1.0
+
     def __post_init__(self) -> None:
         if self.source not in ("structured", "tetwild"):
             raise InputError(f"mesh source {self.source!r}, expected structured or tetwild")
@@ -307,7 +319,13 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
         confirm=True,
         errors=ErrorBeliefs(resolution_mm=0.1),
         considered_geometry=ConsideredGeometry(
-            rest_lengths=0.06, thickness=0.2, share=0.98, renewals=6
+            leaflet_scale=0.03,
+            annulus_scale=0.02,
+            frame_scale=0.02,
+            rest_lengths=0.06,
+            thickness=0.2,
+            share=0.98,
+            renewals=6,
         ),
         considered_law=CURVES,
         pressures=PressureErrors(),
@@ -324,7 +342,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
         ),
         errors=ErrorBeliefs(resolution_mm=0.3),
         considered_geometry=ConsideredGeometry(
-            shape_mm=0.0, annulus_mm=0.0, tips_mm=0.0, rest_lengths=0.04
+            shape_mm=0.0, annulus_mm=0.0, tips_mm=0.0, frame_scale=0.02, rest_lengths=0.04
         ),
         considered_law={},
     )

@@ -29,8 +29,8 @@ from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
 
-LAW = "law"
-"""Name of the error of the tissue's law."""
+LAW, MESH = "law", "mesh"
+"""Names of the errors of the tissue's law and of the mesh."""
 
 VISIBLE = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
@@ -95,7 +95,8 @@ def geometry_sources(
     change = geometry.change(at, joined, states, TOLERANCE)
     if isinstance(change, str):
         return change
-    moves, rows = observed_change(registered, observation, m, predicted, change)
+    moves = seen_change(registered, m, change)
+    rows = observed_change(observation, predicted, moves)
     ends = np.cumsum([len(own) for own in modes])[:-1]
     return tuple(
         ErrorSource(
@@ -107,32 +108,55 @@ def geometry_sources(
     )
 
 
-def law_sources(
+def law_and_mesh_sources(
     tissue: Mapping[str, ExponentialTissue],
+    mesh_share: float,
     registered: RegisteredModel,
     observation: Observed,
     m: FloatArray,
     predicted: FloatArray,
 ) -> tuple[ErrorSource, ...] | str:
-    """Errors of an observation from those of the law, or why they are not known.
+    """Errors of an observation from those of law and mesh, or why they are not known.
 
     A case is estimated with the linear law, and tissue stiffens: at the same mean stress its shape
     is another. One leaflet after another gets an exponential tissue that is as stiff as the linear
     one where closed leaflets are stretched. By how much the new equilibrium moves what is observed
     is one standard deviation of how far the tissue is on its way from one law to the other.
 
+    What a mesh leaves of the error of a coarser one, where there is one, is one standard deviation
+    of the error of the mesh.
+
     Parameters
     ----------
     tissue : mapping
         Region -> exponential tissue, of which only the shape of its curve counts.
+    mesh_share : float
+        Share of the difference between both meshes that the finer one is off; 0: not asked.
     registered, observation, m, predicted
         As of `geometry_sources`; at ``m`` the tissues are as stiff as the linear ones.
     """
-    change = law_change(*closure_at(registered, m), tissue)
-    if isinstance(change, str):
-        return change
-    moves, rows = observed_change(registered, observation, m, predicted, change)
-    return (ErrorSource(ErrorColumns(LAW, rows), rows, moves),)
+    model, at, states = closure_at(registered, m)
+    coarse = model.guide or model
+    first = coarse.rests(np.asarray(at, dtype=np.float64), states)
+    if not first[-1].converged:
+        return first[-1].reason.value
+    found = []
+    if tissue:
+        change = law_change(coarse, at, states, tissue, first)
+        if isinstance(change, str):
+            return change
+        moves = seen_change(registered, m, change)
+        rows = observed_change(observation, predicted, moves)
+        found.append(ErrorSource(ErrorColumns(LAW, rows), rows, moves))
+    if mesh_share and model.guide is not None:
+        fine = predicted.reshape(-1, *model.valve.surface.vertices.shape)
+        moves = np.zeros((*fine.shape, 1))
+        moves[1:, ..., 0] = mesh_share * (
+            fine[1:] - registered.seen(_observed(coarse, first)[1:], m)
+        )
+        rows = observed_change(observation, predicted, moves)
+        found.append(ErrorSource(ErrorColumns(MESH, rows), rows, moves))
+    return tuple(found)
 
 
 def law_change(
@@ -140,29 +164,28 @@ def law_change(
     m: FloatArray,
     states: Sequence[HeldState],
     tissue: Mapping[str, ExponentialTissue],
+    first: Sequence[Simulation],
 ) -> FloatArray | str:
     """Change ``(f, n, 3, q)`` mm of the observed valve with another law, or why there is none.
 
     The open valve is the first frame and stays, the closed one the last; the states come between
-    them. The mesh is that of the guide where there is one: a closure that follows no guide takes as
-    long as an estimation on the other.
+    them.
 
     Parameters
     ----------
     model : ClosureModel
-        Its last closed state is gone on from.
+        On a coarse mesh: a closure that follows no guide takes as long as an estimation on a fine
+        one.
     m : (p,)
         Parameters of the closure.
     states : sequence of HeldState
         Under other loads, gone to from the closed valve.
     tissue : mapping
-        As for `law_sources`.
+        As for `law_and_mesh_sources`.
+    first : sequence of Simulation
+        Closed valve and states with the linear law.
     """
-    model = model.guide or model
     at = np.asarray(m, dtype=np.float64)
-    first = model.rests(at, states)
-    if not first[-1].converged:
-        return first[-1].reason.value
     values = {**model.fixed, **dict(zip(model.names, map(float, at), strict=True))}
     changes = []
     for region, linear in model.settings.tissue.items():
@@ -203,22 +226,20 @@ def closure_at(
     return model.model, registered.mechanical(m), model.under(registered.own(m), model.states)
 
 
-def observed_change(
-    registered: RegisteredModel,
-    observation: Observed,
-    m: FloatArray,
-    predicted: FloatArray,
-    change: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Changes ``(f, n, 3, q)`` mm of the valve as they are seen, and of an observation ``(k, q)``.
-
-    ``predicted`` are all frames at ``m (p,)``, stacked.
-    """
+def seen_change(registered: RegisteredModel, m: FloatArray, change: FloatArray) -> FloatArray:
+    """Changes ``(f, n, 3, q)`` mm of the valve as they are seen, all frames but the open turned."""
     turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
-    turned = np.concatenate([change[:1], np.einsum("ij,fnjq->fniq", turn, change[1:])])
-    jacobian = turned.reshape(len(predicted), -1)
+    return np.concatenate([change[:1], np.einsum("ij,fnjq->fniq", turn, change[1:])])
+
+
+def observed_change(observation: Observed, predicted: FloatArray, moves: FloatArray) -> FloatArray:
+    """What seen changes ``(f, n, 3, q)`` mm of the valve do to an observation ``(k, q)``.
+
+    ``predicted`` are all frames, stacked.
+    """
+    jacobian = moves.reshape(len(predicted), -1)
     linear = observation.of(lambda _: Prediction(predicted, jacobian))
-    return turned, predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
+    return predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
 
 
 def of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:

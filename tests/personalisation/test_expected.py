@@ -51,7 +51,7 @@ def dense(result):
 def stiffening(monkeypatch):
     use(monkeypatch)
     monkeypatch.setattr(
-        "mvest.personalisation.errors.law_sources",
+        "mvest.personalisation.errors.law_and_mesh_sources",
         lambda *_: (error_source(OTHER),),
     )
 

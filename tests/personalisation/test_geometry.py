@@ -33,6 +33,7 @@ from mvest.personalisation.geometry import (
     GeometryModes,
     displacement,
     geometry_modes,
+    leaflet_scales,
     rest_lengths_by_ends,
     rest_lengths_by_tips,
     smooth_modes,
@@ -136,6 +137,34 @@ def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_i
     # What samples of all frames tell of is not added a second time.
     case.error_samples = ()
     assert columns_of(shape_mm=0.3, tips_mm=1.0) == ()
+
+
+def test_a_scale_of_a_leaflet_makes_it_longer_and_leaves_the_other_and_the_annulus():
+    case = corresponding(48, 12)
+    surface = case.surface
+    # Columns of the grid through the middle of either leaflet, from annulus to free edge.
+    lines = [12 + 48 * np.arange(12), 36 + 48 * np.arange(12)]
+    for k, moves in enumerate(leaflet_scales(case)):
+        assert not moves[case.annulus].any()
+        for x, line in enumerate(lines):
+            before, after = (
+                np.linalg.norm(np.diff(points[line], axis=0), axis=1).sum()
+                for points in (surface.vertices, surface.vertices + 0.04 * moves)
+            )
+            assert after / before - 1.0 == pytest.approx(0.04 * (x == k), abs=0.006)
+
+
+def test_scales_of_annulus_and_of_all_lengths_are_what_they_say():
+    model = model_of(GENTLE, **SMALL)
+    case = SimpleNamespace(
+        surface=model.valve.surface, valve=model.valve, error_samples=None, chordae_follow=False
+    )
+    (annulus,) = geometry_modes(case, replace(NONE, annulus_scale=0.02), model)
+    closed = model.contact_valve.motion.annulus[-1]
+    np.testing.assert_allclose(annulus.parts["annulus"][0], 0.02 * (closed - closed.mean(axis=0)))
+    (whole,) = geometry_modes(case, replace(NONE, frame_scale=0.02), model)
+    # A valve that is larger, and as much thicker, has the same shape under the same pressure.
+    np.testing.assert_allclose(whole.parts["thickness"], 0.02)
 
 
 def laid_out(case, tips=0.0, open_move=0.0, closed_move=0.0):
@@ -528,7 +557,7 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
 
 def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
-    monkeypatch.setattr("mvest.personalisation.errors.law_sources", lambda *_: "no law")
+    monkeypatch.setattr("mvest.personalisation.errors.law_and_mesh_sources", lambda *_: "no law")
     fit = personalise(
         case,
         settings(

@@ -523,7 +523,7 @@ def test_a_law_that_is_not_known_is_not_averaged_away_beside_error_samples(monke
     use_geometry(monkeypatch)
     column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
     monkeypatch.setattr(
-        "mvest.personalisation.errors.law_sources", lambda *_: (error_source(column),)
+        "mvest.personalisation.errors.law_and_mesh_sources", lambda *_: (error_source(column),)
     )
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
     law = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}

@@ -144,7 +144,7 @@ def _narrower(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
 
 
 def _shares(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
-    """A row for each source of variance of the moduli, the largest first; less than 1 % is left out."""
+    """A row for each source of variance of the moduli, the largest first; none below 1 %."""
     labels = {one.name: one.label or one.name for one in moduli}
     sources: dict[str, dict[str, float]] = {}
     for row in rows:
