@@ -31,7 +31,6 @@ from mvest.estimation.information.design import Design, together
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.design import (
     HALF,
     KINDS,
@@ -39,6 +38,7 @@ from mvest.personalisation.design import (
     StatedErrors,
     design_case,
 )
+from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
 from mvest.problem.record import EstimateRecord, confounded, finite, record_of

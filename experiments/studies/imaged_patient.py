@@ -14,6 +14,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mvest.personalisation.error_budget import EVERYTHING
 from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
@@ -34,7 +35,6 @@ from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
-from mvest.personalisation.error_budget import EVERYTHING
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.skill import GENERIC, generic_guess
 from mvest.problem.stored import Store

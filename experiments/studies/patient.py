@@ -23,7 +23,8 @@ from scipy.stats import binom, chi2, norm
 from experiments.common.building.gate import gate_of
 from experiments.common.building.patient_store import PatientPlace, make_patient
 from experiments.common.cases.blind import estimate_blindly
-from experiments.common.cases.own_case import case_words, expect_own, write_report
+from experiments.common.cases.check import check
+from experiments.common.cases.own_case import case_words, write_report
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import Values, build
@@ -167,10 +168,10 @@ def _nees(estimate: EstimateRecord) -> float | None:
     return float(z @ np.linalg.solve(np.array(estimate.correlation), z)) / len(z)
 
 
-def expect_patient(values: Values, folder: Path | None = None) -> str:
+def check_patient(values: Values, folder: Path) -> str:
     """What to expect of a virtual patient's case, which is simulated first unless it is there."""
     patient = values["patient"] and build(PatientSettings, values["patient"])
-    return expect_own({**values, "case": str(make_patient(values, patient).case)}, folder)
+    return check(values, read_case(make_patient(values, patient).case), folder)
 
 
 # -- tables ---------------------------------------------------------------------------------------
@@ -639,5 +640,5 @@ STUDY = Study(
     keep=keep,
     keep_arrays=keep_arrays,
     keeps_failures=True,
-    checks=lambda: (expect_patient,),
+    checks=lambda: (check_patient,),
 )

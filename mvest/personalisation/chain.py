@@ -146,13 +146,13 @@ def known_of(problem: CaseProblem, estimate: CaseEstimate) -> Known:
     """What an estimate knows and what limits it, to first order about it."""
     filtered = estimate.result.filtered
     assert filtered is not None
-    model = LinearModel(filtered, estimate.errors)
+    model = LinearModel.of(filtered, estimate.errors)
     return Known(
         quantities=(
-            *derived_quantities(problem, model),
+            *derived_quantities(filtered),
             *strains(problem, estimate, model),
         ),
-        data_alone=data_alone(model),
+        data_alone=data_alone(filtered),
         shares=variance_shares(model),
         narrower=narrower(problem, model),
         geometry=geometry_shifts(problem, estimate),

@@ -21,16 +21,15 @@ from mvest.estimation.information.design import Design, together
 from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.prediction import predict
 from mvest.personalisation.errors import FrameErrors, linearise
-from mvest.personalisation.estimation import CaseProblem, linearised
+from mvest.personalisation.estimation import CaseProblem
 from mvest.personalisation.model import build_model
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors, Treatment
-from mvest.problem.expectation import Expectation, expect
 
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
 """Of the closed frame's pressure, under which the frames of designs are: 120 to 60 mmHg."""
 
 HALF = 0.5
-"""Of the prior's standard deviation, at which half the error of the generic guess is left."""
+"""Of the prior's standard deviation: half the error of the generic guess."""
 
 ERRORS_MMHG = (0.0, 2.0, 5.0, 10.0, 20.0)
 """Errors of pressures that designs are compared with."""
@@ -150,13 +149,6 @@ class FrameDesigns:
         std = dict(zip(bound.names, map(float, bound.std), strict=True))
         return {modulus: std[modulus] / self.knowledge[modulus] for modulus in self.moduli}
 
-    def enough(self, modulus: str, errors: StatedErrors | None = None) -> int | None:
-        """How many frames leave half of the generic guess's error or less; None: all leave more."""
-        for count in range(1, len(self.frames) + 1):
-            if self.left(count, errors)[modulus] <= HALF:
-                return count
-        return None
-
     def rows(self) -> Iterator[dict[str, Any]]:
         """Tidy rows of what each design leaves of each modulus' error, ``left`` in percent of it.
 
@@ -183,97 +175,6 @@ class FrameDesigns:
                     }
 
 
-def design_text(title: str, designs: FrameDesigns) -> str:
-    """A table for a terminal: what is left of the generic guess's error, and what it takes.
-
-    Shares are in percent, one for each modulus.
-    """
-    names = [modulus.partition(".")[2] for modulus in designs.moduli]
-    own = designs.stated
-    rows = {
-        f"as stated ({100 * own.factor:.3g} % in common, offset {own.offset:g}, each {own.each:g})":
-        None,
-        "none": designs.of_kind("each", 0.0),
-    } | {
-        f"{mmhg:g} mmHg {words}": designs.of_kind(kind, mmhg)
-        for kind, words in KINDS.items()
-        for mmhg in (5.0, 20.0)
-    }  # fmt: skip
-    counts = range(1, len(designs.frames) + 1)
-    width = max(map(len, rows))
-    lines = [
-        f"{title}: closed frames like this one under "
-        f"{', '.join(f'{p:.3g}' for p in designs.pressures_mmHg)} mmHg; "
-        f"what they leave of the generic guess's error, {' / '.join(names)} (%)",
-        f"  {'errors of the pressures':<{width}}"
-        + "".join(f"{f'{n} frame' + 's' * (n > 1):>10}" for n in counts),
-    ]
-    for label, errors in rows.items():
-        left = (designs.left(n, errors).values() for n in counts)
-        cells = ("/".join(f"{100 * share:.0f}" for share in shares) for shares in left)
-        lines.append(f"  {label:<{width}}" + "".join(f"{cell:>10}" for cell in cells))
-    return "\n".join([*lines, *(f"  {_enough(designs, modulus)}" for modulus in designs.moduli)])
-
-
-def _enough(designs: FrameDesigns, modulus: str) -> str:
-    """What it takes for half the generic guess's error, or what keeps that from being reached."""
-    name, largest = modulus.partition(".")[2], len(designs.frames)
-    count = designs.enough(modulus)
-    if count is not None:
-        widest = [
-            (
-                max(
-                    (e for e in ERRORS_MMHG
-                     if designs.left(count, designs.of_kind(kind, e))[modulus] <= HALF),
-                    default=0.0,
-                ),
-                kind,
-            )
-            for kind in KINDS
-        ]  # fmt: skip
-        frames = "this frame" if count == 1 else f"{count} frames"
-        return (
-            f"E_f {name}: half of it is left with {frames} and pressures as stated; with errors of "
-            f"one kind alone, up to {', '.join(f'{e:.0f} mmHg ({kind})' for e, kind in widest)}"
-        )
-    exact = designs.enough(modulus, designs.of_kind("each", 0.0))
-    if exact is not None:
-        return (
-            f"E_f {name}: half of it is left with {exact} frame{'s' * (exact > 1)} if the "
-            f"pressures are exact, not with {largest} as they are stated"
-        )
-    left, best = min(
-        (designs.left(largest, known=known)[modulus], words)
-        for words, known in designs.groups.items()
-    )
-    return (
-        f"E_f {name}: more than half of it is left with {largest} frames, also if the pressures "
-        f"were exact; to know {best} would help best ({100 * left:.0f} % left)"
-    )
-
-
-def expect_case(
-    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
-) -> Expectation:
-    """What the frames of a case will tell, found out with one closure; see `personalise`.
-
-    Errors that samples of the frames tell of are left out: each sample would be a closure.
-
-    Parameters
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    model : ClosureModel, optional
-        As `build_model` makes it; one that has closed already need not do so again.
-    """
-    problem = CaseProblem.of(case, settings, model=model)
-    generic = problem.generic()
-    if generic.prediction.converged:
-        generic = linearised(generic, problem)
-    plain = problem.filter(settings.tolerance)
-    return expect(problem.problem(problem.stated, plain), generic.errors.observation())
-
-
 def design_case(
     case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
 ) -> FrameDesigns | str:
@@ -281,7 +182,7 @@ def design_case(
 
     The frames are held and seen as the closed one, under shares of its pressure (`SHARES`): one
     closure, and an equilibrium with its derivatives for each. Errors of which samples tell are left
-    out. Parameters are those of `expect_case`.
+    out. Parameters are those of `mvest.personalisation.check.expect_case`.
     """
     model = build_model(case, settings) if model is None else model
     closed = case.frame(Role.CLOSED)

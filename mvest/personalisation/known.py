@@ -15,6 +15,7 @@ import numpy as np
 
 from mvest.closure.frames import SCALE, is_frame_pressure
 from mvest.estimation.estimate import Estimate
+from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.noise import low_rank_noise
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import to_filter
@@ -110,33 +111,44 @@ class DataAlone:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """The observation to first order about an estimate.
+    """The observation to first order about a closed valve.
 
     Attributes
     ----------
-    filtered : Estimate
+    names : tuple of str, (p,)
+        Of the unknowns.
+    prior : (p, p)
+        Covariance of the unknowns beforehand, in filter coordinates.
+    H : (k, p)
+        Derivatives of the observation in these.
     errors : FrameErrors
         Of the fitted frames beside the unknowns.
+    learned : LearnedNoise or None
+        Size of the errors as it was learned; None: as it is stated.
     """
 
-    filtered: Estimate
+    names: tuple[str, ...]
+    prior: FloatArray
+    H: FloatArray
     errors: FrameErrors
+    learned: LearnedNoise | None = None
+
+    @classmethod
+    def of(cls, filtered: Estimate, errors: FrameErrors) -> LinearModel:
+        """About an estimate."""
+        prior = to_filter(filtered.transform, filtered.prior).covariance
+        return cls(filtered.names, prior, slopes(filtered), errors, filtered.learned)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of the unknowns, ``(p,)``."""
-        return self.filtered.names
-
-    @cached_property
-    def prior(self) -> FloatArray:
-        """Covariance ``(p, p)`` of the unknowns beforehand."""
-        return to_filter(self.filtered.transform, self.filtered.prior).covariance
+    def moduli(self) -> list[int]:
+        """Which unknowns are moduli."""
+        return [k for k, name in enumerate(self.names) if name.startswith("E_f.")]
 
     @cached_property
     def columns(self) -> Mapping[str, FloatArray]:
         """Source -> what its modes of unit variance do to the observation ``(k, q)``."""
-        errors, learned = self.errors, self.filtered.learned
-        sizes = errors.source_sizes(learned)
+        errors = self.errors
+        sizes = errors.source_sizes(self.learned)
         own = {source.name: sizes[source.name] * source.rows for source in errors.sources}
         return own if errors.samples is None else own | {IMAGES: errors.samples.columns}
 
@@ -148,8 +160,8 @@ class LinearModel:
 
     def information(self, beats: float = 1.0) -> FloatArray:
         """What the mean of several beats says of unknowns and modes, ``(p + q, p + q)``."""
-        noise = self.errors.single_noise(self.filtered.learned, beats=beats)
-        A = noise.whiten(np.concatenate([slopes(self.filtered), *self.columns.values()], axis=1))
+        noise = self.errors.single_noise(self.learned, beats=beats)
+        A = noise.whiten(np.concatenate([self.H, *self.columns.values()], axis=1))
         return np.asarray(A.T @ A)
 
     @cached_property
@@ -193,7 +205,7 @@ class LinearModel:
             return None
         columns = [sizes.get(k, 1.0) * own for k, own in self.columns.items() if k != IMAGES]
         beside = np.concatenate(columns, axis=1) if columns else None
-        base = self.errors.single_noise(self.filtered.learned, beats=beats)
+        base = self.errors.single_noise(self.learned, beats=beats)
         own = replace(
             samples,
             base=base if beside is None else low_rank_noise(base, beside),
@@ -201,21 +213,21 @@ class LinearModel:
             beside=beside,
         )
         scale = np.array([sizes.get(name, 1.0) for name in self.names])
-        return own.posterior(slopes(self.filtered), self.prior * np.outer(scale, scale))
+        return own.posterior(self.H, self.prior * np.outer(scale, scale))
 
     def variances(self, sizes: Mapping[str, float] | None = None, beats: float = 1.0) -> FloatArray:
         """Variances ``(p,)`` of the unknowns, what is not known of the errors' size included."""
         found = self.sampled(sizes, beats)
         covariance = self.covariance(sizes, beats) if found is None else found.covariance
-        own, learned = np.diag(covariance)[: len(self.names)], self.filtered.learned
+        own, learned = np.diag(covariance)[: len(self.names)], self.learned
         # That doubt is of the errors of now; of smaller ones it is as much smaller.
         return own if learned is None else own + np.diag(learned.covariance) / beats
 
     def variance_of(self, slopes_: FloatArray) -> FloatArray:
         """Variances ``(...)`` of what depends on unknowns and modes by slopes ``(..., p + q)``."""
         p, covariance = len(self.names), self.covariance()
-        if self.filtered.learned is not None:
-            covariance[:p, :p] += self.filtered.learned.covariance
+        if self.learned is not None:
+            covariance[:p, :p] += self.learned.covariance
         if self._sampled is None:
             return np.einsum("...j,jk,...k->...", slopes_, covariance, slopes_)
         images = np.array(self.sources) == IMAGES
@@ -250,8 +262,8 @@ class LinearModel:
             parts[source] = parts.get(source, 0.0) + by_prior[:, k] ** 2 * variances[k]
         if self._sampled is not None:
             parts[IMAGES] = np.diag(self._sampled.from_samples)
-        if self.filtered.learned is not None:
-            parts[DOUBT] = np.diag(self.filtered.learned.covariance)
+        if self.learned is not None:
+            parts[DOUBT] = np.diag(self.learned.covariance)
         return parts
 
 
@@ -262,7 +274,7 @@ def variance_shares(model: LinearModel) -> tuple[VarianceShare, ...]:
         VarianceShare(source, name, float(part[k] / total[k]))
         for source, part in model.shares.items()
         for k, name in enumerate(model.names)
-        if name.startswith("E_f.")
+        if k in model.moduli
     )
 
 
@@ -292,7 +304,7 @@ def narrower(problem: CaseProblem, model: LinearModel) -> tuple[Narrower, ...]:
     Errors of mesh and linearisation, which no measurement takes away, and the law of the tissue
     stay as they are.
     """
-    moduli = [k for k, name in enumerate(model.names) if name.startswith("E_f.")]
+    moduli = model.moduli
     measured = dict(_measurable(problem, model))
     exact = {source: 0.0 for sizes in measured.values() for source in sizes}
 
@@ -341,17 +353,16 @@ def _measurable(problem: CaseProblem, model: LinearModel) -> Iterator[tuple[str,
             yield words, {source: factor}
 
 
-def data_alone(model: LinearModel) -> tuple[DataAlone, ...]:
+def data_alone(filtered: Estimate) -> tuple[DataAlone, ...]:
     """Each modulus without its own prior, to first order about the estimate.
 
     Precisions add up: 1 / v = 1 / v₀ + 1 / v_data of the variances of a modulus' logarithm. Empty
     for a modulus of which the data say nothing.
     """
-    filtered = model.filtered
     prior = to_filter(filtered.transform, filtered.prior)
     after = filtered.transformed
     found = []
-    for k, name in enumerate(model.names):
+    for k, name in enumerate(filtered.names):
         left = after.std[k] ** 2 / prior.std[k] ** 2
         if not name.startswith("E_f.") or left >= 1.0:
             continue
@@ -363,16 +374,16 @@ def data_alone(model: LinearModel) -> tuple[DataAlone, ...]:
     return tuple(found)
 
 
-def derived_quantities(problem: CaseProblem, model: LinearModel) -> tuple[Quantity, ...]:
+def derived_quantities(filtered: Estimate) -> tuple[Quantity, ...]:
     """What is known better than the moduli: their ratio, and each for the stated pressure.
 
     An error of the pressure moves all moduli together, and so does one of the thickness: neither
     changes their ratio. A modulus over the factor on the pressure is what the closed shape tells
     if the stated pressure is right.
     """
-    filtered = model.filtered
+    names = filtered.names
     after, prior = filtered.transformed, to_filter(filtered.transform, filtered.prior)
-    moduli = [k for k, name in enumerate(model.names) if name.startswith("E_f.")]
+    moduli = [k for k, name in enumerate(names) if name.startswith("E_f.")]
 
     def quantity(name: str, unit: str, direction: Mapping[int, float]) -> Quantity:
         d = np.zeros(len(after.mean))
@@ -381,15 +392,15 @@ def derived_quantities(problem: CaseProblem, model: LinearModel) -> tuple[Quanti
         estimate, low, high = np.exp([middle, middle - reach, middle + reach]).tolist()
         return Quantity(name, unit, estimate, low, high, float(np.exp(d @ prior.mean)))
 
-    regions = {k: model.names[k].partition(".")[2] for k in moduli}
+    regions = {k: names[k].partition(".")[2] for k in moduli}
     found = [
         quantity(
             f"ratio of E_f, {regions[moduli[0]]} to {regions[k]}", "", {moduli[0]: 1.0, k: -1.0}
         )
         for k in moduli[1:]
     ]
-    if SCALE in model.names:
-        at = model.names.index(SCALE)
+    if SCALE in names:
+        at = names.index(SCALE)
         found += [
             quantity(f"E_f {regions[k]} if the stated pressure is right", "MPa", {k: 1.0, at: -1.0})
             for k in moduli
@@ -438,12 +449,12 @@ def strains(
 
 def _moves(problem: CaseProblem, estimate: CaseEstimate, model: LinearModel) -> FloatArray:
     """What unknowns and modes do to the valve, ``(f, n, 3, p + q)`` mm, the open frame first."""
-    place, errors, filtered = estimate.place, estimate.errors, model.filtered
+    place, errors = estimate.place, estimate.errors
     n = len(problem.case.surface.vertices)
-    z = filtered.transform.forward(place.m)
-    jacobian = place.prediction.jacobian * filtered.transform.derivative(z)
+    z = problem.transform.forward(place.m)
+    jacobian = place.prediction.jacobian * problem.transform.derivative(z)
     parts = [jacobian.reshape(-1, n, 3, len(z))]
-    sizes = errors.source_sizes(filtered.learned)
+    sizes = errors.source_sizes(model.learned)
     parts += [sizes[source.name] * source.moves for source in errors.sources]
     if errors.frame_samples is not None:
         own = errors.frame_samples

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.building.closure import mechanics_of, mesh_store
-from experiments.common.building.twin import noise_words
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.progress import PartBar, SolveBar
 from experiments.common.records.record import (
@@ -20,7 +19,7 @@ from experiments.common.records.record import (
     Record,
     has_passed,
 )
-from experiments.common.schema import Values, build
+from experiments.common.schema import Values
 from experiments.common.study import Result
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
@@ -34,8 +33,7 @@ from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
 from mvest.imaging.detection.detect import NoValveError
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.design import design_case, design_text, expect_case
-from mvest.personalisation.model import build_model, with_pressures
+from mvest.personalisation.model import with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.settings import (
     PersonaliseSettings,
@@ -46,7 +44,6 @@ from mvest.personalisation.settings import (
 from mvest.problem.record import EstimateRecord, Row
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
-from mvest.reporting.expectation import expectation_text
 
 TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
@@ -209,24 +206,3 @@ def write_report(folder: Path, record: Record) -> list[Path]:
         line=record.line,
         provenance=record.provenance.model_dump(),
     )
-
-
-def expect_own(values: Values, _folder: Path | None = None) -> str:
-    """What ``check=true`` says of a case: the answer of the Fisher information."""
-    case = read_configured(values["case"])
-    if case.closed is None:
-        return f"{case.name}: an open frame alone, from which nothing can be estimated"
-    settings = settings_of(values, build(PersonalSettings, values["personal"]))
-    model = build_model(case, settings, mesh_store(values))
-    with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-        model.on_step = bar.step
-        expected = expect_case(case, settings, model)
-        designs = design_case(case, settings, model)
-    stated = case.uncertainty
-    noise = noise_words("stated", [stated.typical_mm], stated.correlation_length_mm)
-    further = (
-        f"{case.name}: what further closed frames would tell is not known ({designs})"
-        if isinstance(designs, str)
-        else design_text(case.name, designs)
-    )
-    return f"{expectation_text(case.name, expected, noise)}\n{further}"

@@ -10,7 +10,7 @@ import base64
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,13 @@ from pandas import json_normalize
 from mvest.cases.from_images.detected import DetectedValve
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
+from mvest.personalisation.check import Expected
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Personalised
 from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord, Spread
 from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure
-from mvest.reporting.case.tables import report_tables, unknown_table
+from mvest.reporting.case.tables import expected_tables, report_tables, unknown_table
 from mvest.reporting.case.view import CAMERAS, case_view
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
@@ -33,7 +34,7 @@ from mvest.reporting.images.step import write_image_step
 from mvest.reporting.markup import ended, number
 from mvest.reporting.pictures import TEMPLATES, embedded, rendered
 
-REPORT, UNKNOWNS = "report.html", "unknowns.csv"
+REPORT, UNKNOWNS, CHECK = "report.html", "unknowns.csv", "check.html"
 SCRIPT = TEMPLATES / "case_report.js"
 FULL_WIDTH_INCHES = 8.6
 """Of a picture as wide as the page; print is equally large in narrower ones."""
@@ -90,6 +91,33 @@ def report(
     if not arrays:
         return written
     return [*written, *_write_page(folder, record, case_fields(arrays), line, provenance or {})]
+
+
+def check_page(
+    folder: Path, title: str, lines: Sequence[str], expected: Expected, picture: Path
+) -> Path:
+    """Write ``check.html``: a case as it was read, and what an estimate of it could tell.
+
+    Parameters
+    ----------
+    folder : Path
+    title : str
+    lines : sequence of str
+        What was found while the case was read.
+    expected : Expected
+    picture : Path
+        The case, drawn.
+    """
+    tables = {name: one.readable() for name, one in expected_tables(expected).items()}
+    page = rendered(
+        "check.html.jinja",
+        title=title,
+        lines=lines,
+        reason=expected.reason,
+        picture=embedded(picture),
+        tables=tables,
+    )
+    return write_atomically(folder / CHECK, page)
 
 
 def _write_page(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import Any
 
+from mvest.personalisation.check import Expected
+from mvest.personalisation.record import label_of
 from mvest.problem.record import EstimateRecord, FrameFit, Row, Unknown
 from mvest.problem.verdict import NONE
 from mvest.reporting.markup import ended
@@ -110,6 +113,31 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
         "settings": table(rows("settings")),
     }
     return {name: one for name, one in tables.items() if len(one)}
+
+
+def expected_tables(expected: Expected) -> dict[str, Table]:
+    """What an estimate could tell, by name: ``unknowns``, ``shares`` and ``narrower``."""
+    moduli = [
+        Unknown(name=one.name, label=label_of(one.name))
+        for one in expected.unknowns
+        if one.name.startswith("E_f.")
+    ]
+    rows = [asdict(one) | {"label": label_of(one.name)} for one in expected.unknowns]
+    shares = [asdict(one) | {"source": label_of(one.source)} for one in expected.shares]
+    return {
+        "unknowns": table(
+            rows,
+            name=HIDDEN,
+            label="::unknown",
+            unit="",
+            generic=Column(low="low_before", high="high_before", label="generic (beforehand)"),
+            low="::from",
+            high="::to",
+            width=Column(label="width left", digits=".2f"),
+        ),
+        "shares": _shares(shares, moduli),
+        "narrower": _narrower([asdict(one) for one in expected.narrower], moduli),
+    }
 
 
 def estimate_text(record: EstimateRecord) -> str:

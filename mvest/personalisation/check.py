@@ -1,0 +1,113 @@
+"""What an estimate of a case could tell, found out before anything is estimated.
+
+The information of an observation needs a model, where it is believed to be, and what is seen how
+well; it needs no observed value. So one closure of the generic valve on the coarse mesh of the
+guide, with its derivatives, says which intervals to expect, what they rest on and what would narrow
+them (`mvest.personalisation.known`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.cases.case import ValveCase
+from mvest.closure.model import ClosureModel
+from mvest.estimation.prediction import predict
+from mvest.estimation.transform import to_filter
+from mvest.personalisation.estimation import CaseProblem, linearised, sampled
+from mvest.personalisation.known import (
+    REACH,
+    LinearModel,
+    Narrower,
+    VarianceShare,
+    narrower,
+    variance_shares,
+)
+from mvest.personalisation.model import build_coarse
+from mvest.personalisation.settings import PersonaliseSettings
+from mvest.problem.registration import unit_of
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedUnknown:
+    """The interval of 95 % of one unknown beforehand and, about its prior mean, after an estimate.
+
+    Attributes
+    ----------
+    name, unit : str
+    generic : float
+        Where it is assumed to be.
+    low_before, high_before, low, high : float
+    width : float
+        Of the interval after over before, of the logarithm of what is positive.
+    """
+
+    name: str
+    unit: str
+    generic: float
+    low_before: float
+    high_before: float
+    low: float
+    high: float
+    width: float
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What can be expected of an estimate; without unknowns the reason why that is not known."""
+
+    unknowns: tuple[ExpectedUnknown, ...] = ()
+    shares: tuple[VarianceShare, ...] = ()
+    narrower: tuple[Narrower, ...] = ()
+    reason: str = ""
+
+
+def expect_case(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
+) -> Expected:
+    """What an estimate of a case could tell, to first order about the generic valve.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+    model : ClosureModel, optional
+        The closure of the case; by default on the mesh of the guide.
+    """
+    model = build_coarse(case, settings) if model is None else model
+    problem = CaseProblem.of(case, settings, model=model)
+    place = problem.generic()
+    if not place.prediction.converged:
+        return Expected(reason=place.prediction.reason)
+    place = linearised(place, problem)
+    if case.error_samples is not None:
+        place = sampled(place)
+    seen = predict(
+        place.errors.observation().of(lambda _: place.prediction), place.m, derivatives=True
+    )
+    transform, prior = problem.transform, to_filter(problem.transform, problem.prior)
+    z = transform.forward(place.m)
+    H = seen.jacobian * transform.derivative(z)
+    linear = LinearModel(problem.names, prior.covariance, H, place.errors)
+    std = np.sqrt(linear.variances())
+    ends = [
+        transform.inverse(z + sign * REACH * width)
+        for width in (prior.std, std)
+        for sign in (-1, 1)
+    ]
+    unknowns = tuple(
+        ExpectedUnknown(
+            name,
+            unit_of(name),
+            float(place.m[k]),
+            float(ends[0][k]),
+            float(ends[1][k]),
+            float(ends[2][k]),
+            float(ends[3][k]),
+            float(std[k] / prior.std[k]),
+        )
+        for k, name in enumerate(problem.names)
+    )
+    return Expected(unknowns, variance_shares(linear), narrower(problem, linear))
