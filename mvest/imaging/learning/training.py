@@ -10,9 +10,9 @@ of the simulator does. What is done, and how much, is a choice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,19 +31,26 @@ from mvest.imaging.detection.pose_search import (
     search_poses,
     shape_start_samples,
 )
-from mvest.imaging.detection.shape_model import ShapeModel, TrueValve, fit_shape_model
-from mvest.imaging.detection.trained_model import STAGES, DetectionModel
+from mvest.imaging.detection.shape_model import ShapeModel, TrueValve
+from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.processes import side_by_side
 from mvest.quantities import Count
 from mvest.typing import FloatArray
 
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
+
+SEARCH_STAGES = (
+    "position",
+    "pose_coarse",
+    "pose_fine",
+    *(f"pose_refine_{k}" for k in range(len(REFINEMENTS))),
+)
+"""Stages of the search for poses, of which a draft is made from the first volumes."""
 
 Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
@@ -107,21 +114,6 @@ def taken_for_valves(
     return poses[np.concatenate([np.arange(best), others])]
 
 
-Sampled: TypeAlias = Callable[
-    [Sequence[int], ShapeModel, Callable[[], Trees] | None], Sequence[Samples]
-]
-"""(numbers of volumes, shapes, what makes the draft; none for the first volumes) -> samples."""
-
-
-def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Trees:
-    """The search that is learned from the first volumes alone."""
-    refine = [f"pose_refine_{k}" for k in range(len(REFINEMENTS))]
-    return {
-        name: train_stage(name, *samples_of(name, samples), settings, seed)
-        for name in ("position", "pose_coarse", "pose_fine", *refine)
-    }
-
-
 def draw_samples(
     frame: StandardFrame,
     true: TrueValve,
@@ -178,7 +170,7 @@ def volume_samples(
     settings: TrainingSettings,
     seed: int,
     draft: Trees | None = None,
-) -> Samples:
+) -> dict[str, NDArray[np.float32]]:
     """Simulate one training volume and sample it for all stages.
 
     Parameters
@@ -192,7 +184,12 @@ def volume_samples(
     seed : int
         Of the training.
     draft : mapping, optional
-        For all but the first volumes.
+        Of `SEARCH_STAGES`, for all but the first volumes.
+
+    Returns
+    -------
+    dict
+        ``STAGE.x`` and ``STAGE.y``: features and what they mean, see `Samples`.
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
@@ -201,15 +198,12 @@ def volume_samples(
     )
     true = TrueValve.of(seen.vertices[0], seen.tips[0], shape)
     rng = np.random.default_rng(sample.spawn(1)[0])
-    return draw_samples(standard_frame(volume, 0), true, shape, settings.samples, rng, draft)
-
-
-def samples_of(
-    name: str, parts: Sequence[Samples]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Samples of one stage ``(P, F)``, ``(P, outputs)``, those of all volumes one after another."""
-    x, y = zip(*(part[name] for part in parts), strict=True)
-    return np.concatenate(x), np.concatenate(y)
+    samples = draw_samples(standard_frame(volume, 0), true, shape, settings.samples, rng, draft)
+    return {
+        f"{name}.{kind}": values
+        for name, pair in samples.items()
+        for kind, values in zip("xy", pair, strict=True)
+    }
 
 
 def train_stage(
@@ -226,7 +220,7 @@ def train_stage(
     name : str
         One of :data:`mvest.imaging.detection.trained_model.STAGES`.
     x, y : (P, F), (P, outputs)
-        From :func:`samples_of`.
+        Samples of all volumes, see `Samples`.
     settings : TrainingSettings
     seed : int
         Of the training.
@@ -236,54 +230,6 @@ def train_stage(
         boosting = replace(boosting, trees=settings.many_trees)
     objective = "cross_entropy" if name == "boundary" else "regression"
     return train_boosters(x, y.astype(np.float64), boosting, seed, objective)
-
-
-def train_model(
-    valves: Sequence[MovingValve],
-    settings: TrainingSettings,
-    seed: int,
-    *,
-    sampled: Sampled,
-    processes: int = 1,
-    trained_on: Mapping[str, Any] | None = None,
-    progress: Callable[[], None] | None = None,
-) -> DetectionModel:
-    """Learn all stages from samples of simulated volumes.
-
-    Parameters
-    ----------
-    valves : sequence of MovingValve
-        Of one layout.
-    settings : TrainingSettings
-    seed : int
-        The result depends on it and not on the number of processes.
-    sampled : callable
-        Makes the samples by `volume_samples`, or has them from a cache.
-    processes : int
-    trained_on : mapping, optional
-        Plain values that are kept with the model.
-    progress : callable, optional
-        Called when a stage is done.
-
-    Raises
-    ------
-    InputError
-        If there are fewer shapes than modes.
-    """
-    shape = fit_shape_model(valves, settings.modes)
-    first = min(settings.draft_volumes, settings.volumes)
-    samples = drafted = list(sampled(range(first), shape, None))
-    if first < settings.volumes:
-        draft = (lambda: draft_of(drafted, settings, seed)) if drafted else None
-        samples = [*drafted, *sampled(range(first, settings.volumes), shape, draft)]
-    stages = ((name, *samples_of(name, samples), settings, seed) for name in STAGES)
-    boosters = {}
-    grown = side_by_side(train_stage, stages, processes)
-    for name, found_boosters in zip(STAGES, grown, strict=True):
-        boosters[name] = found_boosters
-        if progress is not None:
-            progress()
-    return DetectionModel(shape, boosters, dict(trained_on or {}))
 
 
 SHARE = 0.5
