@@ -268,7 +268,7 @@ def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp
         titles.append(title)
 
     monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", nothing)
-    monkeypatch.setattr("mvest.reporting.images.montage.headline", titled)
+    monkeypatch.setattr("mvest.reporting.images.headline", titled)
     status, _, err = run("check=true")
     assert status == 2
     (drawn,) = (tmp_path / "outputs" / "volume").glob("*/candidate.png")
