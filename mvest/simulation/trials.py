@@ -16,15 +16,14 @@ from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.accuracy import frame_errors, surface_distance
 from mvest.imaging.learning.training import render_frame
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve
+from mvest.observation.surfaces import surface_distance
 from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area
@@ -103,8 +102,7 @@ def try_volume(
     -------
     dict
         ``row``: JSON text with kind, number, valve, frame and confidence. Where there is a valve,
-        also errors: mean distances of surfaces, of corresponding points and of papillary tips (mm);
-        of each stage (mm, the pose in degrees); and those of `_differences`, with sign.
+        also the errors of `_distances` (mm), and of `_differences`, with sign.
     """
     choose, render = trial.random.spawn(2)
     frame = int(np.random.default_rng(choose).integers(len(valve.times)))
@@ -127,9 +125,8 @@ def try_volume(
         "confidence": float(found.confidence),
     }
     if has_valve:
-        true, layout = TrueValve.of(seen.vertices[0], seen.tips[0], model.shape), seen.layout
-        row |= frame_errors(found, true, layout)
-        row |= _differences(found.vertices, found.tips, true.vertices, true.tips, layout)
+        both = found.vertices, found.tips, seen.vertices[0], seen.tips[0], seen.layout
+        row |= _distances(*both) | _differences(*both)
     return {"row": json.dumps(row)}
 
 
@@ -159,15 +156,8 @@ def try_sequence(
     found = detect_valve(volume, model, replace(settings, min_confidence=0.0))
     frames = []
     for k in range(len(true.times)):
-        x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
-        frames.append(
-            {
-                "surface": surface_distance(x, right, layout),
-                "points": float(np.linalg.norm(x - right, axis=1).mean()),
-                "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
-                **_differences(x, tips, right, true.tips[k], layout),
-            }
-        )
+        both = found.vertices[k], found.tips[k], true.vertices[k], true.tips[k], layout
+        frames.append(_distances(*both) | _differences(*both))
     two = [0, trial.closed]
     row = {
         "kind": trial.kind,
@@ -199,6 +189,29 @@ def _mean_size(frames: Sequence[Row], name: str) -> float | None:
     """Mean over the frames without sign; None where no frame has the value."""
     known = [abs(frame[name]) for frame in frames if frame[name] is not None]
     return float(np.mean(known)) if known else None
+
+
+def _distances(
+    vertices: FloatArray,
+    tips: FloatArray,
+    true_vertices: FloatArray,
+    true_tips: FloatArray,
+    layout: ValveLayout,
+) -> dict[str, float]:
+    """Mean distances (mm) of what was found from the truth.
+
+    ``surface`` (of the vertices of each surface from the other one), ``points`` (of corresponding
+    vertices) and ``tips``.
+    """
+    there, back = (
+        surface_distance(points, surface, layout.triangles).mean()
+        for points, surface in ((vertices, true_vertices), (true_vertices, vertices))
+    )
+    return {
+        "surface": float(0.5 * (there + back)),
+        "points": float(np.linalg.norm(vertices - true_vertices, axis=1).mean()),
+        "tips": float(np.linalg.norm(tips - true_tips, axis=1).mean()),
+    }
 
 
 def _differences(

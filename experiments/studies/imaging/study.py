@@ -63,11 +63,11 @@ LIMIT_MM = 1.5
 """Mean surface distance from which on a detected valve counts as wrong."""
 
 ERRORS = {
-    "position": "mm", "pose": "°", "landmarks": "mm", "hinge": "mm", "surface": "mm",
-    "surface_open": "mm", "surface_closed": "mm", "points": "mm", "tips": "mm",
-    "annulus_area": "%", "ap_diameter": "mm",
-}  # fmt: skip
-"""Errors of a trial, those of the stages of the detection first -> unit."""
+    **dict.fromkeys(("surface", "surface_open", "surface_closed", "points", "tips"), "mm"),
+    "annulus_area": "%",
+    "ap_diameter": "mm",
+}
+"""Errors of a trial and their units: distances, and what clinicians would measure wrongly."""
 
 SHARE = Column("%", ".0f")
 COLUMNS: Mapping[str, Column] = {

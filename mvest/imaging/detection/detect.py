@@ -97,8 +97,8 @@ class FrameValve:
 
     Attributes
     ----------
-    start, pose : Poses
-        One each: what the fit began with, and what it ended with.
+    pose : Poses
+        One.
     coefficients : (K,)
         Of the shape model.
     vertices : (n, 3)
@@ -106,18 +106,14 @@ class FrameValve:
     confidence : float
         0 (no valve) to 1.
     vertex_confidence : (n,)
-    landmarks : (L, 3)
-        As they were found before shapes were fitted.
     """
 
-    start: Poses
     pose: Poses
     coefficients: FloatArray
     vertices: FloatArray
     tips: FloatArray
     confidence: float
     vertex_confidence: FloatArray
-    landmarks: FloatArray
 
 
 def find_frame(
@@ -208,7 +204,7 @@ def fit_frame(
     InputError
         If more modes are to be fitted than the model has.
     """
-    chosen, begin = settings or FitSettings(), pose
+    chosen = settings or FitSettings()
     shape, layout = model.shape, model.shape.layout
     if max(chosen.modes) > len(shape.std):
         raise InputError(
@@ -246,7 +242,7 @@ def fit_frame(
     )
     vertices = relax(vertices, layout, pulls, chosen.stiffness, chosen.hold)
     sure = _confidence(frame, model, pose, b, confidence)
-    return FrameValve(begin, pose, b, vertices, tips, sure, confidence, points)
+    return FrameValve(pose, b, vertices, tips, sure, confidence)
 
 
 def _seen(

@@ -6,15 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.imaging.detection.detect import FrameValve
-from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
-from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
-from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
 BIN_MM = 1.0
@@ -180,71 +175,3 @@ def share_within(errors: FloatArray, std_mm: FloatArray) -> float:
     std_mm : (n,)
     """
     return float((np.abs(errors) <= NORMAL_95 * std_mm[:, None]).mean())
-
-
-FINER = 4
-"""Times as many points as vertices in each direction stand for a surface."""
-
-
-def frame_errors(found: FrameValve, true: TrueValve, layout: ValveLayout) -> dict[str, float]:
-    """Errors of one frame.
-
-    Returns
-    -------
-    dict
-        In mm ``surface`` (mean symmetric distance of the leaflets' surfaces), ``points`` (mean
-        distance of corresponding vertices), ``tips``, ``landmarks`` and ``hinge`` (of the annulus
-        across its course); of the pose that the fit began with, ``position`` (mm) and ``pose``
-        (degrees).
-    """
-    by = found.start.towards(true.pose)[0]
-    return {
-        "surface": surface_distance(found.vertices, true.vertices, layout),
-        "points": _mean_distance(found.vertices, true.vertices),
-        "tips": _mean_distance(found.tips, true.tips),
-        "position": float(np.linalg.norm(by[:3])),
-        "pose": float(np.rad2deg(np.linalg.norm(by[3:6]))),
-        "landmarks": _mean_distance(found.landmarks, landmark_points(true, layout)),
-        "hinge": _across(found.vertices[layout.annulus], true.vertices[layout.annulus]),
-    }
-
-
-def _mean_distance(points: FloatArray, true: FloatArray) -> float:
-    return float(np.linalg.norm(points - true, axis=1).mean())
-
-
-def surface_distance(detected: FloatArray, true: FloatArray, layout: ValveLayout) -> float:
-    """Mean symmetric distance (mm) of two surfaces: of the vertices of each from the other.
-
-    A surface is stood for by its tangent planes at four times as many points in each direction.
-    """
-    there, back = _to_surface(detected, true, layout), _to_surface(true, detected, layout)
-    return float(0.5 * (there.mean() + back.mean()))
-
-
-def _to_surface(points: FloatArray, surface: FloatArray, layout: ValveLayout) -> FloatArray:
-    fine = ValveLayout(FINER * layout.columns, FINER * (layout.rows - 1) + 1)
-    grid = surface.reshape(layout.rows, layout.columns, 3)
-    u = np.arange(fine.columns) / FINER
-    left, share = u.astype(np.int64), (u % 1.0)[:, None]
-    around = grid[:, left] * (1 - share) + grid[:, (left + 1) % layout.columns] * share
-    v = np.arange(fine.rows) / FINER
-    upper = np.minimum(v.astype(np.int64), layout.rows - 2)
-    share = (v - upper)[:, None, None]
-    flat = (around[upper] * (1 - share) + around[upper + 1] * share).reshape(-1, 3)
-    gap, near = cKDTree(flat).query(points)
-    normal = leaflet_axes(flat, fine)[near, :, 2]
-    off = np.abs(((points - flat[near]) * normal).sum(axis=1))
-    # Beyond a rim the nearest point is on the rim itself.
-    row = near // fine.columns
-    inside = (row > 0) & (row < fine.rows - 1)
-    return np.where(inside, off, gap)
-
-
-def _across(points: FloatArray, true: FloatArray) -> float:
-    """Mean distance (mm) of a closed curve's points from another one, seen as segments."""
-    a, b = true, np.roll(true, -1, 0)
-    along = b - a
-    t = ((points[:, None] - a) * along).sum(axis=2) / (along**2).sum(axis=1)
-    foot = a + np.clip(t, 0, 1)[..., None] * along
-    return float(np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1).mean())

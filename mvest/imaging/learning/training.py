@@ -12,15 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mvest.imaging.detection.frame import StandardFrame, standard_frame
+from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_samples, rim_samples
-from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     REFINED,
     REFINEMENTS,
@@ -31,7 +29,7 @@ from mvest.imaging.detection.pose_search import (
     search_poses,
     shape_start_samples,
 )
-from mvest.imaging.detection.shape_model import ShapeModel, TrueValve
+from mvest.imaging.detection.shape_model import Examples, LabelledFrame, ShapeModel, TrueValve
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
@@ -39,7 +37,6 @@ from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.quantities import Count
-from mvest.typing import FloatArray
 
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
@@ -51,9 +48,6 @@ SEARCH_STAGES = (
     *(f"pose_refine_{k}" for k in range(len(REFINEMENTS))),
 )
 """Stages of the search for poses, of which a draft is made from the first volumes."""
-
-Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,45 +95,33 @@ class TrainingSettings:
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 
-def taken_for_valves(
-    frame: StandardFrame, draft: Trees, count: int, rng: np.random.Generator
-) -> Poses:
-    """What a first search takes for valves: the final rating learns from its mistakes.
-
-    Half of ``count`` poses are those rated best, the others some of the rest.
-    """
-    poses, _ = search_poses(frame, draft, REFINED)
-    best = count // 2
-    others = best + rng.choice(len(poses) - best, count - best, replace=False)
-    return poses[np.concatenate([np.arange(best), others])]
-
-
 def draw_samples(
-    frame: StandardFrame,
-    true: TrueValve,
-    model: ShapeModel,
-    counts: SampleCounts,
-    rng: np.random.Generator,
-    draft: Trees | None = None,
-) -> Samples:
-    """Samples of all stages from one frame; a draft's mistakes are among them."""
-    layout = model.layout
-    mistaken = None if draft is None else taken_for_valves(frame, draft, counts.mistaken, rng)
-    samples: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
-        "position": position_samples(frame, true, counts.position, rng),
-        "pose_coarse": coarse_samples(frame, true, model, counts.pose_rating, rng),
-        "pose_fine": fine_samples(frame, true, model, counts.pose_rating, rng, mistaken),
-        "shape": shape_start_samples(frame, true, model, counts.shape, rng),
-        **{rim: rim_samples(frame, true, model, rim, counts.rim, rng) for rim in RIMS},
-        "boundary": boundary_samples(frame, true, model, counts.boundary, rng),
+    seen: LabelledFrame, counts: SampleCounts, draft: Trees | None = None
+) -> Mapping[str, Examples]:
+    """Samples of all stages from one frame, by the stage's name.
+
+    The final rating also learns from what a draft's search takes for valves: half of these poses
+    are those rated best, the others some of the rest.
+    """
+    mistaken = None
+    if draft is not None:
+        poses, _ = search_poses(seen.frame, draft, REFINED)
+        count, best = counts.mistaken, counts.mistaken // 2
+        others = best + seen.rng.choice(len(poses) - best, count - best, replace=False)
+        mistaken = poses[np.concatenate([np.arange(best), others])]
+    samples = {
+        "position": position_samples(seen, counts.position),
+        "pose_coarse": coarse_samples(seen, counts.pose_rating),
+        "pose_fine": fine_samples(seen, counts.pose_rating, mistaken),
+        "shape": shape_start_samples(seen, counts.shape),
+        **{rim: rim_samples(seen, rim, counts.rim) for rim in RIMS},
+        "boundary": boundary_samples(seen, counts.boundary),
     }
     for k in range(len(REFINEMENTS)):
-        samples[f"pose_refine_{k}"] = refinement_samples(
-            frame, true, k, counts.pose_refinement, rng
-        )
+        samples[f"pose_refine_{k}"] = refinement_samples(seen, k, counts.pose_refinement)
     for k in range(len(LANDMARKS)):
-        samples[f"landmark_{k}"] = landmark_samples(frame, true, layout, k, counts.landmark, rng)
-    return {name: (x, y.astype(np.float32)) for name, (x, y) in samples.items()}
+        samples[f"landmark_{k}"] = landmark_samples(seen, k, counts.landmark)
+    return samples
 
 
 def render_frame(
@@ -189,7 +171,7 @@ def volume_samples(
     Returns
     -------
     dict
-        ``STAGE.x`` and ``STAGE.y``: features and what they mean, see `Samples`.
+        ``STAGE.x`` and ``STAGE.y``, see `mvest.imaging.detection.shape_model.Examples`.
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
@@ -198,9 +180,10 @@ def volume_samples(
     )
     true = TrueValve.of(seen.vertices[0], seen.tips[0], shape)
     rng = np.random.default_rng(sample.spawn(1)[0])
-    samples = draw_samples(standard_frame(volume, 0), true, shape, settings.samples, rng, draft)
+    labelled = LabelledFrame(standard_frame(volume, 0), true, shape, rng)
+    samples = draw_samples(labelled, settings.samples, draft)
     return {
-        f"{name}.{kind}": values
+        f"{name}.{kind}": values.astype(np.float32)
         for name, pair in samples.items()
         for kind, values in zip("xy", pair, strict=True)
     }
@@ -220,7 +203,7 @@ def train_stage(
     name : str
         One of :data:`mvest.imaging.detection.trained_model.STAGES`.
     x, y : (P, F), (P, outputs)
-        Samples of all volumes, see `Samples`.
+        Samples of all volumes.
     settings : TrainingSettings
     seed : int
         Of the training.

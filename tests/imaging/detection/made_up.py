@@ -15,7 +15,7 @@ from mvest.imaging.detection import leaflets, pose_search
 from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import MODES
-from mvest.imaging.detection.shape_model import TrueValve
+from mvest.imaging.detection.shape_model import LabelledFrame, TrueValve
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve, landmark_vertices
@@ -104,6 +104,11 @@ class NumberedFrame:
     """Stands in for a frame: says which one it is."""
 
     number: int = 0
+
+
+def labelled(true, shape, seed=0, frame=NumberedFrame()):
+    """A frame to draw samples from."""
+    return LabelledFrame(frame, true, shape, np.random.default_rng(seed))
 
 
 def geometry(frame, pattern, points, axes):

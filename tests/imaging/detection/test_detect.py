@@ -52,11 +52,9 @@ def test_the_fit_arrives_at_the_true_valve(shape, true):
     found = fit_frame(NumberedFrame(), model, true.pose.moved(MISSED), FIT)
     assert mean_gap(found.vertices, true.vertices) < 0.3
     np.testing.assert_allclose(found.tips, true.tips, atol=1e-3)
-    np.testing.assert_allclose(found.landmarks, landmark_points(true, LAYOUT), atol=1e-3)
     assert len(found.coefficients) == FIT.modes[-1]
     assert found.confidence > 0.9
     assert np.all(found.vertex_confidence > 0.8)
-    np.testing.assert_allclose(found.start.centre, true.pose.moved(MISSED).centre)
 
 
 def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypatch):
