@@ -16,7 +16,7 @@ from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.training import render_frame
@@ -93,9 +93,7 @@ def _model(path: str) -> DetectionModel:
     return load_model(path)
 
 
-def try_volume(
-    valve: MovingValve, trial: Trial, model_file: Path, settings: TrackingSettings
-) -> dict[str, Any]:
+def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:
     """Simulate one frame and search it.
 
     Returns
@@ -116,7 +114,7 @@ def try_volume(
         grey = np.random.default_rng(render).integers(0, 256, volume.frames.shape, dtype=np.uint8)
         volume = replace(volume, frames=grey, source="white noise", sha256="")
     model = _model(str(model_file))
-    found = find_frame(standard_frame(volume, 0), model, settings.fit)
+    found = find_frame(standard_frame(volume, 0), model)
     row: dict[str, Any] = {
         "kind": trial.kind,
         "number": trial.number,
@@ -130,9 +128,7 @@ def try_volume(
     return {"row": json.dumps(row)}
 
 
-def try_sequence(
-    valve: MovingValve, trial: Trial, model_file: Path, settings: TrackingSettings
-) -> dict[str, Any]:
+def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:
     """Simulate all frames of a valve as one volume and search it.
 
     However low its confidence, what is found counts as the valve.
@@ -153,7 +149,7 @@ def try_sequence(
     volume = simulate_volume(valve, acquisition, probe, int(scan.generate_state(1)[0]))
     true = true_sequence(valve, probe)
     model, layout = _model(str(model_file)), valve.layout
-    found = detect_valve(volume, model, replace(settings, min_confidence=0.0))
+    found = detect_valve(volume, model, min_confidence=0.0)
     frames = []
     for k in range(len(true.times)):
         both = found.vertices[k], found.tips[k], true.vertices[k], true.tips[k], layout

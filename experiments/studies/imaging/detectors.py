@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +18,6 @@ from experiments.common.building.closure import mechanics_of
 from experiments.common.progress import PartBar
 from experiments.common.schema import NOT_HASHED, Values
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
-from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters, Trees
 from mvest.imaging.learning.training import (
@@ -27,11 +26,11 @@ from mvest.imaging.learning.training import (
     train_stage,
     volume_samples,
 )
-from mvest.imaging.valve_sequence import MovingValve
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, MovingValve
 from mvest.kept import Entry, get_or_make
 from mvest.problem.stored import Store
 from mvest.processes import side_by_side
-from mvest.quantities import Count, Length, Processes, Seed, within
+from mvest.quantities import Count, Length, Processes, Seed, Share, within
 from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
 from mvest.simulation.population import (
@@ -83,7 +82,7 @@ class ImagingSettings:
     calibration: DrawnValves  # measures the errors that detectors state
     test: DrawnValves
     training: TrainingSettings = field(default_factory=TrainingSettings)
-    detection: TrackingSettings = field(default_factory=TrackingSettings)
+    min_confidence: Share = MIN_CONFIDENCE  # from here on something is called a valve
     evaluate: bool = True
     held_out: HeldOutSettings
     processes: Annotated[Processes, NOT_HASHED] = 1
@@ -202,22 +201,21 @@ class ImagingStore:
 
     def tried(self, function: Any, trials: Sequence[Trial], file: Path) -> list[Seen]:
         """Rows and arrays of trials, by `try_volume` or `try_sequence`, of detectors in a file."""
-        # The verdict changes nothing of what is found, nor what was measured of the detectors.
-        settings = replace(self.settings.detection, min_confidence=0.0)
-        model = load_model(file)
-        trees = "".join(text for name in STAGES for text in model.boosters[name].texts)
-        about = {"model": hashlib.sha256(trees.encode()).hexdigest(), "settings": asdict(settings)}
+        # What was measured of the detectors changes nothing of what they find.
+        boosters = load_model(file).boosters
+        trees = "".join(text for name in STAGES for text in boosters[name].texts)
+        key = hashlib.sha256(trees.encode()).hexdigest()
         of = ["calibration" if t.kind.endswith("calibration") else "test" for t in trials]
         drawn = {which: self._valves(which).path.stem for which in set(of)}
         valves = {which: self.population(which) for which in set(of)}
         entries = []
         for trial, which in zip(trials, of, strict=True):
-            described = {**about, "trial": asdict(trial), "valves": drawn[which]}
+            described = {"model": key, "trial": asdict(trial), "valves": drawn[which]}
             entries.append(self._store.entry("trials", described, (function,), _read_trial))
 
         def make(missing: list[int]) -> Iterator[Any]:
             calls = (
-                (valves[of[k]][trials[k].number % len(valves[of[k]])], trials[k], file, settings)
+                (valves[of[k]][trials[k].number % len(valves[of[k]])], trials[k], file)
                 for k in missing
             )
             kinds = ", ".join(dict.fromkeys(trials[k].kind for k in missing))

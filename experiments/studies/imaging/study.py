@@ -119,7 +119,7 @@ def run_imaging(job: Job[Settings]) -> Result:
                 f"valve {min(both)} was trained on, expected other valves to calibrate with and to "
                 "test on: imaging.calibration.seed, imaging.test.seed"
             )
-        limits = settings.detection.min_confidence, settings.held_out.wrong_mm
+        limits = settings.min_confidence, settings.held_out.wrong_mm
         seen = _held_out(store, file)
         accuracy, trained_on["calibrated_on"] = calibrated(seen, *limits)
         tested = result_of(seen, accuracy, model.shape.layout, *limits)
@@ -387,11 +387,10 @@ def require_imaging(config: Values) -> None:
         raise ConfigurationError(
             "imaging.model is given and imaging.evaluate=false: nothing would be done"
         )
-    modes = max(MODES, *settings.detection.fit.modes)
-    if settings.training.modes < modes:
+    if settings.training.modes < MODES:
         raise ConfigurationError(
-            f"imaging.training.modes = {settings.training.modes}, expected at least {modes}: as "
-            "many as are read off and as imaging.detection.fit.modes has"
+            f"imaging.training.modes = {settings.training.modes}, expected at least {MODES}: as "
+            "many as are read off"
         )
     motion = settings.population.motion
     landmark_vertices(ValveLayout(motion.columns, motion.rows))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numba as nb
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from mvest.errors import InputError
-from mvest.quantities import Count, Processes, Share
+from mvest.quantities import Count, Share
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 
@@ -35,9 +35,8 @@ class BoostSettings:
         Share of each tree's answer that is taken.
     min_leaf_samples : int
         Samples that a leaf holds at least.
-    share_features, share_rows : float
+    share_features : float
         Of what there is, drawn anew for every tree.
-    threads : int
     """
 
     trees: Count = 80
@@ -45,9 +44,10 @@ class BoostSettings:
     rate: Share = 0.12
     min_leaf_samples: Count = 40
     share_features: Share = 0.25
-    share_rows: Share = 0.7
-    threads: Processes = 1
 
+
+SHARE_ROWS = 0.7
+"""Of the samples, drawn anew for every tree."""
 
 END: Final = "end of trees\n"
 WRITTEN: Final = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1"}
@@ -175,7 +175,9 @@ def _read(text: str) -> tuple[int, bool, _Trees]:
         raise ValueError(f"not all of {trees} trees")
     sizes = {key: np.array([len(line.split()) for line in lines[key]]) for key in FIELDS}
     nodes, leaves = sizes["threshold"], sizes["leaf_value"]
-    read = {key: np.array(" ".join(lines[key]).split(), dtype=FIELDS[key]) for key in FIELDS}
+    read: dict[str, NDArray[Any]] = {
+        key: np.array(" ".join(lines[key]).split(), dtype=FIELDS[key]) for key in FIELDS
+    }
     children = np.stack([read["left_child"], read["right_child"]], axis=1)
     features = len(about["feature_names"].split())
     # Numbers within each tree become numbers among the nodes and leaves of all.
@@ -227,9 +229,9 @@ def train_boosters(
         "learning_rate": settings.rate,
         "min_data_in_leaf": settings.min_leaf_samples,
         "feature_fraction": settings.share_features,
-        "bagging_fraction": settings.share_rows,
+        "bagging_fraction": SHARE_ROWS,
         "bagging_freq": 1,
-        "num_threads": settings.threads,
+        "num_threads": 1,
         "deterministic": True,
         "force_row_wise": True,
     }

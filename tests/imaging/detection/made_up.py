@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.imaging.detection import leaflets, pose_search
-from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import MODES
 from mvest.imaging.detection.shape_model import LabelledFrame, TrueValve
@@ -24,9 +23,6 @@ from mvest.valve.anatomy.template import Template
 from tests import made_up_sequence
 
 LAYOUT = ValveLayout(16, 7)
-FIT = FitSettings((10, 12, 12), (6.0, 4.0, 3.0))
-"""No more modes than the small shape model has."""
-
 TIPS = np.array([Template().parameters.papillary.tip, Template().parameters.papillary.tip]) * [
     [1, 1, 1],
     [-1, 1, 1],
