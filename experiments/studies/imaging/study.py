@@ -326,31 +326,22 @@ def error_rows(trials: DataFrame) -> DataFrame:
 
 def figure(results: Results) -> Figure | None:
     """Confidence and surface distance in every volume; nothing of a run that only trained."""
-    from mvest.reporting.figures import BAD, COLOURS, SMALL, headline, log_axis, panels
+    from mvest.reporting.figures import COLOURS, SMALL, headline, log_axis, panels
 
     record = results.first
     if not record.tables:
         return None
-    rows, random = record.table_of("trials").rows, np.random.default_rng(0)
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    trials, random = record.table_of("trials").frame, np.random.default_rng(0)
+    kinds = list(trials["kind"].unique())
     drawn, grid = panels(1, 2, 0.42 * len(kinds) + 1.6, sharey=True)
-    limits = {
-        "confidence": float(record.numbers["called_a_valve_from_confidence"] or 0.0),
-        "surface": LIMIT_MM,
-    }
+    limits = {"confidence": record.numbers["called_a_valve_from_confidence"], "surface": LIMIT_MM}
     for axes, (name, limit) in zip(grid[0], limits.items(), strict=True):
-        for k, kind in enumerate(kinds):
-            own = [row for row in rows if row["kind"] == kind and row[name] is not None]
-            places = k + random.uniform(-0.2, 0.2, len(own))
-            for is_right, face in ((True, COLOURS[0]), (False, "white")):
-                shown = [
-                    (row[name], at)
-                    for row, at in zip(own, places, strict=True)
-                    if row["right"] == is_right
-                ]
-                colour = BAD if kind in WITHOUT_VALVE else COLOURS[0]
-                axes.plot(*np.array(shown).reshape(-1, 2).T, "o", ms=4, mec=colour, mfc=face)
         axes.axvline(limit, color="0.25", lw=1.0, ls="--", zorder=0)
+        for k, kind in enumerate(kinds):
+            own, colour = trials[trials["kind"] == kind], COLOURS[kind in WITHOUT_VALVE]
+            places = k + random.uniform(-0.2, 0.2, len(own))
+            for right, face in ((own["right"], colour), (~own["right"], "white")):
+                axes.plot(own[name][right], places[right], "o", ms=4, mec=colour, mfc=face)
     grid[0, 0].set_xlabel("confidence; over time of the best frame")
     grid[0, 1].set_xlabel("mean distance from the true surface [mm]")
     grid[0, 1].set_xscale("log")
@@ -407,9 +398,7 @@ def publish_model(job: Job[Settings], _record: Record) -> None:
     if not job.settings.imaging.publish_model:
         return
     source = job.folder / MODEL
-    if not source.is_file():
-        raise InputError(f"{source}: no such file; force=true trains again")
-    load_model(source)  # what cannot be read is not handed on
+    load_model(source)  # what is missing or cannot be read is not handed on
     write_atomically(MODEL_FILE, source.read_bytes())
     print(f"Detectors in {MODEL_FILE}")
 
