@@ -33,7 +33,6 @@ from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
-from mvest.personalisation.error_budget import EVERYTHING
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.skill import GENERIC, generic_guess
 from mvest.problem.stored import Store
@@ -447,44 +446,13 @@ def _medians(budgets: Sequence[Mapping[str, Any]]) -> Table:
     return table(medians, part="", modulus="", without=":.3f", alone=":.3f")
 
 
-# -- figures --------------------------------------------------------------------------------------
+# -- figure ---------------------------------------------------------------------------------------
 def figure(results: Results) -> dict[str, Figure]:
-    """Estimates from all sources over their truths, and the budget."""
+    """Estimates from all sources over their truths."""
     groups: dict[str, list[tuple[Unknown, str]]] = {source: [] for source in SOURCES.values()}
     for source, one, own in _by_source(_estimates(results)):
         groups[source] += [(modulus, trust_of(own)) for modulus in one.moduli]
-    drawn = {"moduli": moduli_figure(groups)}
-    rows = _medians(_budgets(_estimates(results))).rows
-    return drawn | ({"budget": budget_figure(rows)} if rows else {})
-
-
-def budget_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """What is left of each modulus' uncertainty without each part, and with it alone."""
-    from mvest.reporting.figures import SMALL, headline, panels
-
-    moduli = dict.fromkeys(row["modulus"] for row in rows)
-    parts = [part for part in dict.fromkeys(row["part"] for row in rows) if part != EVERYTHING]
-    drawn, axes = panels(1, len(moduli), 0.27 * len(parts) + 1.6, sharex=True, sharey=True)
-    places = range(len(parts))
-    for one, modulus in zip(axes[0], moduli, strict=True):
-        sizes = {row["part"]: row for row in rows if row["modulus"] == modulus}
-        one.axvline(sizes[EVERYTHING]["without"], color="0.5", lw=0.9, ls="--")
-        for kind, colour, marker in (("alone", "#31446B", "o"), ("without", "#C8553D", "D")):
-            values = [sizes[part][kind] for part in parts]
-            one.plot(values, places, marker, color=colour, ms=4.5, label=kind)
-        one.set_yticks(list(places), parts)
-        one.set_ylim(len(parts) - 0.5, -0.5)
-        one.set_title(modulus.replace(".", " "), loc="left", fontsize=SMALL + 0.5)
-        one.set_xlabel("SD of the modulus' logarithm")
-    axes[0, 0].set_xlim(left=0.0)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower right", ncols=2, fontsize=SMALL, frameon=False)
-    headline(
-        drawn,
-        "Where the information dies between a volume and a modulus",
-        "Each part of what is not known, alone and taken away; dashed: with all of it.",
-    )
-    return drawn
+    return {"moduli": moduli_figure(groups)}
 
 
 def keep(record: Record) -> Record:
@@ -509,8 +477,6 @@ STUDY = Study(
     captions={
         "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
         "verdict on the one from the volume. Simulated.",
-        "budget": "What each part of what is not known costs a modulus, to first order at the "
-        "estimate; medians over simulated volumes.",
     },
     words=case_words,
     files=write_report,

@@ -18,7 +18,6 @@ from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore,
 from mvest.cases.from_images.detector_errors import coverage
 from mvest.errors import ConfigurationError, InputError
 from mvest.files import sha256_of, write_atomically
-from mvest.imaging.detection.pose_search import MODES
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
     DetectionModel,
@@ -334,7 +333,8 @@ def figure(results: Results) -> Figure | None:
     trials, random = record.table_of("trials").frame, np.random.default_rng(0)
     kinds = list(trials["kind"].unique())
     drawn, grid = panels(1, 2, 0.42 * len(kinds) + 1.6, sharey=True)
-    limits = {"confidence": record.numbers["called_a_valve_from_confidence"], "surface": LIMIT_MM}
+    called: Any = record.numbers["called_a_valve_from_confidence"]
+    limits = {"confidence": called, "surface": LIMIT_MM}
     for axes, (name, limit) in zip(grid[0], limits.items(), strict=True):
         axes.axvline(limit, color="0.25", lw=1.0, ls="--", zorder=0)
         for k, kind in enumerate(kinds):
@@ -377,11 +377,6 @@ def require_imaging(config: Values) -> None:
     if settings.model and not settings.evaluate:
         raise ConfigurationError(
             "imaging.model is given and imaging.evaluate=false: nothing would be done"
-        )
-    if settings.training.modes < MODES:
-        raise ConfigurationError(
-            f"imaging.training.modes = {settings.training.modes}, expected at least {MODES}: as "
-            "many as are read off"
         )
     motion = settings.population.motion
     landmark_vertices(ValveLayout(motion.columns, motion.rows))

@@ -165,9 +165,7 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         "version": VERSION,
         "columns": shape.layout.columns,
         "rows": shape.layout.rows,
-        "region_names": list(shape.layout.region_names),
         "trained_on": model.trained_on,
-        "trees": {name: model.boosters[name].outputs for name in STAGES},
     }
     arrays: dict[str, Any] = {"about": _bytes(json.dumps(about, sort_keys=True))}
     for name in STAGES:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from scipy import ndimage
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_samples, rim_samples
 from mvest.imaging.detection.pose_search import (
+    MODES,
     REFINED,
     REFINEMENTS,
     coarse_samples,
@@ -36,7 +38,7 @@ from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acqui
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.quantities import Count
+from mvest.quantities import Count, within
 
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
@@ -86,7 +88,7 @@ class TrainingSettings:
         About which the renderings vary.
     """
 
-    modes: Count = 40
+    modes: Annotated[int, within(MODES, 1000, "", "as many as are read off, or more")] = 40
     samples: SampleCounts = field(default_factory=SampleCounts)
     boosting: BoostSettings = field(default_factory=BoostSettings)
     many_trees: Count = 130

@@ -242,7 +242,7 @@ def test_a_model_is_made_the_one_of_the_package_without_training_again(
         ("imaging.train.count=0", "imaging.train.count = 0, expected 1 to"),
         ("imaging.processes=0", "imaging.processes = 0"),
         ("imaging.held_out.shifted=0", "imaging.held_out.shifted = 0"),
-        ("imaging.training.modes=7", "expected at least 8"),
+        ("imaging.training.modes=7", "imaging.training.modes = 7, expected 8 to"),
         ("imaging.training.acquisition.beats=0", "beats"),
         ("imaging.population.motion.columns=12", "no column"),
         ("imaging.population.motion.frames=30", "frames = 30"),
