@@ -193,7 +193,7 @@ def _distances(
     true_vertices: FloatArray,
     true_tips: FloatArray,
     layout: ValveLayout,
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     """Mean distances (mm) of what was found from the truth.
 
     ``surface`` (of the vertices of each surface from the other one), ``points`` (of corresponding

@@ -253,7 +253,7 @@ def result_of(
 
 def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
     """The tables of a test, with the meaning of their columns (`COLUMNS`)."""
-    tables = {
+    tables: dict[str, Any] = {
         "": kind_rows(trials),
         "errors": error_rows(trials),
         "coverage": covered,

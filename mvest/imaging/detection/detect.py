@@ -31,7 +31,6 @@ HAND_STD_MM = (0.2, 0.03)
 """mm, of landmarks placed by hand: while the shape is fitted, and for the free displacement, which
 is to end there."""
 
-
 ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
 """Modes of the shape model in each round of the fit, as far as the model has them, and how far
 along normals (mm) the leaflets are looked for."""

@@ -72,13 +72,11 @@ def smooth_in_time(
 Landmarks = Mapping[int, Mapping[str, FloatArray]]
 """Placed by hand: frame -> name -> world position (3,) mm."""
 
-
 POSE_LANDMARKS = 4
 """Landmarks by hand that give the pose of a frame."""
 
 LINE_MM = 2.0
 """mm, root sum of squares across the best line: below it a pose does not follow from points."""
-
 
 HYPOTHESES, SHARED = 3, 3
 """Poses of each frame's own search, and best ones of all frames, which are tried in every frame."""
@@ -143,7 +141,7 @@ def detect_valve(
         np.append((1 - s) * at_annulus + s * at_edge, [at_tips] * 2),
     )
     vertices, tips = smooth[:, :-2], smooth[:, -2:]
-    for k in np.flatnonzero(np.isfinite(by_hand).any(axis=(1, 2))):
+    for k in _with_hands(by_hand):
         vertices[k], tips[k] = _held(vertices[k], tips[k], by_hand[k], model)
     accuracy = model.accuracy
     if accuracy is not None:
@@ -183,7 +181,7 @@ def _found_again(
     again = list(valves)
     best = max(valve.confidence for valve in valves)
     lost = {k for k, v in enumerate(valves) if v.confidence < best - LOST_BY}
-    lost -= set(np.flatnonzero(np.isfinite(by_hand).any(axis=(1, 2))).tolist())
+    lost -= set(_with_hands(by_hand))
     while lost:
         beside = {k: max(_beside(k, again, lost), default=None) for k in lost}
         surest = {k: pair for k, pair in beside.items() if pair is not None}
@@ -252,6 +250,11 @@ def _checked(landmarks: Landmarks, frames: int) -> FloatArray:
                     "them about the valve"
                 )
     return placed
+
+
+def _with_hands(placed: FloatArray) -> list[int]:
+    """Frames in which landmarks were placed."""
+    return [k for k, points in enumerate(placed) if np.isfinite(points).any()]
 
 
 def _trajectory(

@@ -184,11 +184,10 @@ def volume_samples(
     rng = np.random.default_rng(sample.spawn(1)[0])
     labelled = LabelledFrame(standard_frame(volume, 0), true, shape, rng)
     samples = draw_samples(labelled, settings.samples, draft)
-    return {
-        f"{name}.{kind}": values.astype(np.float32)
-        for name, pair in samples.items()
-        for kind, values in zip("xy", pair, strict=True)
-    }
+    found = {}
+    for name, (x, y) in samples.items():
+        found |= {f"{name}.x": x, f"{name}.y": y.astype(np.float32)}
+    return found
 
 
 def train_stage(
