@@ -184,7 +184,7 @@ def volume_samples(
     rng = np.random.default_rng(sample.spawn(1)[0])
     labelled = LabelledFrame(standard_frame(volume, 0), true, shape, rng)
     samples = draw_samples(labelled, settings.samples, draft)
-    found = {}
+    found: dict[str, NDArray[np.float32]] = {}
     for name, (x, y) in samples.items():
         found |= {f"{name}.x": x, f"{name}.y": y.astype(np.float32)}
     return found
