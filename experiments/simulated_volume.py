@@ -30,7 +30,6 @@ from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
 from mvest.files import write_atomically
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.volume import VolumeSequence
 from mvest.simulation.motion import MotionSettings, close_in_motion
 
 SUFFIX = ".seq.nrrd"
@@ -126,23 +125,9 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     with PartBar("closure of the valve", 1, "closure") as bar:
         valve = close_in_motion("simulated", template, moduli, motion, mechanics)
         bar.step()
-    seen = []
-    with PartBar("echo of the frames", options.frames, "frame") as bar:
-        for frame in range(options.frames):
-            seen.append(
-                simulate_volume(valve, options.acquisition, probe, options.seed, frames=[frame])
-            )
-            bar.step()
-    first = seen[0]
-    volume = VolumeSequence(
-        np.concatenate([one.frames for one in seen]),
-        first.spacing,
-        first.direction,
-        first.origin,
-        valve.times,
-        first.modality,
-        f"simulated, seed {options.seed}",
-    )
+    with PartBar("echo of all frames", 1, "volume") as bar:
+        volume = simulate_volume(valve, options.acquisition, probe, options.seed)
+        bar.step()
     target.parent.mkdir(parents=True, exist_ok=True)
     truth = target.with_name(target.name.removesuffix(SUFFIX) + "_truth")
     truth.mkdir(exist_ok=True)

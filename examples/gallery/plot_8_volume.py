@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import mvest
-from mvest.reporting.images.montage import montage_figure
+from mvest.reporting.images import montage_figure
 
 sys.path.append(str(Path.cwd().parent))
 from make_volume import make_volume

@@ -7,10 +7,9 @@ geometries: from where the valve truly was (known geometry), and from that with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
-from mvest.cases.case import ErrorSamples, ValveCase
+from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.cases.writer import write_case
@@ -49,7 +48,7 @@ from mvest.reporting.skill import (
     trust_of,
     verdict_table,
 )
-from mvest.reporting.tables import Column, Table, table
+from mvest.reporting.tables import Column, Table, joined, table
 from mvest.simulation.drawn_patient import (
     EchoSettings,
     PatientSettings,
@@ -224,11 +223,21 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     write_sequence_nrrd(place / VOLUME, volume)
     frames = CaseFrames(0, made.closed, made.pressure_mmHg)
     true = true_sequence(made.valve, probe)
-    write_case(place / HIDDEN / KNOWN, _known_case(true, frames, patient))
-    segmented = _segmented_case(
-        true, frames, patient, float(volume.spacing.max()), described["seed"]
+    seen, samples = _segmented(true, frames, float(volume.spacing.max()), described["seed"])
+    stated = replace(
+        true,
+        std_mm=np.full(true.layout.size, KNOWN_UNCERTAINTY["std_mm"]),
+        correlation_length_mm=KNOWN_UNCERTAINTY["correlation_length_mm"],
     )
-    write_case(place / HIDDEN / SEGMENTED, segmented)
+    better = {
+        KNOWN: (stated, "its true positions", None),
+        SEGMENTED: (seen, "a perfect segmentation", samples),
+    }
+    for name, (sequence, what, errors) in better.items():
+        about = f"{patient.description}, {what}"
+        texts = CaseTexts(patient.name, about, "simulated", "MIT", simulated=True)
+        case = case_of_sequence(sequence, frames, texts, error_samples=errors)
+        write_case(place / HIDDEN / name, case)
     write_json(
         place / TRUTH / REVEALED,
         {
@@ -241,22 +250,9 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     )
 
 
-def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: PatientSettings) -> ValveCase:
-    n = sequence.layout.size
-    stated = replace(
-        sequence,
-        std_mm=np.full(n, KNOWN_UNCERTAINTY["std_mm"]),
-        correlation_length_mm=KNOWN_UNCERTAINTY["correlation_length_mm"],
-    )
-    texts = CaseTexts(
-        patient.name, f"{patient.description}, its true positions", "simulated", "MIT", True
-    )
-    return case_of_sequence(stated, frames, texts)
-
-
-def _segmented_case(
-    true: ValveSequence, frames: CaseFrames, patient: PatientSettings, voxel_mm: float, seed: int
-) -> ValveCase:
+def _segmented(
+    true: ValveSequence, frames: CaseFrames, voxel_mm: float, seed: int
+) -> tuple[ValveSequence, ErrorSamples]:
     """The true positions as a label map without mistakes has them: to the error of a voxel.
 
     The error of a position that is rounded to a voxel, in open and closed frame and of the tips,
@@ -281,31 +277,37 @@ def _segmented_case(
         correlation_length_mm=length,
     )
     vertices, tip_errors = (each[:, frames.in_order] for each in errors(SAMPLES))
-    texts = CaseTexts(
-        patient.name, f"{patient.description}, a perfect segmentation", "simulated", "MIT", True
-    )
-    return case_of_sequence(seen, frames, texts, error_samples=ErrorSamples(vertices, tip_errors))
+    return seen, ErrorSamples(vertices, tip_errors)
 
 
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
     """Moduli beside the truth, what they are worth, and what costs them how much."""
     estimates = _estimates(results)
-    medians, budgets = _budgets(estimates)
+    budgets = _budgets(estimates)
     tables = {
         "": _moduli_table(estimates),
         "skill": _skill(estimates),
         "bias": _bias(estimates),
         "verdicts": verdict_table(estimates),
-        "chordae": _chordae(results) if "chordae" in results.table_names else None,
-        "budget": medians,
-        "budget_of_patients": budgets,
+        "chordae": _chordae(results),
+        "budget": _medians(budgets),
+        "budget_of_patients": table(budgets),
     }
-    return {name: one for name, one in tables.items() if one is not None and len(one)}
+    return {name: one for name, one in tables.items() if len(one)}
 
 
 def _estimates(results: Results) -> list[EstimateRecord]:
     return [one.estimates[0] for one in results.records.values() if one.estimates]
+
+
+def _by_source(
+    estimates: Sequence[EstimateRecord],
+) -> Iterator[tuple[str, EstimateRecord, EstimateRecord]]:
+    """What was estimated from, the estimate from that, and the patient's own."""
+    for estimate in estimates:
+        for name, source in SOURCES.items():
+            yield source, estimate.alternatives[name] if name else estimate, estimate
 
 
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
@@ -354,20 +356,18 @@ def _percent(unknown: Unknown) -> float | None:
     return None if error is None else 100.0 * error
 
 
-def _by_source(estimates: Sequence[EstimateRecord]) -> dict[str, list[Unknown]]:
+def _moduli_by_source(estimates: Sequence[EstimateRecord]) -> dict[str, list[Unknown]]:
     """What a modulus was estimated from, and which -> those of all patients."""
     groups: dict[str, list[Unknown]] = {}
-    for estimate in estimates:
-        for name, source in SOURCES.items():
-            one = estimate.alternatives[name] if name else estimate
-            for own in one.moduli:
-                groups.setdefault(f"{source}, {own.name}", []).append(own)
+    for source, one, _ in _by_source(estimates):
+        for own in one.moduli:
+            groups.setdefault(f"{source}, {own.name}", []).append(own)
     return groups
 
 
 def _skill(estimates: Sequence[EstimateRecord]) -> Table:
     """What moduli are worth, together and each; those from volumes as far as they are stated."""
-    each = _by_source(
+    each = _moduli_by_source(
         [one.model_copy(update={"unknowns": tuple(stated(one))}) for one in estimates]
     )
     both = {
@@ -383,7 +383,7 @@ def _bias(estimates: Sequence[EstimateRecord]) -> Table:
     Of all that converged, also of those that the verdict denies: it does not see the truth.
     """
     rows = []
-    for source, moduli in _by_source(estimates).items():
+    for source, moduli in _moduli_by_source(estimates).items():
         known = [(own.truth, own.estimate) for own in moduli if own.estimate is not None]
         truth, found = np.log(np.array(known, dtype=np.float64).reshape(-1, 2).T)
         row = {"estimated from": source, "n": len(known)}
@@ -406,91 +406,54 @@ def _chordae(results: Results) -> Table:
     Beside it the ratio by which estimators lay chordae out.
     """
     laid_out = {"marginal": SEEN_CLOSURE.marginal_slack, "basal": SEEN_CLOSURE.basal_slack}
-    ratios: dict[str, list[list[float]]] = {}
-    for record in results.records.values():
-        if "chordae" in record.tables:
-            rows = record.table_of("chordae").rows
-            for family in dict.fromkeys(row["family"] for row in rows):
-                own = [row["ratio"] for row in rows if row["family"] == family]
-                ratios.setdefault(family, []).append(own)
-    rows = [
-        {
-            "family": family,
-            "patients": len(each),
-            "ratio": np.mean(np.concatenate(each)),
-            "SD": np.std(np.concatenate(each), ddof=1),
-            "SD of patients": np.std([np.mean(own) for own in each], ddof=1 if each[1:] else 0),
-            "laid out": laid_out[family],
-        }
-        for family, each in ratios.items()
-    ]
-    about = {"family": Column(), "patients": Column(), "ratio": Column(digits=".3f", std="SD")}
-    return table(
-        rows, **about, **dict.fromkeys(("SD of patients", "laid out"), Column(digits=".3f"))
+    having = {k: one for k, one in results.records.items() if "chordae" in one.tables}
+    if not having:
+        return table([])
+    chordae = joined({name: one.table_of("chordae") for name, one in having.items()}).frame
+    by_family, by_patient = (
+        chordae.groupby(keys, sort=False)["ratio"] for keys in ("family", ["family", "run"])
     )
+    rows = by_family.agg(ratio="mean", SD="std")
+    means = by_patient.mean().groupby("family", sort=False)
+    rows.insert(0, "patients", means.size())
+    rows["SD of patients"] = means.std().fillna(0.0)
+    rows["laid out"] = rows.index.map(laid_out)
+    about = {"family": Column(), "patients": Column(), "ratio": Column(digits=".3f", std="SD")}
+    about |= dict.fromkeys(("SD of patients", "laid out"), Column(digits=".3f"))
+    return table(rows.reset_index(), **about)
 
 
-# -- what costs how much --------------------------------------------------------------------------
-def _budgets(estimates: Sequence[EstimateRecord]) -> tuple[Table, Table]:
-    """SD of each modulus' logarithm, to first order: medians over patients, and of each.
+def _budgets(estimates: Sequence[EstimateRecord]) -> list[dict[str, Any]]:
+    """SD of each modulus' logarithm in each patient, to first order.
 
     ``without`` a part: it is known exactly and all else as it is; ``alone``: all else is known
     exactly (everything alone: nothing but the noise of single points).
     """
-    rows = [
+    return [
         {"patient": estimate.case, **row}
         for estimate in estimates
         for row in estimate.detail_rows("budget")
     ]
-    groups = dict.fromkeys((row["part"], row["modulus"]) for row in rows)
-    medians = []
-    for part, modulus in groups:
-        own = [row for row in rows if (row["part"], row["modulus"]) == (part, modulus)]
-        sizes = {kind: median(row[kind] for row in own) for kind in ("without", "alone")}
-        medians.append({"part": part, "modulus": modulus, **sizes})
-    return table(medians, part="", modulus="", without=":.3f", alone=":.3f"), table(rows)
 
 
+def _medians(budgets: Sequence[Mapping[str, Any]]) -> Table:
+    """Medians over patients."""
+    import pandas as pd
+
+    if not budgets:
+        return table([])
+    parts = pd.DataFrame(budgets).groupby(["part", "modulus"], sort=False)
+    medians = parts[["without", "alone"]].median().reset_index()
+    return table(medians, part="", modulus="", without=":.3f", alone=":.3f")
+
+
+# -- figure ---------------------------------------------------------------------------------------
 def figure(results: Results) -> dict[str, Figure]:
-    """Estimates from all sources over their truths, and the budget."""
-    groups: dict[str, list[tuple[Unknown, str]]] = {}
-    for estimate in _estimates(results):
-        for name, source in SOURCES.items():
-            one = estimate.alternatives[name] if name else estimate
-            own = [(modulus, trust_of(estimate)) for modulus in one.moduli]
-            groups.setdefault(source, []).extend(own)
-    drawn = {"moduli": moduli_figure(groups)}
-    rows = _budgets(_estimates(results))[0].rows
-    return drawn | ({"budget": budget_figure(rows)} if rows else {})
-
-
-def budget_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """What is left of each modulus' uncertainty without each part, and with it alone."""
-    from mvest.reporting.figures import SMALL, headline, panels
-
-    moduli = dict.fromkeys(row["modulus"] for row in rows)
-    parts = [part for part in dict.fromkeys(row["part"] for row in rows) if part != EVERYTHING]
-    drawn, axes = panels(1, len(moduli), 0.27 * len(parts) + 1.6, sharex=True, sharey=True)
-    places = range(len(parts))
-    for one, modulus in zip(axes[0], moduli, strict=True):
-        sizes = {row["part"]: row for row in rows if row["modulus"] == modulus}
-        one.axvline(sizes[EVERYTHING]["without"], color="0.5", lw=0.9, ls="--")
-        for kind, colour, marker in (("alone", "#31446B", "o"), ("without", "#C8553D", "D")):
-            values = [sizes[part][kind] for part in parts]
-            one.plot(values, places, marker, color=colour, ms=4.5, label=kind)
-        one.set_yticks(list(places), parts)
-        one.set_ylim(len(parts) - 0.5, -0.5)
-        one.set_title(modulus.replace(".", " "), loc="left", fontsize=SMALL + 0.5)
-        one.set_xlabel("SD of the modulus' logarithm")
-    axes[0, 0].set_xlim(left=0.0)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower right", ncols=2, fontsize=SMALL, frameon=False)
-    headline(
-        drawn,
-        "Where the information dies between a volume and a modulus",
-        "Each part of what is not known, alone and taken away; dashed: with all of it.",
-    )
-    return drawn
+    """Estimates from all sources over their truths."""
+    groups: dict[str, list[tuple[Unknown, str]]] = {source: [] for source in SOURCES.values()}
+    for source, one, own in _by_source(_estimates(results)):
+        groups[source] += [(modulus, trust_of(own)) for modulus in one.moduli]
+    return {"moduli": moduli_figure(groups)}
 
 
 def keep(record: Record) -> Record:
@@ -515,8 +478,6 @@ STUDY = Study(
     captions={
         "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
         "verdict on the one from the volume. Simulated.",
-        "budget": "What each part of what is not known costs a modulus, to first order at the "
-        "estimate; medians over simulated volumes.",
     },
     words=case_words,
     files=write_report,

@@ -30,7 +30,7 @@ def run(job: Job[Settings]) -> Result:
 
 def check_volume(values: Mapping[str, Any], folder: Path) -> str:
     """Find, measure and draw the valve without simulating anything, and say so."""
-    from mvest.reporting.images.step import write_image_step
+    from mvest.reporting.images import write_image_step
 
     imaged = build(ImagedInput, values["imaged"])
     detected = find_valve(values["volume"], imaged, folder, estimate=False)

@@ -16,15 +16,14 @@ from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.detection.shape_model import TrueValve
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.accuracy import frame_errors, surface_distance
 from mvest.imaging.learning.training import render_frame
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import MovingValve
+from mvest.observation.surfaces import surface_distance
 from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area
@@ -94,17 +93,14 @@ def _model(path: str) -> DetectionModel:
     return load_model(path)
 
 
-def try_volume(
-    valve: MovingValve, trial: Trial, model_file: Path, settings: TrackingSettings
-) -> dict[str, Any]:
+def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:
     """Simulate one frame and search it.
 
     Returns
     -------
     dict
         ``row``: JSON text with kind, number, valve, frame and confidence. Where there is a valve,
-        also errors: mean distances of surfaces, of corresponding points and of papillary tips (mm);
-        of each stage (mm, the pose in degrees); and those of `_differences`, with sign.
+        also the errors of `_distances` (mm), and of `_differences`, with sign.
     """
     choose, render = trial.random.spawn(2)
     frame = int(np.random.default_rng(choose).integers(len(valve.times)))
@@ -118,7 +114,7 @@ def try_volume(
         grey = np.random.default_rng(render).integers(0, 256, volume.frames.shape, dtype=np.uint8)
         volume = replace(volume, frames=grey, source="white noise", sha256="")
     model = _model(str(model_file))
-    found = find_frame(standard_frame(volume, 0), model, settings.fit)
+    found = find_frame(standard_frame(volume, 0), model)
     row: dict[str, Any] = {
         "kind": trial.kind,
         "number": trial.number,
@@ -127,15 +123,12 @@ def try_volume(
         "confidence": float(found.confidence),
     }
     if has_valve:
-        true, layout = TrueValve.of(seen.vertices[0], seen.tips[0], model.shape), seen.layout
-        row |= frame_errors(found, true, layout)
-        row |= _differences(found.vertices, found.tips, true.vertices, true.tips, layout)
+        both = found.vertices, found.tips, seen.vertices[0], seen.tips[0], seen.layout
+        row |= _distances(*both) | _differences(*both)
     return {"row": json.dumps(row)}
 
 
-def try_sequence(
-    valve: MovingValve, trial: Trial, model_file: Path, settings: TrackingSettings
-) -> dict[str, Any]:
+def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:
     """Simulate all frames of a valve as one volume and search it.
 
     However low its confidence, what is found counts as the valve.
@@ -156,18 +149,11 @@ def try_sequence(
     volume = simulate_volume(valve, acquisition, probe, int(scan.generate_state(1)[0]))
     true = true_sequence(valve, probe)
     model, layout = _model(str(model_file)), valve.layout
-    found = detect_valve(volume, model, replace(settings, min_confidence=0.0))
+    found = detect_valve(volume, model, min_confidence=0.0)
     frames = []
     for k in range(len(true.times)):
-        x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
-        frames.append(
-            {
-                "surface": surface_distance(x, right, layout),
-                "points": float(np.linalg.norm(x - right, axis=1).mean()),
-                "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
-                **_differences(x, tips, right, true.tips[k], layout),
-            }
-        )
+        both = found.vertices[k], found.tips[k], true.vertices[k], true.tips[k], layout
+        frames.append(_distances(*both) | _differences(*both))
     two = [0, trial.closed]
     row = {
         "kind": trial.kind,
@@ -199,6 +185,29 @@ def _mean_size(frames: Sequence[Row], name: str) -> float | None:
     """Mean over the frames without sign; None where no frame has the value."""
     known = [abs(frame[name]) for frame in frames if frame[name] is not None]
     return float(np.mean(known)) if known else None
+
+
+def _distances(
+    vertices: FloatArray,
+    tips: FloatArray,
+    true_vertices: FloatArray,
+    true_tips: FloatArray,
+    layout: ValveLayout,
+) -> dict[str, float | None]:
+    """Mean distances (mm) of what was found from the truth.
+
+    ``surface`` (of the vertices of each surface from the other one), ``points`` (of corresponding
+    vertices) and ``tips``.
+    """
+    there, back = (
+        surface_distance(points, surface, layout.triangles).mean()
+        for points, surface in ((vertices, true_vertices), (true_vertices, vertices))
+    )
+    return {
+        "surface": float(0.5 * (there + back)),
+        "points": float(np.linalg.norm(vertices - true_vertices, axis=1).mean()),
+        "tips": float(np.linalg.norm(tips - true_tips, axis=1).mean()),
+    }
 
 
 def _differences(

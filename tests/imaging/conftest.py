@@ -17,7 +17,7 @@ from mvest.imaging.learning.training import (
     draw_samples,
     train_stage,
 )
-from tests.imaging.detection.made_up import ball_volume, moving_valve, placed
+from tests.imaging.detection.made_up import ball_volume, labelled, moving_valve, placed
 
 TURN = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
 
@@ -52,7 +52,8 @@ def settings():
 @pytest.fixture(scope="session")
 def trained(shape, seen_valve, settings):
     """A detection model of a few small trees that learned from a few samples."""
-    found = draw_samples(*seen_valve, shape, settings.samples, np.random.default_rng(0))
+    frame, true = seen_valve
+    found = draw_samples(labelled(true, shape, frame=frame), settings.samples)
     boosters = {name: train_stage(name, *found[name], settings, 5) for name in STAGES}
     n = shape.layout.size
     rng = np.random.default_rng(1)

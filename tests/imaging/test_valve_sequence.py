@@ -1,4 +1,4 @@
-"""Sequences of valves refuse arrays that do not belong together.
+"""Moving valves and sequences refuse arrays that do not belong together.
 
 Named points: a wrong angle, row, tip or frame, and what a layout cannot give.
 """
@@ -8,47 +8,68 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import LANDMARKS, ValveSequence, landmark_vertices, landmarks
+from mvest.imaging.valve_sequence import (
+    LANDMARKS,
+    MovingValve,
+    ValveSequence,
+    landmark_vertices,
+    landmarks,
+)
 
 LAYOUT = ValveLayout(8, 3)
 
 
-def fields():
-    n = LAYOUT.size
-    return {
+SIZE = LAYOUT.size
+FIELDS = {
+    ValveSequence: {
         "layout": LAYOUT,
         "times": np.array([0.0, 0.1]),
-        "vertices": np.random.default_rng(0).normal(size=(2, n, 3)),
+        "vertices": np.random.default_rng(0).normal(size=(2, SIZE, 3)),
         "tips": np.zeros((2, 2, 3)),
         "frame_confidence": np.ones(2),
-        "vertex_confidence": np.ones((2, n)),
-        "std_mm": np.ones(n),
+        "vertex_confidence": np.ones((2, SIZE)),
+        "std_mm": np.ones(SIZE),
         "correlation_length_mm": 5.0,
-    }
+    },
+    MovingValve: {
+        "name": "made up",
+        "layout": LAYOUT,
+        "times": np.array([0.0, 0.1]),
+        "vertices": np.zeros((2, SIZE, 3)),
+        "tips": np.zeros((2, 2, 3)),
+        "thickness": np.ones(SIZE),
+        "chord_phi": np.zeros(4),
+        "chord_s": np.zeros(4),
+        "chord_tip": np.zeros(4, np.int64),
+    },
+}
+CHECKED = {
+    ValveSequence: ("vertices", "tips", "frame_confidence", "vertex_confidence", "std_mm"),
+    MovingValve: ("vertices", "tips", "thickness", "chord_s", "chord_tip"),
+}
 
 
 def test_rims_are_rows_of_the_layout():
-    sequence = ValveSequence(**fields())
+    sequence = ValveSequence(**FIELDS[ValveSequence])
     grid = sequence.vertices.reshape(2, 3, 8, 3)
     np.testing.assert_array_equal(sequence.annulus, grid[:, 0])
     np.testing.assert_array_equal(sequence.free_edge, grid[:, -1])
 
 
-@pytest.mark.parametrize(
-    "name", ["vertices", "tips", "frame_confidence", "vertex_confidence", "std_mm"]
-)
-def test_a_wrong_shape_is_named(name):
-    wrong = fields()
-    wrong[name] = wrong[name][..., :-1]
+@pytest.mark.parametrize(("kind", "name"), [(k, n) for k, each in CHECKED.items() for n in each])
+def test_a_wrong_shape_is_named(kind, name):
+    wrong = FIELDS[kind] | {name: FIELDS[kind][name][..., :-1]}
+    kind(**FIELDS[kind])
     with pytest.raises(InputError, match=name):
-        ValveSequence(**wrong)
+        kind(**wrong)
 
 
+@pytest.mark.parametrize("kind", FIELDS)
 @pytest.mark.parametrize("times", [[0.1, 0.0], [0.1, 0.1], [0.0, np.nan]])
-def test_times_must_increase(times):
+def test_times_must_increase(kind, times):
     # With "a difference <= 0" as the test, times that are no numbers pass.
     with pytest.raises(InputError, match="times"):
-        ValveSequence(**(fields() | {"times": np.array(times)}))
+        kind(**(FIELDS[kind] | {"times": np.array(times)}))
 
 
 def coordinates(layout: ValveLayout, frames: int = 2) -> ValveSequence:

@@ -126,7 +126,7 @@ def run_volume(
     folder: Path,
 ) -> Result:
     """Find the valve in the configured volume, write it, and personalise the case it makes."""
-    from mvest.reporting.images.step import write_image_step
+    from mvest.reporting.images import write_image_step
 
     detected = find_valve(file, imaged, folder)
     for sentence in detected.sentences:
@@ -155,7 +155,7 @@ def find_valve(
         except NoValveError as nothing:
             if nothing.candidate is None:
                 raise
-            from mvest.reporting.images.step import draw_candidate
+            from mvest.reporting.images import draw_candidate
 
             volume, low = read_for_case(Path(file), imaged), imaged.min_confidence
             drawn = draw_candidate(volume, nothing.candidate, low, folder)

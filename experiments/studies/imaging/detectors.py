@@ -1,42 +1,36 @@
 """What the study of detectors makes: valves, training samples, detectors and trials of them.
 
-Everything is made once and cached on disk under a key of its inputs and of the code that makes it,
-so an interrupted study goes on where it was.
+All of it is cached on disk under a key of its inputs and of the code that makes it, so an
+interrupted study goes on where it was.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.common.building.closure import mechanics_of
 from experiments.common.progress import PartBar
 from experiments.common.schema import NOT_HASHED, Values
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
-from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
-from mvest.imaging.learning.boosting import Trees
+from mvest.imaging.learning.boosting import Boosters, Trees
 from mvest.imaging.learning.training import (
-    Samples,
+    SEARCH_STAGES,
     TrainingSettings,
-    draft_of,
-    train_model,
     train_stage,
     volume_samples,
 )
-from mvest.imaging.models import MODEL_FILE
-from mvest.imaging.valve_sequence import MovingValve
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, MovingValve
 from mvest.kept import Entry, get_or_make
-from mvest.problem.stored import Store, key_of
+from mvest.problem.stored import Store
 from mvest.processes import side_by_side
-from mvest.quantities import Count, Length, Processes, Seed, within
+from mvest.quantities import Count, Length, Processes, Seed, Share, within
 from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
 from mvest.simulation.population import (
@@ -50,16 +44,10 @@ from mvest.simulation.trials import Trial
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
-Try = Callable[[MovingValve, Trial, Path, TrackingSettings], dict[str, Any]]
 Seen = tuple[Mapping[str, Any], Mapping[str, FloatArray]]
 """Row and arrays of a trial."""
 
-PACKAGED = "package"
-"""Stands for the detectors that come with the package."""
-
 Some = Annotated[int, within(1, 100_000, "", "things that each take their time")]
-
-SAMPLED_BY = (volume_samples, draft_of, fit_shape_model)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +82,7 @@ class ImagingSettings:
     calibration: DrawnValves  # measures the errors that detectors state
     test: DrawnValves
     training: TrainingSettings = field(default_factory=TrainingSettings)
-    detection: TrackingSettings = field(default_factory=TrackingSettings)
+    min_confidence: Share = MIN_CONFIDENCE  # from here on something is called a valve
     evaluate: bool = True
     held_out: HeldOutSettings
     processes: Annotated[Processes, NOT_HASHED] = 1
@@ -104,21 +92,14 @@ class ImagingSettings:
     )
 
 
-class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]):
-    """Samples of one volume in a file, read stage by stage: those of all fill the memory."""
+SAMPLED_BY = (volume_samples, train_stage, fit_shape_model)
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
-    def __getitem__(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        x, y = read_npz(self._path, [f"{name}.x", f"{name}.y"]).values()
-        return x, y
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(STAGES)
-
-    def __len__(self) -> int:
-        return len(STAGES)
+def _grow(name: str, files: Sequence[Path], settings: TrainingSettings, seed: int) -> Boosters:
+    """Trees of one stage; samples of all stages would fill the memory."""
+    samples = (read_npz(file, [f"{name}.x", f"{name}.y"]).values() for file in files)
+    x, y = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    return train_stage(name, x, y, settings, seed)
 
 
 class ImagingStore:
@@ -130,23 +111,12 @@ class ImagingStore:
         The resolved configuration, checked.
     settings : ImagingSettings
         Of the study.
-
-    Attributes
-    ----------
-    given : Path or None
-        File of detectors to be tested; None trains some.
-    model_file : Path
-        Of these, or of the trained ones.
     """
 
     def __init__(self, config: Values, settings: ImagingSettings) -> None:
         self._store = Store(Path(config["paths"]["outputs"]) / "detectors")
         self.settings, self.seed = settings, int(config["seed"])
         self._mechanics = mechanics_of(config)
-        self.given: Path | None = None
-        if settings.model is not None:
-            self.given = MODEL_FILE if settings.model == PACKAGED else Path(settings.model)
-        self.model_file = self.given or self._model_file()
 
     def _valves(self, which: str) -> Entry[Population]:
         described = {
@@ -160,120 +130,108 @@ class ImagingStore:
 
     def population(self, which: str) -> tuple[MovingValve, ...]:
         """A population of simulated valves: ``train``, ``calibration`` or ``test``."""
-        drawn = getattr(self.settings, which)
+        drawn, own = getattr(self.settings, which), self.settings
 
         def draw() -> Population:
             with PartBar(f"valves: {which}", drawn.count, "valve") as bar:
                 return draw_population(
-                    drawn.count,
-                    drawn.seed,
-                    self.settings.bases,
-                    self.settings.population,
-                    self._mechanics,
-                    processes=self.settings.processes,
-                    progress=lambda _number, _valve: bar.step(),
-                )
+                    drawn.count, drawn.seed, own.bases, own.population, self._mechanics,
+                    processes=own.processes, progress=lambda _number, _valve: bar.step(),
+                )  # fmt: skip
 
         return self._valves(which).get_or_make(draw, save_population).valves
 
-    def samples_folder(self) -> Path:
-        """Folder of the samples of all training volumes, however many there are."""
+    def model_entry(self) -> Entry[DetectionModel]:
+        """Where the trained detectors are cached."""
+        described = {**self._sampling(), "training": asdict(self.settings.training)}
+        return self._store.entry("models", described, (*SAMPLED_BY, save_model), load_model)
+
+    def samples_entry(self, number: int) -> Entry[Path]:
+        """Where the samples of a training volume are cached, however many volumes there are."""
+        described = {**self._sampling(), "number": number}
+        return self._store.entry("samples", described, SAMPLED_BY, lambda path: path)
+
+    def _sampling(self) -> dict[str, Any]:
         known = ("modes", "samples", "acquisition", "draft_volumes", "boosting")
-        described = {
+        return {
             "valves": self._valves("train").path.stem,
             "settings": {key: asdict(self.settings.training)[key] for key in known},
             "seed": self.seed,
         }
-        return self._store.folder / "samples" / key_of(described, SAMPLED_BY)
 
-    def _model_file(self) -> Path:
-        described = {
-            "samples": self.samples_folder().name,
-            "settings": asdict(self.settings.training),
-        }
-        made_by = (*SAMPLED_BY, train_stage, save_model)
-        return self._store.entry("models", described, made_by, load_model).path
-
-    def train(self, valves: Sequence[MovingValve], trained_on: Values) -> DetectionModel:
-        """Detectors trained on valves."""
-        folder, settings = self.samples_folder(), self.settings.training
-
-        def sampled(
-            numbers: Sequence[int], shape: ShapeModel, make_draft: Callable[[], Trees] | None
-        ) -> list[StoredSamples]:
-            def make(missing: list[int]) -> Iterator[Samples]:
-                draft = make_draft() if make_draft else None
-                calls = (
-                    (valves[k % len(valves)], k, shape, settings, self.seed, draft)
-                    for k in (numbers[at] for at in missing)
-                )
-                return self._with_bar("training volumes", volume_samples, calls, len(missing))
-
-            entries = [Entry(folder / f"{k:05d}.npz", StoredSamples) for k in numbers]
-            return get_or_make(entries, make, _write_samples)
+    def train(self, trained_on: Values) -> DetectionModel:
+        """Detectors trained on the valves to train on; the first volumes make a draft."""
+        settings, valves = self.settings.training, self.population("train")
 
         def train() -> DetectionModel:
-            with PartBar("training", len(STAGES), "stage") as bar:
-                return train_model(
-                    valves,
-                    settings,
-                    self.seed,
-                    processes=self.settings.processes,
-                    trained_on=trained_on,
-                    progress=bar.step,
-                    sampled=sampled,
-                )
+            shape = fit_shape_model(valves, settings.modes)
+            first = min(settings.draft_volumes, settings.volumes)
+            files = self._samples(valves, shape, range(first), lambda: None)
 
-        return Entry(self.model_file, load_model).get_or_make(train, save_model)
+            def draft() -> Trees | None:
+                return self._grown(SEARCH_STAGES, files[:first]) if first else None
 
-    @cached_property
-    def model_key(self) -> str:
-        """Key of the detectors by their shapes and trees, whatever was measured of them since."""
-        digest = hashlib.sha256()
-        for name, array in sorted(read_npz(self.model_file).items()):
-            if not name.startswith(("about", "accuracy.")):
-                digest.update(name.encode() + array.tobytes())
-        return digest.hexdigest()
+            files += self._samples(valves, shape, range(first, settings.volumes), draft)
+            return DetectionModel(shape, self._grown(STAGES, files), dict(trained_on))
 
-    def tried(self, function: Try, trials: Sequence[Trial]) -> list[Seen]:
-        """Rows and arrays of trials of the detectors, which are trained by now."""
-        # The verdict changes nothing of what is found.
-        settings = replace(self.settings.detection, min_confidence=0.0)
+        return self.model_entry().get_or_make(train, save_model)
+
+    def _samples(
+        self,
+        valves: Sequence[MovingValve],
+        shape: ShapeModel,
+        numbers: Sequence[int],
+        make_draft: Callable[[], Trees | None],
+    ) -> list[Path]:
+        """Files of the samples of training volumes; a draft is made if some are missing."""
+
+        def make(missing: list[int]) -> Iterator[Any]:
+            draft, settings = make_draft(), self.settings.training
+            calls = (
+                (valves[k % len(valves)], k, shape, settings, self.seed, draft)
+                for k in (numbers[at] for at in missing)
+            )
+            return self._made("training volumes", volume_samples, calls, len(missing))
+
+        return get_or_make([self.samples_entry(k) for k in numbers], make, _write)
+
+    def _grown(self, stages: Sequence[str], files: Sequence[Path]) -> Trees:
+        calls = ((name, files, self.settings.training, self.seed) for name in stages)
+        return dict(zip(stages, self._made("stages", _grow, calls, len(stages)), strict=True))
+
+    def tried(self, function: Any, trials: Sequence[Trial], file: Path) -> list[Seen]:
+        """Rows and arrays of trials, by `try_volume` or `try_sequence`, of detectors in a file."""
+        # What was measured of the detectors changes nothing of what they find.
+        boosters = load_model(file).boosters
+        trees = "".join(text for name in STAGES for text in boosters[name].texts)
+        key = hashlib.sha256(trees.encode()).hexdigest()
         of = ["calibration" if t.kind.endswith("calibration") else "test" for t in trials]
+        drawn = {which: self._valves(which).path.stem for which in set(of)}
         valves = {which: self.population(which) for which in set(of)}
         entries = []
         for trial, which in zip(trials, of, strict=True):
-            described = {
-                "trial": asdict(trial),
-                "valves": self._valves(which).path.stem,
-                "model": self.model_key,
-                "settings": asdict(settings),
-            }
+            described = {"model": key, "trial": asdict(trial), "valves": drawn[which]}
             entries.append(self._store.entry("trials", described, (function,), _read_trial))
 
-        def make(missing: list[int]) -> Iterator[dict[str, Any]]:
+        def make(missing: list[int]) -> Iterator[Any]:
             calls = (
-                (valves[of[k]][trials[k].number % len(valves[of[k]])], trials[k], self.model_file,
-                 settings)
+                (valves[of[k]][trials[k].number % len(valves[of[k]])], trials[k], file)
                 for k in missing
-            )  # fmt: skip
+            )
             kinds = ", ".join(dict.fromkeys(trials[k].kind for k in missing))
-            return self._with_bar(f"volumes: {kinds}", function, calls, len(missing))
+            return self._made(f"volumes: {kinds}", function, calls, len(missing))
 
-        return get_or_make(entries, make, lambda path, arrays: np.savez(path, **arrays))
+        return get_or_make(entries, make, _write)
 
-    def _with_bar(self, title: str, function: Any, calls: Any, total: int) -> Iterator[Any]:
+    def _made(self, title: str, function: Any, calls: Any, total: int) -> Iterator[Any]:
         """What calls return, with a bar."""
-        with PartBar(title, total, "volume") as bar:
+        with PartBar(title, total, "part") as bar:
             for made in side_by_side(function, calls, self.settings.processes):
                 yield made
                 bar.step()
 
 
-def _write_samples(path: Path, samples: Samples) -> None:
-    arrays: dict[str, Any] = {}
-    for name, (x, y) in samples.items():
-        arrays |= {f"{name}.x": x, f"{name}.y": y}
+def _write(path: Path, arrays: Mapping[str, Any]) -> None:
     np.savez(path, **arrays)
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore,
 from mvest.cases.from_images.detector_errors import coverage
 from mvest.errors import ConfigurationError, InputError
 from mvest.files import sha256_of, write_atomically
-from mvest.imaging.detection.pose_search import MODES
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
     DetectionModel,
@@ -25,17 +25,10 @@ from mvest.imaging.detection.trained_model import (
     save_model,
 )
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.accuracy import (
-    Correlogram,
-    best_threshold,
-    measure_accuracy,
-    unlike_share,
-    widened,
-)
+from mvest.imaging.learning.accuracy import measure_accuracy, unlike_share, widened
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import landmark_vertices
 from mvest.provenance import provenance
-from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.trials import (
     SEQUENCES,
@@ -56,42 +49,35 @@ Row = Mapping[str, Any]
 MODEL = "tee.npz"
 """The trained detectors, in the folder of a run."""
 
+PACKAGED = "package"
+"""Stands for the detectors that come with the package."""
+
 POPULATIONS = ("train", "calibration", "test")
 
-CALIBRATION, WIDE = "calibration", "wide calibration"
-"""Volumes over time that measure the errors, and that say how these grow as confidence falls."""
+CALIBRATION, *TESTED, WIDE = SEQUENCES
+"""Kinds of volumes over time: those that measure the errors, those tested on, and those that say
+how errors grow as confidence falls."""
 
-SETTINGS = {"sequence": VOLUMES[0], "shifted sequence": VOLUMES[1]}
-"""Kind of volumes over time -> how its acquisitions are drawn."""
+LIMIT_MM = 1.5
+"""Mean surface distance from which on a detected valve counts as wrong."""
 
-STAGES = {"position": "mm", "pose": "°", "landmarks": "mm", "hinge": "mm", "surface": "mm"}
-"""Stages of the detection in their order -> unit of their errors."""
+ERRORS = {
+    **dict.fromkeys(("surface", "surface_open", "surface_closed", "points", "tips"), "mm"),
+    "annulus_area": "%",
+    "ap_diameter": "mm",
+}
+"""Errors of a trial and their units: distances, and what clinicians would measure wrongly."""
 
-LIMITS_MM = (0.5, 0.8, 1.5)
-"""Surface distances marked in the figure. From the last one on a detected valve counts as wrong."""
-
-SHARE, DISTANCE = Column("%", ".0f"), Column("mm", ".2f")
+SHARE = Column("%", ".0f")
 COLUMNS: Mapping[str, Column] = {
     **dict.fromkeys(("confidence", "lowest", "median", "highest"), Column("", ".2f")),
-    **{name: Column(unit, ".2f") for name, unit in STAGES.items()},
-    **dict.fromkeys(("called_a_valve", "wrongly_so"), SHARE),
-    "below_limit": replace(SHARE, label=f"detected, surface below {LIMITS_MM[-1]:g} mm"),
+    **{name: Column(unit, ".2f") for name, unit in ERRORS.items()},
+    **dict.fromkeys(("called_a_valve", "wrongly_so", "within_95", "state_right"), SHARE),
+    "below_limit": replace(SHARE, label=f"detected, surface below {LIMIT_MM:g} mm"),
     "wrong_yet_like": replace(SHARE, label="wrong, yet like those of training"),
-    "state_right": replace(SHARE, label="orifice open or closed, right"),
-    **{f"surface_{which}": DISTANCE for which in ("mean", "median", "open", "closed")},
-    "surface_90": replace(DISTANCE, label="surface, 90th percentile"),
-    "points": replace(DISTANCE, label="point to point"),
-    "tips": replace(DISTANCE, label="papillary tips"),
-    "annulus_area": Column("%", ".1f"),
-    "annulus_area_bias": Column("%", ".1f"),
-    "ap_diameter": replace(DISTANCE, label="AP diameter"),
-    "ap_diameter_bias": replace(DISTANCE, label="AP diameter bias"),
-    "within_95": replace(SHARE, label="within 1.96 SD"),
-    "rms": DISTANCE,
-    "stated": replace(DISTANCE, label="rms stated"),
-    "within_95_handed_on": replace(SHARE, label="within 1.96 SD, handed on"),
-    "rms_handed_on": replace(DISTANCE, label="rms, handed on"),
-    "stated_handed_on": replace(DISTANCE, label="rms stated, handed on"),
+    "within_95_handed_on": replace(SHARE, label="within 95, handed on"),
+    "percentile_90": Column(label="90th percentile"),
+    **dict.fromkeys(("rms", "stated", "rms_handed_on", "stated_handed_on"), Column("mm", ".2f")),
 }
 """Columns of all tables that have a unit. Errors of one frame have a sign, means have none."""
 
@@ -103,33 +89,39 @@ class Settings:
     imaging: ImagingSettings
 
 
+# -- run ------------------------------------------------------------------------------------------
 def run_imaging(job: Job[Settings]) -> Result:
     """Train detectors and test them on valves that no training saw; the model is left beside."""
     require_imaging(job.values)
     settings = job.settings.imaging
     store = ImagingStore(job.values, settings)
-    if store.given:
-        model = load_model(store.given)
+    if settings.model is not None:
+        file = MODEL_FILE if settings.model == PACKAGED else Path(settings.model)
+        model = load_model(file)
         trained_on = dict(model.trained_on)
     else:
-        valves = store.population("train")
+        file = store.model_entry().path
         trained_on = {
-            "valves": [valve.name for valve in valves],
+            "valves": [valve.name for valve in store.population("train")],
             "seed": store.seed,
             "settings": json.loads(json.dumps(asdict(settings.training))),
             "versions": {k: provenance()["versions"][k] for k in ("mvest", "numpy", "lightgbm")},
             "volumes": settings.training.volumes,
         }
-        model = store.train(valves, trained_on)
+        model = store.train(trained_on)
         trained_on["config_hash"] = job.config_hash
     tested, accuracy = Result(), None
     if settings.evaluate:
-        apart = [[valve.name for valve in store.population(which)] for which in POPULATIONS[1:]]
-        require_apart(trained_on["valves"], *apart)
-        volumes, sequences = _held_out(store)
-        limits = settings.detection.min_confidence, settings.held_out.wrong_mm
-        accuracy, correlogram, trained_on["calibrated_on"] = calibrated(sequences, *limits)
-        tested = result_of(volumes, sequences, accuracy, correlogram, model.shape.layout, *limits)
+        held_out = chain(*(store.population(which) for which in POPULATIONS[1:]))
+        if both := set(trained_on["valves"]) & {valve.name for valve in held_out}:
+            raise ConfigurationError(
+                f"valve {min(both)} was trained on, expected other valves to calibrate with and to "
+                "test on: imaging.calibration.seed, imaging.test.seed"
+            )
+        limits = settings.min_confidence, settings.held_out.wrong_mm
+        seen = _held_out(store, file)
+        accuracy, trained_on["calibrated_on"] = calibrated(seen, *limits)
+        tested = result_of(seen, accuracy, model.shape.layout, *limits)
     path = job.folder / MODEL
     save_model(path, DetectionModel(model.shape, model.boosters, trained_on, accuracy))
     about: dict[str, Number] = {
@@ -137,45 +129,43 @@ def run_imaging(job: Job[Settings]) -> Result:
         "training_valves": len(trained_on["valves"]),
         "model_sha256": sha256_of(path),
     }
-    done = [*([] if store.given else ["trained"]), *(["tested"] if settings.evaluate else [])]
+    done = ["trained"] * (settings.model is None) + ["tested"] * settings.evaluate
     return replace(tested, numbers={**about, **tested.numbers}, reason=" and ".join(done))
 
 
-# -- what is found in held-out volumes ------------------------------------------------------------
-def _held_out(store: ImagingStore) -> tuple[list[Row], dict[str, list[Seen]]]:
-    """Rows of volumes of one frame, and what was found in volumes over time, by kind."""
+def _held_out(store: ImagingStore, file: Path) -> list[Seen]:
+    """What is found in volumes of one frame, and in volumes over time."""
     settings, counts = store.settings, store.settings.held_out
+    over_time = (
+        settings.calibration.count, counts.sequences, counts.shifted_sequences,
+        counts.wide_calibration,
+    )  # fmt: skip
+    numbers = dict(zip(SEQUENCES, over_time, strict=True))
+    numbers |= dict(zip(VOLUMES, (counts.volumes, counts.shifted), strict=True))
+    numbers |= dict.fromkeys(WITHOUT_VALVE, counts.without_valve)
     acquisition, closed = settings.training.acquisition, settings.population.motion.frames - 1
-
-    def trials(kinds: Iterable[str], numbers: Iterable[int]) -> list[Trial]:
-        return [
+    seen = []
+    for kinds, function in (((*VOLUMES, *WITHOUT_VALVE), try_volume), (SEQUENCES, try_sequence)):
+        trials = [
             Trial(kind, k, store.seed, acquisition, closed)
-            for kind, count in zip(kinds, numbers, strict=True)
-            for k in range(count)
+            for kind in kinds
+            for k in range(numbers[kind])
         ]
-
-    without = [counts.without_valve] * len(WITHOUT_VALVE)
-    kinds, numbers = (*VOLUMES, *WITHOUT_VALVE), (counts.volumes, counts.shifted, *without)
-    volumes = store.tried(try_volume, trials(kinds, numbers))
-    over_time = (counts.sequences, counts.shifted_sequences, counts.wide_calibration)
-    asked = trials(SEQUENCES, (settings.calibration.count, *over_time))
-    sequences: dict[str, list[Seen]] = {kind: [] for kind in SEQUENCES}
-    for trial, seen in zip(asked, store.tried(try_sequence, asked), strict=True):
-        sequences[trial.kind].append(seen)
-    return [row for row, _ in volumes], sequences
+        seen += store.tried(function, trials, file)
+    return seen
 
 
 def calibrated(
-    sequences: Mapping[str, Sequence[Seen]], min_confidence: float, wrong_mm: float
-) -> tuple[DetectionAccuracy, Correlogram, list[str]]:
+    seen: Sequence[Seen], min_confidence: float, wrong_mm: float
+) -> tuple[DetectionAccuracy, list[str]]:
     """Errors in the calibration volumes whose valve was detected, and the names of these valves.
 
     Where it was not, or where something else was taken for it, no standard deviation says how far.
 
     Parameters
     ----------
-    sequences : mapping
-        Kind of volumes over time -> rows and arrays of `try_sequence`.
+    seen : sequence
+        Rows and arrays of `try_sequence`, of all kinds.
     min_confidence : float
         From here on something is called a valve.
     wrong_mm : float
@@ -186,29 +176,32 @@ def calibrated(
     InputError
         If the valve was detected in fewer than two of them.
     """
-    seen = _detected(sequences[CALIBRATION], min_confidence, wrong_mm)
-    if len(seen) < 2:
+    own = _detected(seen, CALIBRATION, min_confidence, wrong_mm)
+    if len(own) < 2:
+        count = sum(row["kind"] == CALIBRATION for row, _ in seen)
         raise InputError(
-            f"imaging.calibration: in {len(seen)} of {len(sequences[CALIBRATION])} volumes the "
-            f"valve was detected (confidence at least {min_confidence:g}, points nearer than "
-            f"{wrong_mm:g} mm), expected two or more: more volumes to train on"
+            f"imaging.calibration: in {len(own)} of {count} volumes the valve was detected "
+            f"(confidence at least {min_confidence:g}, points nearer than {wrong_mm:g} mm), "
+            "expected two or more: more volumes to train on"
         )
     errors, tips, rest, shapes, tip_shapes = (
-        _stacked(seen, name) for name in ("errors", "tip_errors", "rest", "shapes", "tip_shapes")
+        _stacked(own, name) for name in ("errors", "tip_errors", "rest", "shapes", "tip_shapes")
     )
-    accuracy, correlogram = measure_accuracy(errors, tips, rest.mean(axis=0))
+    accuracy = measure_accuracy(errors, tips, rest.mean(axis=0))
     accuracy = replace(accuracy, shapes=shapes, tip_shapes=tip_shapes)
-    if wide := _detected(sequences[WIDE], min_confidence, wrong_mm):
-        own, others = _confidence(seen), _confidence(wide)
-        accuracy = widened(accuracy, own, _stacked(wide, "errors"), others)
-    return accuracy, correlogram, [row["valve"] for row, _ in seen]
+    if wide := _detected(seen, WIDE, min_confidence, wrong_mm):
+        others = _stacked(wide, "errors"), _confidence(wide)
+        accuracy = widened(accuracy, _confidence(own), *others)
+    return accuracy, [row["valve"] for row, _ in own]
 
 
-def _detected(seen: Sequence[Seen], min_confidence: float, wrong_mm: float = np.inf) -> list[Seen]:
+def _detected(
+    seen: Sequence[Seen], kind: str, min_confidence: float, wrong_mm: float = np.inf
+) -> list[Seen]:
     return [
         (row, arrays)
         for row, arrays in seen
-        if row["confidence"] >= min_confidence and row["points"] < wrong_mm
+        if row["kind"] == kind and row["confidence"] >= min_confidence and row["points"] < wrong_mm
     ]
 
 
@@ -220,36 +213,31 @@ def _stacked(seen: Sequence[Seen], name: str) -> FloatArray:
     return np.stack([arrays[name] for _, arrays in seen])
 
 
-# -- tables ---------------------------------------------------------------------------------------
+# -- tables and figure ----------------------------------------------------------------------------
 def result_of(
-    volumes: Sequence[Row],
-    sequences: Mapping[str, Sequence[Seen]],
+    seen: Sequence[Seen],
     accuracy: DetectionAccuracy,
-    correlogram: Correlogram,
     layout: ValveLayout,
     min_confidence: float,
     wrong_mm: float,
 ) -> Result:
-    """Tables, numbers and arrays of a test; see `calibrated`."""
-    over_time = [row for seen in sequences.values() for row, _ in seen]
-    judged = judge([*volumes, *over_time], min_confidence, wrong_mm, accuracy.like_from)
-    right, other = (judged["confidence"][judged["right"] == is_right] for is_right in (True, False))
-    without = judged["confidence"][judged["kind"].isin(list(WITHOUT_VALVE))]
-    count = len(accuracy.samples)
-    tables: dict[str, Sequence[Row] | DataFrame] = {
-        "": accuracy_rows(judged),
-        "over_time": over_time_rows(judged),
-        "confidence": confidence_rows(judged),
-        "coverage": coverage_rows(sequences, accuracy, layout, min_confidence),
-        "stages": stage_rows(judged),
-        "volumes": volumes,
-        "sequences": over_time,
-    }
+    """Tables and numbers of a test; see `calibrated`."""
+    trials = judge([row for row, _ in seen], min_confidence, wrong_mm, accuracy.like_from)
+    count, tried = len(accuracy.samples), int((trials["kind"] == CALIBRATION).sum())
+    covered: list[Row] = []
+    for kind in TESTED:
+        if own := _detected(seen, kind, min_confidence):
+            shapes = np.concatenate([_stacked(own, "shapes"), _stacked(own, "tip_shapes")], axis=2)
+            rows = coverage(layout, accuracy, _stacked(own, "errors"), shapes, _confidence(own))
+            covered += [
+                {"kind": kind, "frame": frame, "volumes": len(own)} | row
+                for frame, row in zip(("open", "closed"), rows, strict=True)
+            ]
     return Result(
-        tables={name: table_of(rows) for name, rows in tables.items()},
+        tables=tables_of(trials, covered),
         numbers={
             "calibration_sequences": count,
-            "calibration_sequences_left_out": len(sequences[CALIBRATION]) - count,
+            "calibration_sequences_left_out": tried - count,
             "median_std_mm": float(np.median(accuracy.std_mm)),
             "mean_error_mm": float(np.linalg.norm(accuracy.samples.mean(axis=0), axis=2).mean()),
             "correlation_length_mm": accuracy.correlation_length_mm,
@@ -259,25 +247,23 @@ def result_of(
             "unlike_expected_percent": 100 * unlike_share(count),
             "called_a_valve_from_confidence": min_confidence,
             "not_the_valve_from_mm": wrong_mm,
-            "highest_confidence_without_valve": float(without.max()),
-            "highest_confidence_wrong": float(other.max()),
-            "lowest_confidence_right": float(right.min()) if len(right) else None,
-            "best_threshold": best_threshold(right.to_numpy(), other.to_numpy())
-            if len(right)
-            else None,
-        },
-        arrays={
-            "std_mm": accuracy.std_mm.reshape(layout.rows, layout.columns),
-            "distance_mm": correlogram.distance,
-            "correlation": correlogram.correlation,
         },
     )
 
 
-def table_of(rows: Sequence[Row] | DataFrame) -> Table:
-    """Rows with the meaning of their columns (`COLUMNS`)."""
-    names = rows.columns if hasattr(rows, "columns") else dict.fromkeys(n for r in rows for n in r)
-    return table(rows, **{str(name): COLUMNS.get(str(name), Column()) for name in names})
+def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
+    """The tables of a test, with the meaning of their columns (`COLUMNS`)."""
+    tables: dict[str, Any] = {
+        "": kind_rows(trials),
+        "errors": error_rows(trials),
+        "coverage": covered,
+        "trials": trials,
+    }
+    return {name: _with_units(table(rows)) for name, rows in tables.items()}
+
+
+def _with_units(plain: Table) -> Table:
+    return replace(plain, columns={name: COLUMNS.get(name, Column()) for name in plain.values})
 
 
 def judge(
@@ -291,8 +277,9 @@ def judge(
     import pandas as pd
 
     frame = pd.DataFrame(rows)
-    for name in ("points", "median_confidence"):
-        frame[name] = frame[name].astype(float) if name in frame else np.nan
+    names = ["points", "median_confidence", "state_right", *ERRORS]
+    frame = frame.reindex(columns=list(dict.fromkeys([*frame, *names])))
+    frame = frame.astype(dict.fromkeys(names, float))
     middle = frame["median_confidence"].fillna(frame["confidence"])
     return frame.assign(
         called=frame["confidence"] >= min_confidence,
@@ -301,135 +288,73 @@ def judge(
     )
 
 
-def accuracy_rows(judged: DataFrame) -> list[Row]:
-    """A row for each setting: errors in volumes of one frame that are called a valve.
-
-    Shares are of all its volumes.
-    """
-    out: list[Row] = []
-    for setting in VOLUMES:
-        own = judged[judged["kind"] == setting]
-        found = own[own["called"]]
-        surface, area, diameter = (
-            found[name].astype(float) for name in ("surface", "annulus_area", "ap_diameter")
-        )
-        believed = (surface >= LIMITS_MM[-1]) & ~found["unlike"]
-        out.append(
-            {
-                "setting": setting,
-                "volumes": len(own),
-                "called_a_valve": 100 * own["called"].mean(),
-                "surface_mean": surface.mean(),
-                "surface_median": surface.median(),
-                "surface_90": surface.quantile(0.9),
-                "below_limit": 100 * (surface < LIMITS_MM[-1]).sum() / len(own),
-                "points": found["points"].mean(),
-                "tips": found["tips"].mean(),
-                "annulus_area": area.abs().mean(),
-                "annulus_area_bias": area.mean(),
-                "ap_diameter": diameter.abs().mean(),
-                "ap_diameter_bias": diameter.mean(),
-                "state_right": found["state_right"].astype(float).mean(),
-                "wrong_yet_like": 100 * believed.sum() / len(own),
-            }
-        )
-    return out
-
-
-def over_time_rows(judged: DataFrame) -> DataFrame:
-    """A row for each setting: means over the volumes over time that are called a valve."""
-    names = ("surface", "surface_open", "surface_closed", "points", "tips", "annulus_area",
-             "ap_diameter", "state_right")  # fmt: skip
-    found = judged[judged["called"] & judged["kind"].isin(list(SETTINGS))]
-    means = (
-        found.astype(dict.fromkeys(names, float)).groupby("kind", sort=False)[list(names)].mean()
-    )
-    means.insert(0, "volumes", found.groupby("kind").size())
-    return means.rename(index=SETTINGS).reset_index(names="setting")
-
-
-def confidence_rows(judged: DataFrame) -> DataFrame:
+def kind_rows(trials: DataFrame) -> DataFrame:
     """A row for each kind of volumes: how sure the detectors are, and whether rightly.
 
     A valve is lost where it is not found or something else is; without a valve none is lost.
     """
-    lost = ~(judged["called"] & judged["right"]) & ~judged["kind"].isin(list(WITHOUT_VALVE))
-    judged = judged.assign(
-        called_a_valve=100.0 * judged["called"],
-        wrongly_so=100.0 * (judged["called"] & ~judged["right"]),
-        lost=lost,
+    found, wrong = trials["called"], trials["surface"] >= LIMIT_MM
+    judged = trials.assign(
+        lost=~(found & trials["right"]) & ~trials["kind"].isin(list(WITHOUT_VALVE)),
+        called_a_valve=100.0 * found,
+        wrongly_so=100.0 * (found & ~trials["right"]),
+        below_limit=(100.0 * (found & ~wrong)).where(trials["kind"].isin([*VOLUMES, *TESTED])),
+        wrong_yet_like=100.0 * (found & wrong & ~trials["unlike"]),
+        state_right=trials["state_right"].where(found),
     )
     kinds = judged.groupby("kind", sort=False)
     rows = kinds["confidence"].agg(volumes="size", lowest="min", median="median", highest="max")
-    shares, counts = ["called_a_valve", "wrongly_so"], ["lost", "unlike"]
-    return rows.join(kinds[shares].mean()).join(kinds[counts].sum()).reset_index()
+    shares = ["called_a_valve", "wrongly_so", "below_limit", "wrong_yet_like", "state_right"]
+    return rows.join(kinds[["lost", "unlike"]].sum()).join(kinds[shares].mean()).reset_index()
 
 
-def stage_rows(judged: DataFrame) -> DataFrame:
-    """A row for each stage and setting: median and 90th percentile of the error."""
-    with_valve = judged[judged["kind"].isin(VOLUMES)]
-    errors = with_valve.melt("kind", list(STAGES), "stage", "error").astype({"error": float})
-    stages = errors.groupby(["stage", "kind"], sort=False)["error"]
-    rows = stages.quantile(np.array([0.5, 0.9])).unstack()
-    rows.columns = ["error", "error_90"]
-    rows.insert(0, "volumes", stages.size())
-    rows = rows.loc[list(STAGES)].reset_index().rename(columns={"kind": "setting"})
-    return rows.assign(unit=rows["stage"].map(STAGES))
+def error_rows(trials: DataFrame) -> DataFrame:
+    """A row for each error and kind of volumes to test on, of those that are called a valve.
+
+    Mean, median and 90th percentile are of the size, the bias is of what has a sign.
+    """
+    found = trials[trials["called"] & trials["kind"].isin([*VOLUMES, *TESTED])]
+    errors = found.melt("kind", list(ERRORS), "error", "bias").dropna(subset="bias")
+    size = errors.assign(size=errors["bias"].abs()).groupby(["error", "kind"], sort=False)
+    rows = size["size"].agg(volumes="size", mean="mean", median="median")
+    rows["percentile_90"] = size["size"].quantile(0.9)
+    rows = rows.join(size["bias"].mean()).reset_index()
+    signed = rows["kind"].isin(VOLUMES) & rows["error"].isin(["annulus_area", "ap_diameter"])
+    return rows.assign(bias=rows["bias"].where(signed), unit=rows["error"].map(ERRORS))
 
 
-def coverage_rows(
-    sequences: Mapping[str, Sequence[Seen]],
-    accuracy: DetectionAccuracy,
-    layout: ValveLayout,
-    min_confidence: float,
-) -> list[Row]:
-    """A row for each setting and frame: see `mvest.cases.from_images.detector_errors.coverage`."""
-    rows: list[Row] = []
-    for kind, setting in SETTINGS.items():
-        if seen := _detected(sequences[kind], min_confidence):
-            errors, leaflets, tips = (
-                _stacked(seen, name) for name in ("errors", "shapes", "tip_shapes")
-            )
-            shapes = np.concatenate([leaflets, tips], axis=2)
-            covered = coverage(layout, accuracy, errors, shapes, _confidence(seen))
-            rows += [
-                {"setting": setting, "frame": frame, "volumes": len(seen)} | row
-                for frame, row in zip(("open", "closed"), covered, strict=True)
-            ]
-    return rows
+def figure(results: Results) -> Figure | None:
+    """Confidence and surface distance in every volume; nothing of a run that only trained."""
+    from mvest.reporting.figures import COLOURS, SMALL, headline, log_axis, panels
 
-
-# -- figures --------------------------------------------------------------------------------------
-def figure(results: Results) -> dict[str, Figure]:
-    """Errors of the detectors, and their confidence; nothing of a run that only trained."""
-    from mvest.reporting.images.figures import confidence_figure, errors_figure
-
-    name, record = next(iter(results.records.items()))
+    record = results.first
     if not record.tables:
-        return {}
-    threshold, wrong, length = (
-        float(record.numbers[key])  # type: ignore[arg-type]
-        for key in (
-            "called_a_valve_from_confidence",
-            "not_the_valve_from_mm",
-            "correlation_length_mm",
-        )
+        return None
+    trials, random = record.table_of("trials").frame, np.random.default_rng(0)
+    kinds = list(trials["kind"].unique())
+    drawn, grid = panels(1, 2, 0.42 * len(kinds) + 1.6, sharey=True)
+    called: Any = record.numbers["called_a_valve_from_confidence"]
+    limits = {"confidence": called, "surface": LIMIT_MM}
+    for axes, (name, limit) in zip(grid[0], limits.items(), strict=True):
+        axes.axvline(limit, color="0.25", lw=1.0, ls="--", zorder=0)
+        for k, kind in enumerate(kinds):
+            own, colour = trials[trials["kind"] == kind], COLOURS[kind in WITHOUT_VALVE]
+            places = k + random.uniform(-0.2, 0.2, len(own))
+            for right, face in ((own["right"], colour), (~own["right"], "white")):
+                axes.plot(own[name][right], places[right], "o", ms=4, mec=colour, mfc=face)
+    grid[0, 0].set_xlabel("confidence; over time of the best frame")
+    grid[0, 1].set_xlabel("mean distance from the true surface [mm]")
+    grid[0, 1].set_xscale("log")
+    log_axis(grid[0, 1].xaxis)
+    grid[0, 0].set_yticks(range(len(kinds)), kinds, fontsize=SMALL)
+    grid[0, 0].set_ylim(len(kinds) - 0.5, -0.5)
+    headline(
+        drawn,
+        "Detectors in simulated volumes that no training saw",
+        "Hollow: there is no valve, or what was found is not it. Dashed: called a valve from here, "
+        f"and {LIMIT_MM:g} mm.",
     )
-    volumes, stages = (record.table_of(part).rows for part in ("volumes", "stages"))
-    every = [*volumes, *record.table_of("sequences").rows]
-    distances = {
-        setting: [
-            row["surface"]
-            for row in volumes
-            if row["kind"] == setting and row["confidence"] >= threshold
-        ]
-        for setting in VOLUMES
-    }
-    arrays = read_npz(results.arrays[name])
-    return {
-        "": errors_figure(distances, LIMITS_MM, stages, length_mm=length, **arrays),
-        "confidence": confidence_figure(every, threshold, wrong),
-    }
+    return drawn
 
 
 # -- settings and the package's model -------------------------------------------------------------
@@ -453,31 +378,8 @@ def require_imaging(config: Values) -> None:
         raise ConfigurationError(
             "imaging.model is given and imaging.evaluate=false: nothing would be done"
         )
-    modes = max(MODES, *settings.detection.fit.modes)
-    if settings.training.modes < modes:
-        raise ConfigurationError(
-            f"imaging.training.modes = {settings.training.modes}, expected at least {modes}: as "
-            "many as are read off and as imaging.detection.fit.modes has"
-        )
     motion = settings.population.motion
     landmark_vertices(ValveLayout(motion.columns, motion.rows))
-
-
-def require_apart(*populations: Iterable[str]) -> None:
-    """Refuse populations that have a valve of the same name.
-
-    Raises
-    ------
-    ConfigurationError
-    """
-    seen: set[str] = set()
-    for names in map(set, populations):
-        if both := seen & names:
-            raise ConfigurationError(
-                f"valve {min(both)} is in two populations, expected other valves to train on, to "
-                "calibrate with and to test on: imaging.calibration.seed, imaging.test.seed"
-            )
-        seen |= names
 
 
 def publish_model(job: Job[Settings], _record: Record) -> None:
@@ -491,14 +393,7 @@ def publish_model(job: Job[Settings], _record: Record) -> None:
     if not job.settings.imaging.publish_model:
         return
     source = job.folder / MODEL
-    if not source.is_file():
-        raise InputError(f"{source}: no such file; force=true trains again")
-    # What cannot be read is not handed on.
-    if load_model(source).accuracy is None:
-        print(
-            f"note: the errors of {source} were never measured (imaging.evaluate=false)",
-            file=sys.stderr,
-        )
+    load_model(source)  # what is missing or cannot be read is not handed on
     write_atomically(MODEL_FILE, source.read_bytes())
     print(f"Detectors in {MODEL_FILE}")
 
@@ -508,11 +403,9 @@ STUDY = Study(
     run=run_imaging,
     figure=figure,
     captions={
-        "": "Distance of detected leaflets from the true ones, errors of each stage, and size and "
-        "correlation of the errors that are stated. Simulated.",
-        "confidence": "Confidence in volumes with and without a valve. Simulated.",
+        "": "Confidence, and distance of detected leaflets from the true ones, in volumes with and "
+        "without a valve. Simulated."
     },
-    keep_arrays=lambda record, path: read_npz(path),
     finish=publish_model,
     require=require_imaging,
 )

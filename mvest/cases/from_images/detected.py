@@ -26,7 +26,7 @@ from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.volumes import read_volume
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
     DetectionModel,
@@ -171,7 +171,7 @@ def detect_in_volume(
     valve = detect_valve(
         volume,
         model,
-        TrackingSettings(min_confidence=settings.min_confidence),
+        min_confidence=settings.min_confidence,
         landmarks=by_hand,
         progress=progress,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +19,7 @@ from mvest.imaging.detection.pose_search import (
 from mvest.imaging.detection.shape_model import Pulls, fit_shape, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import ValveSequence, landmark_vertices
-from mvest.quantities import Count, Length, Weight
+from mvest.imaging.valve_sequence import LANDMARKS, ValveSequence, landmark_vertices
 from mvest.typing import FloatArray, IntArray
 
 LANDMARK_STD_MM = 1.2
@@ -33,30 +31,16 @@ HAND_STD_MM = (0.2, 0.03)
 """mm, of landmarks placed by hand: while the shape is fitted, and for the free displacement, which
 is to end there."""
 
+ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
+"""Modes of the shape model in each round of the fit, as far as the model has them, and how far
+along normals (mm) the leaflets are looked for."""
 
-@dataclass(frozen=True, slots=True)
-class FitSettings:
-    """How leaflets are fitted.
+ALIKE = 8.0
+"""Neighbouring vertices see much the same: what is seen counts as if there were this many times
+fewer of them."""
 
-    Attributes
-    ----------
-    modes : tuple of int
-        Modes of the shape model in each round.
-    reach_mm : tuple of float
-        How far along normals the leaflets are looked for in each round.
-    alike : float
-        Neighbouring vertices see much the same: what is seen counts as if there were this many
-        times fewer of them.
-    stiffness, hold : float
-        Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`.
-    """
-
-    modes: tuple[Count, ...] = (14, 25, 40)
-    reach_mm: tuple[Length, ...] = (6.0, 4.0, 3.0)
-    alike: Weight = 8.0
-    stiffness: Weight = 4.0
-    hold: Weight = 0.3
-
+STIFFNESS, HOLD = 4.0, 0.3
+"""Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`."""
 
 CANDIDATES = 40
 """Poses that a search returns, many of them alike."""
@@ -97,8 +81,8 @@ class FrameValve:
 
     Attributes
     ----------
-    start, pose : Poses
-        One each: what the fit began with, and what it ended with.
+    pose : Poses
+        One.
     coefficients : (K,)
         Of the shape model.
     vertices : (n, 3)
@@ -106,23 +90,17 @@ class FrameValve:
     confidence : float
         0 (no valve) to 1.
     vertex_confidence : (n,)
-    landmarks : (L, 3)
-        As they were found before shapes were fitted.
     """
 
-    start: Poses
     pose: Poses
     coefficients: FloatArray
     vertices: FloatArray
     tips: FloatArray
     confidence: float
     vertex_confidence: FloatArray
-    landmarks: FloatArray
 
 
-def find_frame(
-    frame: StandardFrame, model: DetectionModel, settings: FitSettings | None = None
-) -> FrameValve:
+def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
     """Search one frame and fit the valve in it.
 
     Raises
@@ -135,34 +113,30 @@ def find_frame(
         raise NoValveError("no place to look for a valve at: no field of view")
     if rating[0] < SURE:
         poses = poses[poses.apart(rating, TRIED)]
-        best = int(np.argmax(merits(frame, model, poses, settings or FitSettings())))
+        best = int(np.argmax(merits(frame, model, poses)))
         poses = poses[best : best + 1]
-    return fit_frame(frame, model, poses[:1], settings)
+    return fit_frame(frame, model, poses[:1])
 
 
-def merits(
-    frame: StandardFrame, model: DetectionModel, poses: Poses, settings: FitSettings
-) -> FloatArray:
+def merits(frame: StandardFrame, model: DetectionModel, poses: Poses) -> FloatArray:
     """Confidence ``(P,)`` in valves at some poses, fitted roughly to every second row and column.
 
     Where images are unlike those of training, a wrong pose may be rated best; its leaflets then are
     not where the boundary is seen, or are of a shape that valves do not have.
     """
-    return np.array([_merit(frame, model, poses[k : k + 1], settings) for k in range(len(poses))])
+    return np.array([_merit(frame, model, poses[k : k + 1]) for k in range(len(poses))])
 
 
-def _merit(
-    frame: StandardFrame, model: DetectionModel, pose: Poses, settings: FitSettings
-) -> float:
+def _merit(frame: StandardFrame, model: DetectionModel, pose: Poses) -> float:
     shape, layout = model.shape, model.shape.layout
     some = np.arange(layout.size).reshape(layout.rows, -1)[::2, ::2]
     coarse = ValveLayout(some.shape[1], some.shape[0])
     start, _ = starting_shape(frame, model.boosters, pose, shape)
-    b = np.zeros(settings.modes[0])
+    b = np.zeros(min(ROUNDS[0][0], len(shape.std)))
     b[:MODES] = start[0]
     seen = np.zeros(0)
-    wide = np.sqrt(max(1.0, settings.alike * coarse.size / layout.size))
-    for reach in (settings.reach_mm[0], settings.reach_mm[-1]):
+    wide = np.sqrt(max(1.0, ALIKE * coarse.size / layout.size))
+    for _, reach in (ROUNDS[0], ROUNDS[-1]):
         vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
         normals, offset, std, seen = find_boundary(frame, model.boosters, vertices, coarse, reach)
         pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
@@ -186,11 +160,10 @@ def fit_frame(
     frame: StandardFrame,
     model: DetectionModel,
     pose: Poses,
-    settings: FitSettings | None = None,
     *,
     coefficients: FloatArray | None = None,
     tips: FloatArray | None = None,
-    fixed: Mapping[int, FloatArray] | None = None,
+    fixed: FloatArray | None = None,
 ) -> FrameValve:
     """Fit the valve from a pose (one).
 
@@ -200,53 +173,38 @@ def fit_frame(
         Where to start from; otherwise read off at the pose.
     tips : (2, 3) mm, optional
         Where papillary tips are looked for.
-    fixed : mapping, optional
-        Landmarks placed by hand: number -> world position. They stay.
-
-    Raises
-    ------
-    InputError
-        If more modes are to be fitted than the model has.
+    fixed : (L, 3) mm, optional
+        World positions of landmarks placed by hand, which stay; NaN where none was.
     """
-    chosen, begin = settings or FitSettings(), pose
     shape, layout = model.shape, model.shape.layout
-    if max(chosen.modes) > len(shape.std):
-        raise InputError(
-            f"fit of {max(chosen.modes)} modes, expected at most the model's {len(shape.std)}"
-        )
     start, found_tips = starting_shape(frame, model.boosters, pose, shape)
-    b = np.zeros(chosen.modes[0])
+    b = np.zeros(min(ROUNDS[0][0], len(shape.std)))
     b[:MODES] = start[0] if coefficients is None else coefficients[:MODES]
     tips = found_tips[0] if tips is None else tips
     vertices = pose.world(shape.shape(b[None]))[0]
-    # Landmarks; those placed by hand are believed.
     at = np.array(list(landmark_vertices(layout).values()))
-    guesses = np.concatenate([vertices[at], tips])
-    fixed = fixed or {}
-    free = np.array([k for k in range(len(guesses)) if k not in fixed], dtype=np.int64)
-    points, spread = np.array(guesses), np.full(len(guesses), 0.0)
-    points[free], spread[free] = find_landmarks(frame, model.boosters, pose, guesses[free], free)
-    for k, point in fixed.items():
-        points[k] = point
-    tips = points[len(at) :]
-    std = np.hypot(
-        np.where(np.isin(np.arange(len(at)), free), LANDMARK_STD_MM, HAND_STD_MM[0]),
-        spread[: len(at)],
-    )
-    pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], points[: len(at)], std))
-    manual = np.array([k for k in fixed if k < len(at)], dtype=np.int64)
-    by_hand = at[manual], points[manual], np.full(len(manual), HAND_STD_MM[0])
-    for modes, reach in zip(chosen.modes, chosen.reach_mm, strict=True):
-        b = np.concatenate([b, np.zeros(modes - len(b))]) if modes > len(b) else b[:modes]
-        _, pulls, confidence = _seen(frame, model, pose, b, reach, chosen.alike, by_hand)
+    points, spread = np.concatenate([vertices[at], tips]), np.zeros(len(LANDMARKS))
+    by_hand = np.zeros(len(points), dtype=np.bool_)
+    if fixed is not None:
+        by_hand = np.isfinite(fixed[:, 0])
+        points[by_hand] = fixed[by_hand]
+    free = np.flatnonzero(~by_hand)
+    points[free], spread[free] = find_landmarks(frame, model.boosters, pose, points[free], free)
+    on_leaflets, tips = points[: len(at)], points[len(at) :]
+    manual = np.flatnonzero(by_hand[: len(at)])
+    std = np.full(len(at), LANDMARK_STD_MM)
+    std[manual] = HAND_STD_MM[0]
+    std = np.hypot(std, spread[: len(at)])
+    pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], on_leaflets, std))
+    hand = at[manual], on_leaflets[manual]
+    for modes, reach in ROUNDS:
+        b = np.concatenate([b, np.zeros(max(0, min(modes, len(shape.std)) - len(b)))])
+        _, pulls, _ = _seen(frame, model, pose, b, reach, *hand, HAND_STD_MM[0])
         pose, b = fit_shape(shape, pose, b, pulls)
-    by_hand = at[manual], points[manual], np.full(len(manual), HAND_STD_MM[1])
-    vertices, pulls, confidence = _seen(
-        frame, model, pose, b, chosen.reach_mm[-1], chosen.alike, by_hand
-    )
-    vertices = relax(vertices, layout, pulls, chosen.stiffness, chosen.hold)
+    vertices, pulls, confidence = _seen(frame, model, pose, b, reach, *hand, HAND_STD_MM[1])
+    vertices = relax(vertices, layout, pulls, STIFFNESS, HOLD)
     sure = _confidence(frame, model, pose, b, confidence)
-    return FrameValve(begin, pose, b, vertices, tips, sure, confidence, points)
+    return FrameValve(pose, b, vertices, tips, sure, confidence)
 
 
 def _seen(
@@ -255,25 +213,25 @@ def _seen(
     pose: Poses,
     b: FloatArray,
     reach: float,
-    alike: float,
-    by_hand: tuple[IntArray, FloatArray, FloatArray],
+    hand: IntArray,
+    points: FloatArray,
+    hand_std: float,
 ) -> tuple[FloatArray, Pulls, FloatArray]:
     """A shape ``(n, 3)`` mm, what pulls on it, and each vertex' confidence ``(n,)``.
 
-    Leaflets and rims pull, and vertices placed by hand: their numbers, where they were placed, and
-    the standard deviations of that.
+    Leaflets and rims pull, and vertices placed by hand: their numbers ``hand``, where they were
+    placed (``points``), and the standard deviation of that.
     """
     layout, boosters = model.shape.layout, model.boosters
     vertices = pose.world(model.shape.shape(b[None]))[0]
     normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
-    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(alike) * std)]
+    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(ALIKE) * std)]
     for rim, at in (("annulus", layout.annulus), ("free_edge", layout.free_edge)):
         axes, off, spread = find_rim(
             frame, boosters, rim, vertices, layout, float(pose.log_scale[0])
         )
         # Columns are alike too, over about as many as rows are.
-        wide = np.sqrt(np.sqrt(alike)) * np.hypot(RIM_STD_MM, spread)
+        wide = np.sqrt(np.sqrt(ALIKE)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
-    at, points, wide = by_hand
-    parts.append(Pulls.to_points(at, vertices[at], points, wide))
+    parts.append(Pulls.to_points(hand, vertices[hand], points, np.full(len(hand), hand_std)))
     return vertices, Pulls.joined(parts), confidence

@@ -8,8 +8,7 @@ cubes and their differences are those of Haar.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -43,8 +42,7 @@ MIN_GREY_VALUES = 8
 """Different values below which a frame holds no image."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StandardFrame:
+class StandardFrame(NamedTuple):
     """Means over cubes of 1, 2, 4, ... voxels of the ranks of one frame's grey values.
 
     A rank is the share of voxels within the field of view that are darker, so that gain, dynamic
@@ -185,8 +183,7 @@ def _halved(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return ((total + 4) // 8).astype(np.uint8)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SamplePattern:
+class SamplePattern(NamedTuple):
     """Where and at which scale ranks are sampled about a hypothesis.
 
     Attributes
@@ -247,18 +244,8 @@ def features(
         Columns are the axes of each hypothesis in world coordinates, scale included.
     """
     values = np.empty((len(points), len(pattern.offsets)), dtype=np.float32)
-    _sample(
-        frame.data,
-        frame.starts,
-        frame.shapes,
-        frame.to_index,
-        frame.origin,
-        np.ascontiguousarray(points, dtype=np.float64),
-        np.ascontiguousarray(axes, dtype=np.float64),
-        np.ascontiguousarray(pattern.offsets, dtype=np.float64),
-        pattern.levels,
-        values,
-    )
+    points, axes = (np.ascontiguousarray(x, dtype=np.float64) for x in (points, axes))
+    _sample(frame, pattern, points, axes, values)
     if not len(pattern.pairs):
         return values
     difference = values[:, pattern.pairs[:, 0]] - values[:, pattern.pairs[:, 1]]
@@ -267,18 +254,15 @@ def features(
 
 @nb.njit(cache=True)
 def _sample(
-    data: NDArray[np.uint8],
-    starts: IntArray,
-    shapes: IntArray,
-    to_index: FloatArray,
-    origin: FloatArray,
+    frame: StandardFrame,
+    pattern: SamplePattern,
     points: FloatArray,
     axes: FloatArray,
-    offsets: FloatArray,
-    levels: IntArray,
     out: NDArray[np.float32],
 ) -> None:  # pragma: no cover (compiled)
     """Trilinear interpolation at every offset of every hypothesis; 0 outside the volume."""
+    data, starts, shapes, to_index, origin = frame
+    offsets, levels, _ = pattern
     for p in range(len(points)):
         base = to_index @ (points[p] - origin)
         turn = to_index @ axes[p]

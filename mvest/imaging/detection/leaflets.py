@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from mvest.imaging.detection.frame import SamplePattern, StandardFrame, features
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.shape_model import (
+    Examples,
+    LabelledFrame,
     Misses,
-    ShapeModel,
     TrueValve,
     missed_poses,
     missed_shapes,
@@ -93,17 +94,11 @@ def landmark_points(true: TrueValve, layout: ValveLayout) -> FloatArray:
     return np.concatenate([true.vertices[list(landmark_vertices(layout).values())], true.tips])
 
 
-def landmark_samples(
-    frame: StandardFrame,
-    true: TrueValve,
-    layout: ValveLayout,
-    which: int,
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float32], FloatArray]:
+def landmark_samples(seen: LabelledFrame, which: int, count: int) -> Examples:
     """Candidates about one landmark, and where it lies from them ``(P, 3)`` in their axes."""
+    frame, true, model, rng = seen
     poses = missed_poses(true.pose, LANDMARK_MISSES, count, rng)
-    point = landmark_points(true, layout)[which]
+    point = landmark_points(true, model.layout)[which]
     candidates = point + rng.standard_normal((count, 3)) * LANDMARK_START_MM
     gap = np.einsum("pij,pi->pj", poses.rotation, point - candidates)
     return features(frame, LANDMARK_PATTERN, candidates, poses.axes), gap
@@ -165,20 +160,14 @@ def rim_axes(vertices: FloatArray, layout: ValveLayout, row: int) -> FloatArray:
     return np.stack([along, away, np.cross(along, away)], axis=2)
 
 
-def rim_samples(
-    frame: StandardFrame,
-    true: TrueValve,
-    model: ShapeModel,
-    which: str,
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float32], FloatArray]:
+def rim_samples(seen: LabelledFrame, which: str, count: int) -> Examples:
     """Candidates about one of `RIMS`, and where it lies from them ``(P, 2)`` mm."""
+    frame, true, model, rng = seen
     layout = model.layout
     row = RIMS[which] % layout.rows
     target = true.vertices.reshape(layout.rows, layout.columns, 3)[row]
     xs, ys = [], []
-    for guess in missed_shapes(true, model, RIM_MISSES, GUESSES, rng):
+    for guess in missed_shapes(seen, RIM_MISSES, GUESSES):
         columns = rng.integers(layout.columns, size=count // GUESSES)
         axes = rim_axes(guess, layout, row)[columns]
         about = guess.reshape(layout.rows, layout.columns, 3)[row][columns]
@@ -293,13 +282,12 @@ def _gap(
     return np.asarray(((there - points) * facing).sum(axis=1) / slope)
 
 
-def boundary_samples(
-    frame: StandardFrame, true: TrueValve, model: ShapeModel, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], FloatArray]:
+def boundary_samples(seen: LabelledFrame, count: int) -> Examples:
     """Places along normals of missed shapes, with the label of each ``(P, 1)``."""
+    frame, true, model, rng = seen
     layout = model.layout
     xs, ys = [], []
-    for guess in missed_shapes(true, model, BOUNDARY_MISSES, GUESSES, rng):
+    for guess in missed_shapes(seen, BOUNDARY_MISSES, GUESSES):
         which = rng.integers(layout.size, size=count // GUESSES)
         axes = leaflet_axes(guess, layout)[which]
         off = rng.uniform(-6.0, 6.0, len(which))

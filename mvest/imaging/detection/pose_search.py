@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from mvest.imaging.detection.frame import SamplePattern, StandardFrame, directions, features
 from mvest.imaging.detection.pose import Poses, rotation_grid
-from mvest.imaging.detection.shape_model import Misses, ShapeModel, TrueValve, missed_poses
+from mvest.imaging.detection.shape_model import (
+    Examples,
+    LabelledFrame,
+    Misses,
+    ShapeModel,
+    TrueValve,
+    missed_poses,
+)
 from mvest.imaging.learning.boosting import Trees
 from mvest.typing import FloatArray
 
@@ -61,10 +68,9 @@ def _shell_features(frame: StandardFrame, points: FloatArray) -> NDArray[np.floa
     return np.concatenate(parts, axis=1)
 
 
-def position_samples(
-    frame: StandardFrame, true: TrueValve, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], FloatArray]:
+def position_samples(seen: LabelledFrame, count: int) -> Examples:
     """Places near a valve and anywhere, with their ratings ``(P, 1)``."""
+    frame, true, _, rng = seen
     centre = true.pose.centre[0]
     anywhere = _places(frame)
     near = centre + rng.standard_normal((count // 2, 3)) * rng.choice([3.0, 8.0], (count // 2, 1))
@@ -150,10 +156,9 @@ def pose_error(poses: Poses, true: TrueValve, model: ShapeModel) -> FloatArray:
     return np.asarray(np.linalg.norm(gap, axis=2).mean(axis=1))
 
 
-def coarse_samples(
-    frame: StandardFrame, true: TrueValve, model: ShapeModel, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], FloatArray]:
+def coarse_samples(seen: LabelledFrame, count: int) -> Examples:
     """Hypotheses such as a grid of orientations at likely places gives, with ratings ``(P, 1)``."""
+    frame, true, model, rng = seen
     grid = rotation_grid(ORIENTATIONS)
     kinds = (Misses(3.0, 10.0, 0.1), Misses(5.0, 22.0, 0.1))
     parts = [missed_poses(true.pose, misses, count // 4, rng) for misses in kinds]
@@ -165,14 +170,7 @@ def coarse_samples(
     return features(frame, COARSE, poses.centre, poses.axes), rating
 
 
-def fine_samples(
-    frame: StandardFrame,
-    true: TrueValve,
-    model: ShapeModel,
-    count: int,
-    rng: np.random.Generator,
-    mistaken: Poses | None = None,
-) -> tuple[NDArray[np.float32], FloatArray]:
+def fine_samples(seen: LabelledFrame, count: int, mistaken: Poses | None = None) -> Examples:
     """Hypotheses such as remain after refinement, with ratings ``(P, 1)``.
 
     Half of those made up are about right; the others are turned about the valve's axis (front for
@@ -183,6 +181,7 @@ def fine_samples(
     mistaken : Poses, optional
         What a search without this rating took for the valve: also learned from.
     """
+    frame, true, model, rng = seen
     kinds = (Misses(1.0, 3.0, 0.03), Misses(2.5, 8.0, 0.06), Misses(6.0, 25.0, 0.12))
     parts = [missed_poses(true.pose, misses, count // 6, rng) for misses in kinds]
     turned = missed_poses(true.pose, Misses(3.0, 10.0, 0.08), count // 3, rng)
@@ -209,10 +208,9 @@ def _strayed(poses: Poses, rng: np.random.Generator, share: float = 0.1) -> Pose
     return Poses(centre, poses.rotation, poses.log_scale)
 
 
-def refinement_samples(
-    frame: StandardFrame, true: TrueValve, step: int, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], FloatArray]:
+def refinement_samples(seen: LabelledFrame, step: int, count: int) -> Examples:
     """Poses missed as ``REFINEMENTS[step]`` says, and what takes each back ``(P, 7)``."""
+    frame, true, _, rng = seen
     poses = missed_poses(true.pose, REFINEMENTS[step], count, rng)
     right = true.pose.repeated(count)
     return features(frame, FINE, poses.centre, poses.axes), poses.towards(right)
@@ -275,10 +273,9 @@ def _start_pattern() -> SamplePattern:
 START = _start_pattern()
 
 
-def shape_start_samples(
-    frame: StandardFrame, true: TrueValve, model: ShapeModel, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], FloatArray]:
+def shape_start_samples(seen: LabelledFrame, count: int) -> Examples:
     """Missed poses, with the coefficients and tips ``(P, MODES + 6)`` seen from them."""
+    frame, true, model, rng = seen
     poses = missed_poses(true.pose, START_MISSES, count, rng)
     local = poses.local(np.broadcast_to(true.vertices, (count, *true.vertices.shape)))
     tips = poses.local(np.broadcast_to(true.tips, (count, 2, 3)))

@@ -15,12 +15,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from mvest.errors import InputError
+from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.pose import Poses, pose_of
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
@@ -255,6 +258,29 @@ class TrueValve:
         return cls(vertices, tips, model.pose_of(vertices, tips))
 
 
+class LabelledFrame(NamedTuple):
+    """A frame to learn from.
+
+    Attributes
+    ----------
+    frame : StandardFrame
+    true : TrueValve
+        The valve in it.
+    model : ShapeModel
+    rng : numpy Generator
+        Draws the samples.
+    """
+
+    frame: StandardFrame
+    true: TrueValve
+    model: ShapeModel
+    rng: np.random.Generator
+
+
+Examples: TypeAlias = tuple[NDArray[np.float32], FloatArray]
+"""Features ``(P, F)`` and what they mean ``(P, outputs)``."""
+
+
 @dataclass(frozen=True, slots=True)
 class Misses:
     """By how much guesses miss a pose or a shape: standard deviations.
@@ -279,10 +305,9 @@ def missed_poses(true: Poses, misses: Misses, count: int, rng: np.random.Generat
     return true.repeated(count).moved(rng.standard_normal((count, 7)) * std)
 
 
-def missed_shapes(
-    true: TrueValve, model: ShapeModel, misses: Misses, count: int, rng: np.random.Generator
-) -> FloatArray:
+def missed_shapes(seen: LabelledFrame, misses: Misses, count: int) -> FloatArray:
     """``(count, n, 3)`` mm: guesses of one valve in world coordinates."""
+    _, true, model, rng = seen
     poses = missed_poses(true.pose, misses, count, rng)
     exact = model.coefficients(true.pose.local(true.vertices[None]))
     by = rng.standard_normal((count, len(model.std))) * (misses.shape * model.std)

@@ -9,7 +9,6 @@ the closure itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,9 +17,10 @@ from mvest.errors import InputError
 from mvest.imaging.detection.detect import (
     CANDIDATES,
     HAND_STD_MM,
+    HOLD,
+    STIFFNESS,
     SURE,
     TRIED,
-    FitSettings,
     FrameValve,
     NoValveError,
     fit_frame,
@@ -33,7 +33,6 @@ from mvest.imaging.detection.shape_model import Pulls, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.valve_sequence import LANDMARKS, MIN_CONFIDENCE, ValveSequence, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
-from mvest.quantities import BeatTime, Count, Length, Share, Speed
 from mvest.typing import BoolArray, FloatArray
 
 
@@ -73,53 +72,32 @@ def smooth_in_time(
 Landmarks = Mapping[int, Mapping[str, FloatArray]]
 """Placed by hand: frame -> name -> world position (3,) mm."""
 
-
 POSE_LANDMARKS = 4
 """Landmarks by hand that give the pose of a frame."""
 
 LINE_MM = 2.0
 """mm, root sum of squares across the best line: below it a pose does not follow from points."""
 
+HYPOTHESES, SHARED = 3, 3
+"""Poses of each frame's own search, and best ones of all frames, which are tried in every frame."""
 
-@dataclass(frozen=True, slots=True)
-class TrackingSettings:
-    """How frames are joined.
+SPEED_MM_S, STILL_MM = 60.0, 2.0
+"""Standard deviations of the speed at which a hypothesis moves (its annulus), and of its change
+between frames however short their interval: errors."""
 
-    Attributes
-    ----------
-    hypotheses : int
-        Of each frame's own search.
-    shared : int
-        Best ones of all frames that are tried in every frame.
-    speed_mm_s : float
-        Standard deviation of the speed at which a hypothesis moves (its annulus, in mm).
-    still_mm : float
-        Standard deviation of its change between frames however short their interval: errors.
-    smoothing_s : (float, float, float)
-        Times over which annulus, free edge and papillary tips are smoothed; 0: not at all.
-    min_confidence : float
-        Of the best frame: below it there is no valve.
-    lost_by : float
-        Confidence by which a frame is behind the best one from which on it is sought again from the
-        frames beside it.
-    fit : FitSettings
-    """
+SMOOTHING_S = (0.06, 0.015, 0.06)
+"""s over which annulus, free edge and papillary tips are smoothed; 0: not at all."""
 
-    hypotheses: Count = 3
-    shared: Count = 3
-    speed_mm_s: Speed = 60.0
-    still_mm: Length = 2.0
-    smoothing_s: tuple[BeatTime, BeatTime, BeatTime] = (0.06, 0.015, 0.06)
-    min_confidence: Share = MIN_CONFIDENCE
-    lost_by: Share = 0.2
-    fit: FitSettings = field(default_factory=FitSettings)
+LOST_BY = 0.2
+"""A frame is searched again, from its neighbours, if its confidence is this much below the best
+frame's."""
 
 
 def detect_valve(
     volume: VolumeSequence,
     model: DetectionModel,
-    settings: TrackingSettings | None = None,
     *,
+    min_confidence: float = MIN_CONFIDENCE,
     landmarks: Landmarks | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ValveSequence:
@@ -129,7 +107,8 @@ def detect_valve(
     ----------
     volume : VolumeSequence
     model : DetectionModel
-    settings : TrackingSettings, optional
+    min_confidence : float
+        Of the best frame: below it there is no valve.
     landmarks : mapping, optional
         Placed by hand where the automatic ones failed; they stay where they are.
     progress : callable, optional
@@ -142,19 +121,18 @@ def detect_valve(
     InputError
         If a frame holds no image, or landmarks name no frame or point that there is.
     """
-    chosen = settings or TrackingSettings()
-    by_hand = _checked(landmarks or {}, len(volume.times), model)
+    by_hand = _checked(landmarks or {}, len(volume.times))
     frames = [standard_frame(volume, k) for k in range(len(volume.times))]
-    poses = _trajectory(frames, np.asarray(volume.times), model, chosen, by_hand)
+    poses = _trajectory(frames, np.asarray(volume.times), model, by_hand)
     valves: list[FrameValve] = []
     for k, frame in enumerate(frames):
-        valves.append(fit_frame(frame, model, poses[k : k + 1], chosen.fit, fixed=by_hand.get(k)))
+        valves.append(fit_frame(frame, model, poses[k : k + 1], fixed=by_hand[k]))
         if progress is not None:
             progress(k + 1, len(frames))
-    valves = _found_again(frames, valves, model, chosen, by_hand)
+    valves = _found_again(frames, valves, model, by_hand)
     confidence = np.array([valve.confidence for valve in valves])
     sure = np.stack([valve.vertex_confidence for valve in valves])
-    at_annulus, at_edge, at_tips = chosen.smoothing_s
+    at_annulus, at_edge, at_tips = SMOOTHING_S
     layout, s = model.shape.layout, model.shape.layout.s
     smooth = smooth_in_time(
         np.asarray(volume.times),
@@ -163,8 +141,8 @@ def detect_valve(
         np.append((1 - s) * at_annulus + s * at_edge, [at_tips] * 2),
     )
     vertices, tips = smooth[:, :-2], smooth[:, -2:]
-    for k, points in by_hand.items():
-        vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, chosen.fit)
+    for k in _with_hands(by_hand):
+        vertices[k], tips[k] = _held(vertices[k], tips[k], by_hand[k], model)
     accuracy = model.accuracy
     if accuracy is not None:
         accuracy = accuracy.at(float(np.median(confidence)))
@@ -178,11 +156,11 @@ def detect_valve(
         np.full(layout.size, np.nan) if accuracy is None else accuracy.std_mm,
         np.nan if accuracy is None else accuracy.correlation_length_mm,
     )
-    by_eye = any(len(points) >= POSE_LANDMARKS for points in by_hand.values())
-    if confidence.max() < chosen.min_confidence and not by_eye:
+    by_eye = np.isfinite(by_hand[:, :, 0]).sum(axis=1) >= POSE_LANDMARKS
+    if confidence.max() < min_confidence and not by_eye.any():
         raise NoValveError(
             f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
-            f"of {confidence.max():.2f}, expected at least {chosen.min_confidence:g} (a mitral "
+            f"of {confidence.max():.2f}, expected at least {min_confidence:g} (a mitral "
             "valve whole within the field of view, or landmarks placed by hand)",
             valve,
         )
@@ -193,18 +171,17 @@ def _found_again(
     frames: list[StandardFrame],
     valves: list[FrameValve],
     model: DetectionModel,
-    chosen: TrackingSettings,
-    by_hand: Mapping[int, Mapping[int, FloatArray]],
+    by_hand: FloatArray,
 ) -> list[FrameValve]:
     """The valves, those of lost frames sought again from the frames beside them, surest first.
 
-    A frame is lost where another one is surer by ``lost_by``. What is found again is kept if it is
+    A frame is lost where another one is surer by `LOST_BY`. What is found again is kept if it is
     surer than what was there.
     """
     again = list(valves)
     best = max(valve.confidence for valve in valves)
-    lost = {k for k, v in enumerate(valves) if v.confidence < best - chosen.lost_by}
-    lost -= set(by_hand)
+    lost = {k for k, v in enumerate(valves) if v.confidence < best - LOST_BY}
+    lost -= set(_with_hands(by_hand))
     while lost:
         beside = {k: max(_beside(k, again, lost), default=None) for k in lost}
         surest = {k: pair for k, pair in beside.items() if pair is not None}
@@ -214,7 +191,7 @@ def _found_again(
         near = again[surest[k][1]]
         lost.remove(k)
         other = fit_frame(
-            frames[k], model, near.pose, chosen.fit, coefficients=near.coefficients, tips=near.tips
+            frames[k], model, near.pose, coefficients=near.coefficients, tips=near.tips
         )
         if other.confidence > again[k].confidence:
             again[k] = other
@@ -231,48 +208,41 @@ def _beside(k: int, valves: list[FrameValve], lost: set[int]) -> list[tuple[floa
 def _held(
     vertices: FloatArray,
     tips: FloatArray,
-    points: Mapping[int, FloatArray],
+    points: FloatArray,
     model: DetectionModel,
-    fit: FitSettings,
 ) -> tuple[FloatArray, FloatArray]:
     """One frame with its landmarks where they were placed; the leaflets about them come along."""
-    at = np.array(list(landmark_vertices(model.shape.layout).values()))
-    moved = np.array(tips)
-    for number, point in points.items():
-        if number >= len(at):
-            moved[number - len(at)] = point
-    on = [number for number in points if number < len(at)]
-    if on:
-        target = np.stack([points[number] for number in on])
+    placed = np.isfinite(points[:, 0])
+    tips = np.where(placed[-2:, None], points[-2:], tips)
+    on = np.flatnonzero(placed[:-2])
+    if len(on):
+        at = np.array(list(landmark_vertices(model.shape.layout).values()))[on]
         std = np.full(len(on), HAND_STD_MM[1])
-        pulls = Pulls.to_points(at[on], vertices[at[on]], target, std)
-        vertices = relax(vertices, model.shape.layout, pulls, fit.stiffness, fit.hold)
-    return vertices, moved
+        pulls = Pulls.to_points(at, vertices[at], points[on], std)
+        vertices = relax(vertices, model.shape.layout, pulls, STIFFNESS, HOLD)
+    return vertices, tips
 
 
-def _checked(
-    landmarks: Landmarks, frames: int, model: DetectionModel
-) -> dict[int, dict[int, FloatArray]]:
-    known = {name: k for k, name in enumerate(LANDMARKS)}
-    placed: dict[int, dict[int, FloatArray]] = {}
+def _checked(landmarks: Landmarks, frames: int) -> FloatArray:
+    """Positions ``(frames, L, 3)`` of landmarks placed by hand, NaN where none was."""
+    placed = np.full((frames, len(LANDMARKS), 3), np.nan)
     for frame, points in landmarks.items():
         if not 0 <= frame < frames:
             raise InputError(f"landmarks of frame {frame}; the volume has frames 0 to {frames - 1}")
-        strange = [name for name in points if name not in known]
-        if strange:
+        if strange := [name for name in points if name not in LANDMARKS]:
             raise InputError(
                 f"landmarks of frame {frame}: {', '.join(strange)}; expected some of "
-                f"{', '.join(known)}"
+                f"{', '.join(LANDMARKS)}"
             )
-        placed[frame] = {known[name]: np.asarray(point, float) for name, point in points.items()}
         for name, point in points.items():
             if np.shape(point) != (3,) or not np.isfinite(point).all():
                 raise InputError(
                     f"landmarks of frame {frame}, {name}: {np.asarray(point).tolist()}, expected "
                     "three finite coordinates"
                 )
+            placed[frame, LANDMARKS.index(name)] = point
         if len(points) >= POSE_LANDMARKS:
-            about = np.stack(list(placed[frame].values()))
+            about = np.stack(list(points.values()))
             size = np.linalg.svd(about - about.mean(axis=0), compute_uv=False)
             if size[1] < LINE_MM:
                 raise InputError(
@@ -282,20 +252,24 @@ def _checked(
     return placed
 
 
+def _with_hands(placed: FloatArray) -> list[int]:
+    """Frames in which landmarks were placed."""
+    return [k for k, points in enumerate(placed) if np.isfinite(points).any()]
+
+
 def _trajectory(
     frames: list[StandardFrame],
     times: FloatArray,
     model: DetectionModel,
-    chosen: TrackingSettings,
-    by_hand: Mapping[int, Mapping[int, FloatArray]],
+    by_hand: FloatArray,
 ) -> Poses:
     """One pose for every frame."""
     own: list[tuple[Poses, FloatArray]] = []
     for k, frame in enumerate(frames):
-        placed = _pose_by_hand(by_hand.get(k, {}), model)
+        placed = _pose_by_hand(by_hand[k], model)
         if placed is None:
             poses, rating = search_poses(frame, model.boosters, CANDIDATES)
-            few = poses.apart(rating, chosen.hypotheses)
+            few = poses.apart(rating, HYPOTHESES)
             own.append((poses[few], rating[few]))
         else:
             own.append((placed, np.ones(1)))
@@ -303,31 +277,32 @@ def _trajectory(
     pool = Poses.joined([poses for poses, _ in own])
     if not len(pool):
         raise NoValveError("no valve found; there is no place in any frame to look for one at")
-    best = pool[pool.apart(ratings, chosen.shared)]
-    if not by_hand and np.median([rating[0] for _, rating in own if len(rating)]) < SURE:
+    best = pool[pool.apart(ratings, SHARED)]
+    if (
+        np.isnan(by_hand).all()
+        and np.median([rating[0] for _, rating in own if len(rating)]) < SURE
+    ):
         tried = pool[pool.apart(ratings, TRIED)]
-        likeliest = _likeliest_in_all(frames, model, tried, chosen.fit)
+        likeliest = _likeliest_in_all(frames, model, tried)
         best = tried[likeliest : likeliest + 1]
         own = [(poses[_like(poses, best)], rating[_like(poses, best)]) for poses, rating in own]
     candidates = []
     for k, frame in enumerate(frames):
-        if _pose_by_hand(by_hand.get(k, {}), model) is not None:
+        if _pose_by_hand(by_hand[k], model) is not None:
             candidates.append(own[k])
             continue
         again, rated = refined(frame, model.boosters, best)
         candidates.append((Poses.joined([own[k][0], again]), np.concatenate([own[k][1], rated])))
-    path = _best_path(candidates, times, model, chosen)
+    path = _best_path(candidates, times, model)
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
 
 
-def _likeliest_in_all(
-    frames: list[StandardFrame], model: DetectionModel, tried: Poses, fit: FitSettings
-) -> int:
+def _likeliest_in_all(frames: list[StandardFrame], model: DetectionModel, tried: Poses) -> int:
     """At which of some poses the valve is seen best in a few frames."""
     seen = np.zeros(len(tried))
     for k in sorted({0, len(frames) // 2, len(frames) - 1}):
         poses, _ = refined(frames[k], model.boosters, tried)
-        seen += merits(frames[k], model, poses, fit)
+        seen += merits(frames[k], model, poses)
     return int(np.argmax(seen))
 
 
@@ -341,7 +316,6 @@ def _best_path(
     candidates: list[tuple[Poses, FloatArray]],
     times: FloatArray,
     model: DetectionModel,
-    chosen: TrackingSettings,
 ) -> list[int]:
     """The hypothesis of each frame on the likeliest trajectory (Viterbi)."""
     points = np.concatenate([model.shape.mean[model.shape.layout.annulus[::4]], model.shape.tips])
@@ -351,7 +325,7 @@ def _best_path(
     for k in range(1, len(candidates)):
         gap = where[k][:, None] - where[k - 1][None]
         moved = np.linalg.norm(gap, axis=3).mean(axis=2)
-        std = np.hypot(chosen.still_mm, chosen.speed_mm_s * (times[k] - times[k - 1]))
+        std = np.hypot(STILL_MM, SPEED_MM_S * (times[k] - times[k - 1]))
         # Bounded, so that one frame gone wrong does not drag the others along.
         step = np.minimum(0.5 * (moved / std) ** 2, 8.0) + total[None]
         back.append(np.argmin(step, axis=1))
@@ -362,14 +336,14 @@ def _best_path(
     return path[::-1]
 
 
-def _pose_by_hand(points: Mapping[int, FloatArray], model: DetectionModel) -> Poses | None:
-    """The pose that lays the mean valve on landmarks, if there are four or more."""
-    if len(points) < POSE_LANDMARKS:
+def _pose_by_hand(points: FloatArray, model: DetectionModel) -> Poses | None:
+    """The pose that lays the mean valve on landmarks ``(L, 3)``, if there are four or more."""
+    placed = np.isfinite(points[:, 0])
+    if placed.sum() < POSE_LANDMARKS:
         return None
-    shape = model.shape
+    shape, to = model.shape, points[placed]
     at = list(landmark_vertices(shape.layout).values())
-    from_ = np.concatenate([shape.mean[at], shape.tips])[list(points)]
-    to = np.stack(list(points.values()))
+    from_ = np.concatenate([shape.mean[at], shape.tips])[placed]
     a, b = from_ - from_.mean(axis=0), to - to.mean(axis=0)
     turn, _ = Rotation.align_vectors(b, a)
     rotation = turn.as_matrix()

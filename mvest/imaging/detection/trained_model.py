@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,9 +43,6 @@ OUTPUTS: Final = {
 
 STAGES: Final = tuple(OUTPUTS)
 """Names of all sets of trees."""
-
-UNFIT = (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError)
-"""What arrays that are no model raise when one is made of them."""
 
 MAX_FILE_SIZE = 2**28
 """Bytes; the model that comes with the package has a few millions."""
@@ -109,7 +106,25 @@ class DetectionAccuracy:
         return float(start * np.exp(slope * (1.0 - confidence)))
 
 
-ACCURACY: Final = tuple(field.name for field in fields(DetectionAccuracy))
+ARRAYS: Final[Mapping[str, tuple[int | str, ...]]] = {
+    "shape.size_mm": (),
+    "shape.mean": ("n", 3),
+    "shape.modes": ("K", "n", 3),
+    "shape.std": ("K",),
+    "shape.tips": (2, 3),
+    "accuracy.std_mm": ("n",),
+    "accuracy.correlation_length_mm": (),
+    "accuracy.samples": ("S", "F", "n", 3),
+    "accuracy.tip_samples": ("S", "F", 2, 3),
+    "accuracy.widening": (2,),
+    "accuracy.like_from": (),
+    "accuracy.shapes": ("S", "F", "n", 3),
+    "accuracy.tip_shapes": ("S", "F", 2, 3),
+}
+"""Attributes of shapes and accuracy in a file, and their lengths."""
+
+HALVED: Final = ("n", "S")
+"""Arrays with such a length and more axes are stored in single precision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,25 +165,18 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         "version": VERSION,
         "columns": shape.layout.columns,
         "rows": shape.layout.rows,
-        "region_names": list(shape.layout.region_names),
         "trained_on": model.trained_on,
-        "trees": {name: model.boosters[name].outputs for name in STAGES},
     }
-    arrays: dict[str, Any] = {
-        "about": _bytes(json.dumps(about, sort_keys=True)),
-        "shape.size_mm": np.array(shape.size_mm),
-        "shape.mean": shape.mean.astype(np.float32),
-        "shape.modes": shape.modes.astype(np.float32),
-        "shape.std": shape.std,
-        "shape.tips": shape.tips,
-    }
+    arrays: dict[str, Any] = {"about": _bytes(json.dumps(about, sort_keys=True))}
     for name in STAGES:
         for k, text in enumerate(model.boosters[name].texts):
             arrays[f"trees.{name}.{k}"] = _bytes(text)
-    for name in ACCURACY if model.accuracy is not None else ():
-        if (value := getattr(model.accuracy, name)) is not None:
-            kind = np.float32 if np.ndim(value) > 1 else np.float64
-            arrays[f"accuracy.{name}"] = np.asarray(value, dtype=kind)
+    for name, lengths in ARRAYS.items():
+        part, _, attribute = name.partition(".")
+        value = getattr(getattr(model, part), attribute, None)
+        if value is not None:
+            single = len(lengths) > 1 and set(lengths) & set(HALVED)
+            arrays[name] = np.asarray(value, dtype=np.float32 if single else np.float64)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
@@ -187,7 +195,7 @@ def load_model(path: Path | str) -> DetectionModel:
     stored = read_npz(io.BytesIO(raw), where=str(source))
     try:
         return _model(stored, source, hashlib.sha256(raw).hexdigest())
-    except UNFIT as fault:
+    except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError) as fault:
         if isinstance(fault, InputError) and str(fault).startswith(str(source)):
             raise
         lacks = "lacks " if isinstance(fault, KeyError) else ""
@@ -225,39 +233,25 @@ def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> Det
         if not isinstance(about[key], kind):
             raise ValueError(f"{key} is no {kind.__name__}")
     layout = ValveLayout(about["columns"], about["rows"])
-    n = layout.size
-
-    def numbers(name: str, *shape: int | None) -> FloatArray:
-        return check_array(stored[name], name, "f", shape)
-
-    std = numbers("shape.std", None)
-    shape = ShapeModel(
-        layout,
-        float(numbers("shape.size_mm")),
-        numbers("shape.mean", n, 3),
-        numbers("shape.modes", len(std), n, 3),
-        std,
-        numbers("shape.tips", 2, 3),
-    )
+    sizes = {"n": layout.size, "K": len(stored["shape.std"])}
+    parts: dict[str, dict[str, Any]] = {"shape": {}, "accuracy": {}}
+    if "accuracy.std_mm" in stored:
+        sizes |= dict(zip("SF", stored["accuracy.samples"].shape, strict=False))
+    for name, lengths in ARRAYS.items():
+        part, _, attribute = name.partition(".")
+        if name in stored or part == "shape":
+            wanted = [sizes[x] if isinstance(x, str) else x for x in lengths]
+            value = check_array(stored[name], name, "f", wanted)
+            parts[part][attribute] = value if len(lengths) else float(value)
     boosters = {}
     for name, outputs in OUTPUTS.items():
         texts = tuple(_text(stored[f"trees.{name}.{k}"]) for k in range(outputs))
         boosters[name] = Boosters(texts, f"{source}, {name}")
     accuracy = None
-    if "accuracy.std_mm" in stored:
-        count = np.shape(stored["accuracy.samples"])[:2]
-        start, slope = numbers("accuracy.widening", 2).tolist()
-        has_shapes = "accuracy.shapes" in stored
-        accuracy = DetectionAccuracy(
-            numbers("accuracy.std_mm", n),
-            float(numbers("accuracy.correlation_length_mm")),
-            numbers("accuracy.samples", *count, n, 3),
-            numbers("accuracy.tip_samples", *count, 2, 3),
-            (start, slope),
-            float(numbers("accuracy.like_from")),
-            numbers("accuracy.shapes", *count, n, 3) if has_shapes else None,
-            numbers("accuracy.tip_shapes", *count, 2, 3) if has_shapes else None,
-        )
+    if parts["accuracy"]:
+        start, slope = parts["accuracy"].pop("widening").tolist()
+        accuracy = DetectionAccuracy(**parts["accuracy"], widening=(start, slope))
+    shape = ShapeModel(layout, **parts["shape"])
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
 
 

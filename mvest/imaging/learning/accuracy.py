@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.imaging.detection.detect import FrameValve
-from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
-from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
-from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
 BIN_MM = 1.0
@@ -31,20 +25,6 @@ NORMAL_95 = 1.959963984540054
 """Standard deviations on either side that hold 95 % of a normal distribution."""
 
 
-class Correlogram(NamedTuple):
-    """Correlation of errors against distance.
-
-    Attributes
-    ----------
-    distance : (B,) mm
-        Mean distance of each bin's pairs.
-    correlation : (B,)
-    """
-
-    distance: FloatArray
-    correlation: FloatArray
-
-
 def matern(distance: FloatArray, length: float) -> FloatArray:
     """Matérn correlation of smoothness 3/2, which estimators take errors to have.
 
@@ -55,7 +35,7 @@ def matern(distance: FloatArray, length: float) -> FloatArray:
     return np.asarray((1.0 + d) * np.exp(-d))
 
 
-def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
+def correlogram(errors: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """How alike errors are at two vertices, by the vertices' straight distance.
 
     Parameters
@@ -67,8 +47,10 @@ def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
 
     Returns
     -------
-    Correlogram
-        Bins up to 30 mm; each value is a mean over pairs, errors over their standard deviations.
+    distance : (B,) mm
+        Mean distance of the pairs of each bin, up to 30 mm.
+    correlation : (B,)
+        Mean over these pairs, errors over their standard deviations.
     """
     size = np.sqrt((errors**2).mean(axis=0))
     if not (np.isfinite(size).all() and (size > 0).all()):
@@ -77,24 +59,19 @@ def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
     product = scaled.T @ scaled / len(scaled)
     first, second = np.triu_indices(len(points), 1)
     distance = cdist(points, points)[first, second]
-    number = (distance / BIN_MM).astype(np.int64)
     near = distance < FARTHEST_MM
-    pairs = np.bincount(number[near]).astype(np.float64)
-    some = pairs > 0
-
-    def mean(values: FloatArray) -> FloatArray:
-        total = np.bincount(number[near], weights=values[near])
-        return np.asarray(total[some] / pairs[some])
-
-    return Correlogram(mean(distance), mean(product[first, second]))
+    number = (distance[near] / BIN_MM).astype(np.int64)
+    pairs = np.bincount(number).astype(np.float64)
+    totals = (np.bincount(number, v[near]) for v in (distance, product[first, second]))
+    means, correlations = (total[pairs > 0] / pairs[pairs > 0] for total in totals)
+    return means, correlations
 
 
-def fitted_length(correlations: Correlogram) -> float:
+def fitted_length(distance: FloatArray, correlation: FloatArray) -> float:
     """The length (mm) of the Matérn correlation that is nearest to a correlogram, bin by bin."""
 
     def miss(log_length: float) -> float:
-        gap = matern(correlations.distance, np.exp(log_length)) - correlations.correlation
-        return float((gap**2).sum())
+        return float(((matern(distance, np.exp(log_length)) - correlation) ** 2).sum())
 
     low, high = np.log(LENGTHS_MM)
     best = minimize_scalar(miss, bounds=(low, high), method="bounded")
@@ -103,7 +80,7 @@ def fitted_length(correlations: Correlogram) -> float:
 
 def measure_accuracy(
     samples: FloatArray, tip_samples: FloatArray, rest: FloatArray
-) -> tuple[DetectionAccuracy, Correlogram]:
+) -> DetectionAccuracy:
     """What held-out sequences say of the detectors' errors.
 
     Parameters
@@ -120,8 +97,6 @@ def measure_accuracy(
         The standard deviation of a vertex is the root mean square over sequences, frames and
         coordinates of its errors about their mean over the sequences (in each frame and coordinate,
         so that S - 1 of S are free).
-    Correlogram
-        From which its length was fitted.
 
     Raises
     ------
@@ -131,8 +106,8 @@ def measure_accuracy(
     count, frames, n = samples.shape[:3]
     about = samples - samples.mean(axis=0)
     std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 1) * frames * 3))
-    correlations = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
-    return DetectionAccuracy(std, fitted_length(correlations), samples, tip_samples), correlations
+    length = fitted_length(*correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest))
+    return DetectionAccuracy(std, length, samples, tip_samples)
 
 
 def widened(
@@ -200,84 +175,3 @@ def share_within(errors: FloatArray, std_mm: FloatArray) -> float:
     std_mm : (n,)
     """
     return float((np.abs(errors) <= NORMAL_95 * std_mm[:, None]).mean())
-
-
-FINER = 4
-"""Times as many points as vertices in each direction stand for a surface."""
-
-
-def frame_errors(found: FrameValve, true: TrueValve, layout: ValveLayout) -> dict[str, float]:
-    """Errors of one frame.
-
-    Returns
-    -------
-    dict
-        In mm ``surface`` (mean symmetric distance of the leaflets' surfaces), ``points`` (mean
-        distance of corresponding vertices), ``tips``, ``landmarks`` and ``hinge`` (of the annulus
-        across its course); of the pose that the fit began with, ``position`` (mm) and ``pose``
-        (degrees).
-    """
-    by = found.start.towards(true.pose)[0]
-    return {
-        "surface": surface_distance(found.vertices, true.vertices, layout),
-        "points": _mean_distance(found.vertices, true.vertices),
-        "tips": _mean_distance(found.tips, true.tips),
-        "position": float(np.linalg.norm(by[:3])),
-        "pose": float(np.rad2deg(np.linalg.norm(by[3:6]))),
-        "landmarks": _mean_distance(found.landmarks, landmark_points(true, layout)),
-        "hinge": _across(found.vertices[layout.annulus], true.vertices[layout.annulus]),
-    }
-
-
-def _mean_distance(points: FloatArray, true: FloatArray) -> float:
-    return float(np.linalg.norm(points - true, axis=1).mean())
-
-
-def surface_distance(detected: FloatArray, true: FloatArray, layout: ValveLayout) -> float:
-    """Mean symmetric distance (mm) of two surfaces: of the vertices of each from the other.
-
-    A surface is stood for by its tangent planes at four times as many points in each direction.
-    """
-    there, back = _to_surface(detected, true, layout), _to_surface(true, detected, layout)
-    return float(0.5 * (there.mean() + back.mean()))
-
-
-def _to_surface(points: FloatArray, surface: FloatArray, layout: ValveLayout) -> FloatArray:
-    fine = ValveLayout(FINER * layout.columns, FINER * (layout.rows - 1) + 1)
-    grid = surface.reshape(layout.rows, layout.columns, 3)
-    u = np.arange(fine.columns) / FINER
-    left, share = u.astype(np.int64), (u % 1.0)[:, None]
-    around = grid[:, left] * (1 - share) + grid[:, (left + 1) % layout.columns] * share
-    v = np.arange(fine.rows) / FINER
-    upper = np.minimum(v.astype(np.int64), layout.rows - 2)
-    share = (v - upper)[:, None, None]
-    flat = (around[upper] * (1 - share) + around[upper + 1] * share).reshape(-1, 3)
-    gap, near = cKDTree(flat).query(points)
-    normal = leaflet_axes(flat, fine)[near, :, 2]
-    off = np.abs(((points - flat[near]) * normal).sum(axis=1))
-    # Beyond a rim the nearest point is on the rim itself.
-    row = near // fine.columns
-    inside = (row > 0) & (row < fine.rows - 1)
-    return np.where(inside, off, gap)
-
-
-def _across(points: FloatArray, true: FloatArray) -> float:
-    """Mean distance (mm) of a closed curve's points from another one, seen as segments."""
-    a, b = true, np.roll(true, -1, 0)
-    along = b - a
-    t = ((points[:, None] - a) * along).sum(axis=2) / (along**2).sum(axis=1)
-    foot = a + np.clip(t, 0, 1)[..., None] * along
-    return float(np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1).mean())
-
-
-def best_threshold(right: FloatArray, wrong: FloatArray) -> float:
-    """The confidence that separates right detections from wrong ones best.
-
-    It maximises the share of ``right`` at or above it plus the share of ``wrong`` below it; of
-    equally good thresholds the middle one is taken.
-    """
-    edges = np.unique(np.concatenate([right, wrong]))
-    tried = np.concatenate([edges[:1] - 1e-3, 0.5 * (edges[1:] + edges[:-1]), edges[-1:] + 1e-3])
-    score = [(right >= t).mean() + (wrong < t).mean() for t in tried]
-    best = tried[np.isclose(score, max(score))]
-    return float(best[len(best) // 2])

@@ -8,6 +8,7 @@ checked once, and their answers are the same to the last bit.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from mvest.errors import InputError
-from mvest.quantities import Count, Processes, Share
+from mvest.quantities import Count, Share
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 
@@ -34,9 +35,8 @@ class BoostSettings:
         Share of each tree's answer that is taken.
     min_leaf_samples : int
         Samples that a leaf holds at least.
-    share_features, share_rows : float
+    share_features : float
         Of what there is, drawn anew for every tree.
-    threads : int
     """
 
     trees: Count = 80
@@ -44,31 +44,23 @@ class BoostSettings:
     rate: Share = 0.12
     min_leaf_samples: Count = 40
     share_features: Share = 0.25
-    share_rows: Share = 0.7
-    threads: Processes = 1
 
-    def parameters(self, objective: str, seed: int) -> dict[str, Any]:
-        """LightGBM's names for them."""
-        return {
-            "objective": objective,
-            "num_leaves": self.leaves,
-            "learning_rate": self.rate,
-            "min_data_in_leaf": self.min_leaf_samples,
-            "feature_fraction": self.share_features,
-            "bagging_fraction": self.share_rows,
-            "bagging_freq": 1,
-            "max_bin": 63,
-            "num_threads": self.threads,
-            "seed": seed,
-            "deterministic": True,
-            "force_row_wise": True,
-            "verbosity": -1,
-        }
 
+SHARE_ROWS = 0.7
+"""Of the samples, drawn anew for every tree."""
 
 END: Final = "end of trees\n"
 WRITTEN: Final = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1"}
 """What the head of every text says."""
+
+OF_NODES: Final = ("split_feature", "threshold", "left_child", "right_child", "decision_type")
+"""What a tree has one of for each node."""
+
+FIELDS: Final = {
+    **dict.fromkeys((*OF_NODES, "num_leaves", "num_cat", "is_linear"), np.int64),
+    **dict.fromkeys(("threshold", "leaf_value"), np.float64),
+}
+"""What is read of every tree, and its type."""
 
 IS_PROBABILITY: Final = {"regression": False, "cross_entropy": True}
 """Whether answers are the logistic function of the sums of trees, by the objective."""
@@ -141,7 +133,7 @@ class Boosters:
             )
         answers = np.empty((len(x), self.outputs))
         for k, (trees, is_probability) in enumerate(self._trees):
-            total = _sums(x, *trees)
+            total = _sums(x, trees)
             answers[:, k] = expit(total) if is_probability else total
         return answers
 
@@ -151,15 +143,9 @@ Trees: TypeAlias = Mapping[str, Boosters]
 
 
 @nb.njit(cache=True)
-def _sums(
-    x: NDArray[np.float32],
-    roots: IntArray,
-    feature: IntArray,
-    threshold: FloatArray,
-    children: IntArray,
-    values: FloatArray,
-) -> FloatArray:  # pragma: no cover (compiled)
+def _sums(x: NDArray[np.float32], trees: _Trees) -> FloatArray:  # pragma: no cover (compiled)
     """Sum over the trees ``(P,)``, in their order."""
+    roots, feature, threshold, children, values = trees
     total = np.zeros(len(x))
     for p in range(len(x)):
         for root in roots:
@@ -171,54 +157,54 @@ def _sums(
 
 
 def _read(text: str) -> tuple[int, bool, _Trees]:
-    """Number of features, whether outputs are probabilities, and the trees in a text."""
-    body, end, _ = text.partition(END)
-    head, *blocks = body.split("\nTree=")
+    """Number of features, whether outputs are probabilities, and the trees in a text.
+
+    Raises
+    ------
+    ValueError, LookupError
+        If something is missing, or a node leads to anything but later nodes and leaves of its tree.
+    """
+    whole, end, _ = text.partition(END)
+    head, _, body = whole.partition("\nTree=")
     about = dict(line.split("=", 1) for line in head.split("\n")[1:] if line)
     if not end or {key: about[key] for key in WRITTEN} != WRITTEN:
         raise ValueError("cut off, or of another version")
-    if not blocks or len(about["tree_sizes"].split()) != len(blocks):
-        raise ValueError(f"{len(blocks)} trees, which are not all")
+    trees = len(about["tree_sizes"].split())
+    lines = {key: re.findall(f"^{key}=(.*)$", body, re.MULTILINE) for key in FIELDS}
+    if not trees or {body.count("\nTree=") + 1, *map(len, lines.values())} != {trees}:
+        raise ValueError(f"not all of {trees} trees")
+    sizes = {key: np.array([len(line.split()) for line in lines[key]]) for key in FIELDS}
+    nodes, leaves = sizes["threshold"], sizes["leaf_value"]
+    read: dict[str, NDArray[Any]] = {
+        key: np.array(" ".join(lines[key]).split(), dtype=FIELDS[key]) for key in FIELDS
+    }
+    children = np.stack([read["left_child"], read["right_child"]], axis=1)
     features = len(about["feature_names"].split())
-    trees, nodes, leaves = [], 0, 0
-    for number, block in enumerate(blocks):
-        tree = _tree(block, number, features)
-        inner = tree.children >= 0
-        children = np.where(inner, tree.children + nodes, tree.children - leaves)
-        root = tree.roots + (nodes if len(children) else -leaves)
-        trees.append(tree._replace(roots=root, children=children))
-        nodes, leaves = nodes + len(children), leaves + len(tree.values)
-    joined = (np.concatenate(parts) for parts in zip(*trees, strict=True))
-    return features, IS_PROBABILITY[about["objective"]], _Trees(*joined)
-
-
-def _tree(block: str, number: int, features: int) -> _Trees:
-    """One tree by itself, whose nodes lead to later ones and to leaves only."""
-    fields = dict(line.split("=", 1) for line in block.split("\n")[1:] if line)
-    feature, left, right, kind = (
-        np.array(fields[key].split(), dtype=np.int64)
-        for key in ("split_feature", "left_child", "right_child", "decision_type")
-    )
-    threshold, values = (
-        np.array(fields[key].split(), dtype=np.float64) for key in ("threshold", "leaf_value")
-    )
-    count = len(threshold)
+    # Numbers within each tree become numbers among the nodes and leaves of all.
+    first_node, first_leaf = np.cumsum(nodes) - nodes, np.cumsum(leaves) - leaves
+    tree = np.repeat(np.arange(trees), nodes)[:, None]
+    own = np.arange(nodes.sum())[:, None] - first_node[tree]
+    inner = children >= 0
     sound = (
-        {len(feature), len(left), len(right), len(kind), len(values) - 1} == {count}
-        and fields["num_leaves"] == str(len(values))
-        and fields["num_cat"] == fields["is_linear"] == "0"
-        and np.isin(kind, (0, 2)).all()  # a comparison, where no feature is missing
-        and np.isin(feature, np.arange(features)).all()
-        and np.isfinite(threshold).all()
-        and np.isfinite(values).all()
+        all((sizes[key] == nodes).all() for key in OF_NODES)
+        and (leaves == nodes + 1).all()
+        and np.array_equal(read["num_leaves"], leaves)
+        and not (read["num_cat"].any() or read["is_linear"].any())
+        and np.isin(read["decision_type"], (0, 2)).all()  # a comparison, and no missing feature
+        and np.isin(read["split_feature"], np.arange(features)).all()
+        and np.isfinite(read["threshold"]).all()
+        and np.isfinite(read["leaf_value"]).all()
+        and ((children > own) & (children < nodes[tree]))[inner].all()
+        and (children >= -leaves[tree])[~inner].all()
     )
     if not sound:
-        raise ValueError(f"tree {number}: refers to what is not there")
-    children = np.stack([left, right], axis=1)
-    later = (children > np.arange(count)[:, None]) & (children < count)
-    if not (later | ((children < 0) & (children >= -len(values)))).all():
-        raise ValueError(f"tree {number}: refers to what is not there")
-    return _Trees(np.array([0 if count else -1]), feature, threshold, children, values)
+        raise ValueError("a tree refers to what is not there")
+    children = children + np.where(inner, first_node[tree], -first_leaf[tree])
+    roots = np.where(nodes > 0, first_node, -1 - first_leaf)
+    trees_of_all = _Trees(
+        roots, read["split_feature"], read["threshold"], children, read["leaf_value"]
+    )
+    return features, IS_PROBABILITY[about["objective"]], trees_of_all
 
 
 def train_boosters(
@@ -237,17 +223,23 @@ def train_boosters(
     """
     import lightgbm  # here, as it takes a second that what only uses trees need not wait
 
-    data = lightgbm.Dataset(
-        x,
-        label=np.ascontiguousarray(y[:, 0]),
-        free_raw_data=False,
-        params={"max_bin": 63, "verbosity": -1},
-    )
-    texts = []
+    parameters = {
+        "objective": objective,
+        "num_leaves": settings.leaves,
+        "learning_rate": settings.rate,
+        "min_data_in_leaf": settings.min_leaf_samples,
+        "feature_fraction": settings.share_features,
+        "bagging_fraction": SHARE_ROWS,
+        "bagging_freq": 1,
+        "num_threads": 1,
+        "deterministic": True,
+        "force_row_wise": True,
+    }
+    binned = {"max_bin": 63, "verbosity": -1}
+    data = lightgbm.Dataset(x, free_raw_data=False, params=binned)
+    parameters, texts = parameters | binned, []
     for k in range(y.shape[1]):
         data.set_label(np.ascontiguousarray(y[:, k]))
-        booster = lightgbm.train(
-            settings.parameters(objective, seed + k), data, num_boost_round=settings.trees
-        )
-        texts.append(booster.model_to_string())
+        own = parameters | {"seed": seed + k}
+        texts.append(lightgbm.train(own, data, settings.trees).model_to_string())
     return Boosters(tuple(texts))

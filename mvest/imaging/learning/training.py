@@ -10,18 +10,18 @@ of the simulator does. What is done, and how much, is a choice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mvest.imaging.detection.frame import StandardFrame, standard_frame
+from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_samples, rim_samples
-from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
+    MODES,
     REFINED,
     REFINEMENTS,
     coarse_samples,
@@ -31,22 +31,25 @@ from mvest.imaging.detection.pose_search import (
     search_poses,
     shape_start_samples,
 )
-from mvest.imaging.detection.shape_model import ShapeModel, TrueValve, fit_shape_model
-from mvest.imaging.detection.trained_model import STAGES, DetectionModel
+from mvest.imaging.detection.shape_model import Examples, LabelledFrame, ShapeModel, TrueValve
+from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import LANDMARKS, MovingValve, ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.processes import side_by_side
-from mvest.quantities import Count
-from mvest.typing import FloatArray
+from mvest.quantities import Count, within
 
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
 
-Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
+SEARCH_STAGES = (
+    "position",
+    "pose_coarse",
+    "pose_fine",
+    *(f"pose_refine_{k}" for k in range(len(REFINEMENTS))),
+)
+"""Stages of the search for poses, of which a draft is made from the first volumes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +88,7 @@ class TrainingSettings:
         About which the renderings vary.
     """
 
-    modes: Count = 40
+    modes: Annotated[int, within(MODES, 1000, "", "as many as are read off, or more")] = 40
     samples: SampleCounts = field(default_factory=SampleCounts)
     boosting: BoostSettings = field(default_factory=BoostSettings)
     many_trees: Count = 130
@@ -94,60 +97,33 @@ class TrainingSettings:
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 
-def taken_for_valves(
-    frame: StandardFrame, draft: Trees, count: int, rng: np.random.Generator
-) -> Poses:
-    """What a first search takes for valves: the final rating learns from its mistakes.
-
-    Half of ``count`` poses are those rated best, the others some of the rest.
-    """
-    poses, _ = search_poses(frame, draft, REFINED)
-    best = count // 2
-    others = best + rng.choice(len(poses) - best, count - best, replace=False)
-    return poses[np.concatenate([np.arange(best), others])]
-
-
-Sampled: TypeAlias = Callable[
-    [Sequence[int], ShapeModel, Callable[[], Trees] | None], Sequence[Samples]
-]
-"""(numbers of volumes, shapes, what makes the draft; none for the first volumes) -> samples."""
-
-
-def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Trees:
-    """The search that is learned from the first volumes alone."""
-    refine = [f"pose_refine_{k}" for k in range(len(REFINEMENTS))]
-    return {
-        name: train_stage(name, *samples_of(name, samples), settings, seed)
-        for name in ("position", "pose_coarse", "pose_fine", *refine)
-    }
-
-
 def draw_samples(
-    frame: StandardFrame,
-    true: TrueValve,
-    model: ShapeModel,
-    counts: SampleCounts,
-    rng: np.random.Generator,
-    draft: Trees | None = None,
-) -> Samples:
-    """Samples of all stages from one frame; a draft's mistakes are among them."""
-    layout = model.layout
-    mistaken = None if draft is None else taken_for_valves(frame, draft, counts.mistaken, rng)
-    samples: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
-        "position": position_samples(frame, true, counts.position, rng),
-        "pose_coarse": coarse_samples(frame, true, model, counts.pose_rating, rng),
-        "pose_fine": fine_samples(frame, true, model, counts.pose_rating, rng, mistaken),
-        "shape": shape_start_samples(frame, true, model, counts.shape, rng),
-        **{rim: rim_samples(frame, true, model, rim, counts.rim, rng) for rim in RIMS},
-        "boundary": boundary_samples(frame, true, model, counts.boundary, rng),
+    seen: LabelledFrame, counts: SampleCounts, draft: Trees | None = None
+) -> Mapping[str, Examples]:
+    """Samples of all stages from one frame, by the stage's name.
+
+    The final rating also learns from what a draft's search takes for valves: half of these poses
+    are those rated best, the others some of the rest.
+    """
+    mistaken = None
+    if draft is not None:
+        poses, _ = search_poses(seen.frame, draft, REFINED)
+        count, best = counts.mistaken, counts.mistaken // 2
+        others = best + seen.rng.choice(len(poses) - best, count - best, replace=False)
+        mistaken = poses[np.concatenate([np.arange(best), others])]
+    samples = {
+        "position": position_samples(seen, counts.position),
+        "pose_coarse": coarse_samples(seen, counts.pose_rating),
+        "pose_fine": fine_samples(seen, counts.pose_rating, mistaken),
+        "shape": shape_start_samples(seen, counts.shape),
+        **{rim: rim_samples(seen, rim, counts.rim) for rim in RIMS},
+        "boundary": boundary_samples(seen, counts.boundary),
     }
     for k in range(len(REFINEMENTS)):
-        samples[f"pose_refine_{k}"] = refinement_samples(
-            frame, true, k, counts.pose_refinement, rng
-        )
+        samples[f"pose_refine_{k}"] = refinement_samples(seen, k, counts.pose_refinement)
     for k in range(len(LANDMARKS)):
-        samples[f"landmark_{k}"] = landmark_samples(frame, true, layout, k, counts.landmark, rng)
-    return {name: (x, y.astype(np.float32)) for name, (x, y) in samples.items()}
+        samples[f"landmark_{k}"] = landmark_samples(seen, k, counts.landmark)
+    return samples
 
 
 def render_frame(
@@ -178,7 +154,7 @@ def volume_samples(
     settings: TrainingSettings,
     seed: int,
     draft: Trees | None = None,
-) -> Samples:
+) -> dict[str, NDArray[np.float32]]:
     """Simulate one training volume and sample it for all stages.
 
     Parameters
@@ -192,7 +168,12 @@ def volume_samples(
     seed : int
         Of the training.
     draft : mapping, optional
-        For all but the first volumes.
+        Of `SEARCH_STAGES`, for all but the first volumes.
+
+    Returns
+    -------
+    dict
+        ``STAGE.x`` and ``STAGE.y``, see `mvest.imaging.detection.shape_model.Examples`.
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
@@ -201,15 +182,12 @@ def volume_samples(
     )
     true = TrueValve.of(seen.vertices[0], seen.tips[0], shape)
     rng = np.random.default_rng(sample.spawn(1)[0])
-    return draw_samples(standard_frame(volume, 0), true, shape, settings.samples, rng, draft)
-
-
-def samples_of(
-    name: str, parts: Sequence[Samples]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Samples of one stage ``(P, F)``, ``(P, outputs)``, those of all volumes one after another."""
-    x, y = zip(*(part[name] for part in parts), strict=True)
-    return np.concatenate(x), np.concatenate(y)
+    labelled = LabelledFrame(standard_frame(volume, 0), true, shape, rng)
+    samples = draw_samples(labelled, settings.samples, draft)
+    found: dict[str, NDArray[np.float32]] = {}
+    for name, (x, y) in samples.items():
+        found |= {f"{name}.x": x, f"{name}.y": y.astype(np.float32)}
+    return found
 
 
 def train_stage(
@@ -226,7 +204,7 @@ def train_stage(
     name : str
         One of :data:`mvest.imaging.detection.trained_model.STAGES`.
     x, y : (P, F), (P, outputs)
-        From :func:`samples_of`.
+        Samples of all volumes.
     settings : TrainingSettings
     seed : int
         Of the training.
@@ -236,54 +214,6 @@ def train_stage(
         boosting = replace(boosting, trees=settings.many_trees)
     objective = "cross_entropy" if name == "boundary" else "regression"
     return train_boosters(x, y.astype(np.float64), boosting, seed, objective)
-
-
-def train_model(
-    valves: Sequence[MovingValve],
-    settings: TrainingSettings,
-    seed: int,
-    *,
-    sampled: Sampled,
-    processes: int = 1,
-    trained_on: Mapping[str, Any] | None = None,
-    progress: Callable[[], None] | None = None,
-) -> DetectionModel:
-    """Learn all stages from samples of simulated volumes.
-
-    Parameters
-    ----------
-    valves : sequence of MovingValve
-        Of one layout.
-    settings : TrainingSettings
-    seed : int
-        The result depends on it and not on the number of processes.
-    sampled : callable
-        Makes the samples by `volume_samples`, or has them from a cache.
-    processes : int
-    trained_on : mapping, optional
-        Plain values that are kept with the model.
-    progress : callable, optional
-        Called when a stage is done.
-
-    Raises
-    ------
-    InputError
-        If there are fewer shapes than modes.
-    """
-    shape = fit_shape_model(valves, settings.modes)
-    first = min(settings.draft_volumes, settings.volumes)
-    samples = drafted = list(sampled(range(first), shape, None))
-    if first < settings.volumes:
-        draft = (lambda: draft_of(drafted, settings, seed)) if drafted else None
-        samples = [*drafted, *sampled(range(first, settings.volumes), shape, draft)]
-    stages = ((name, *samples_of(name, samples), settings, seed) for name in STAGES)
-    boosters = {}
-    grown = side_by_side(train_stage, stages, processes)
-    for name, found_boosters in zip(STAGES, grown, strict=True):
-        boosters[name] = found_boosters
-        if progress is not None:
-            progress()
-    return DetectionModel(shape, boosters, dict(trained_on or {}))
 
 
 SHARE = 0.5

@@ -35,6 +35,18 @@ SPEED_OF_SOUND = 1540.0
 LARGEST = 1000.0
 """Size of any setting, in its unit."""
 
+BOUNDS = {
+    **dict.fromkeys(
+        ("attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
+         "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
+         "beat_turn_deg"), (0.0, LARGEST),
+    ),
+    **dict.fromkeys(("side_lobe_db", "angle_floor_db", "dropout_db"), (-LARGEST, 0.0)),
+    **dict.fromkeys(("azimuth_deg", "elevation_span_deg"), (10.0, 120.0)),
+    "dropout": (0.0, 0.6),
+    "beats": (1.0, 12.0),
+}  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
@@ -141,19 +153,11 @@ class Acquisition:
         if len(self.shape) != 3 or min(self.shape) < 8:
             self._refuse("shape", "three numbers of voxels >= 8")
         bounds = {
-            **dict.fromkeys(
-                ("attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
-                 "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
-                 "beat_turn_deg"), (0.0, LARGEST),
-            ),
-            **dict.fromkeys(("side_lobe_db", "angle_floor_db", "dropout_db"), (-LARGEST, 0.0)),
-            **dict.fromkeys(("azimuth_deg", "elevation_span_deg"), (10.0, 120.0)),
+            **BOUNDS,
             "lateral_deg": (0.2, self.azimuth_deg / 4),
             "elevation_deg": (0.2, self.elevation_span_deg / 4),
             "axial_mm": (0.0, (self.depth_mm[1] - self.depth_mm[0]) / 4),
-            "dropout": (0.0, 0.6),
-            "beats": (1.0, 12.0),
-        }  # fmt: skip
+        }
         for name in (f.name for f in fields(self) if f.name not in ("depth_mm", "shape")):
             low, high = bounds.get(name, (-LARGEST, LARGEST))
             if not low <= getattr(self, name) <= high:

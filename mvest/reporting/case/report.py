@@ -30,7 +30,7 @@ from mvest.reporting.case.tables import expected_tables, report_tables, unknown_
 from mvest.reporting.case.view import CAMERAS, case_view
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
-from mvest.reporting.images.step import write_image_step
+from mvest.reporting.images import write_image_step
 from mvest.reporting.markup import ended, number
 from mvest.reporting.pictures import TEMPLATES, embedded, rendered
 

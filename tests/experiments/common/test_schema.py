@@ -8,7 +8,6 @@ from omegaconf.errors import ConfigKeyError, ValidationError
 from experiments.common.config import PARTS
 from experiments.common.schema import build, schema
 from mvest.errors import ConfigurationError, InputError
-from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.simulation.population import PopulationSettings
@@ -57,7 +56,7 @@ def test_the_librarys_defaults_are_the_configurations() -> None:
     template = OmegaConf.to_container(OmegaConf.structured(schema(*PARTS["valve"])))
     assert build(TemplateParameters, template) == TemplateParameters()
     # Dataclasses within dataclasses, and mappings.
-    for cls in (PopulationSettings, TrainingSettings, TrackingSettings):
+    for cls in (PopulationSettings, TrainingSettings):
         made = OmegaConf.to_container(OmegaConf.structured(schema(cls)))
         assert build(cls, made) == cls()
     mechanics = OmegaConf.structured(schema(*PARTS["mechanics"]))

@@ -12,17 +12,9 @@ from experiments.common.schema import build
 from experiments.results.keep import publish, regenerate
 from experiments.run import main
 from experiments.studies.imaging import study as imaging
-from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore, StoredSamples
-from experiments.studies.imaging.study import (
-    Settings,
-    accuracy_rows,
-    calibrated,
-    confidence_rows,
-    judge,
-    over_time_rows,
-    stage_rows,
-)
-from mvest.errors import ConfigurationError, InputError
+from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore
+from experiments.studies.imaging.study import Settings, calibrated, error_rows, judge, kind_rows
+from mvest.errors import InputError
 from mvest.imaging.detection import trained_model as detection_model
 from mvest.imaging.detection.trained_model import (
     STAGES,
@@ -31,6 +23,7 @@ from mvest.imaging.detection.trained_model import (
     load_model,
     save_model,
 )
+from mvest.reading.npz import read_npz
 from mvest.simulation.trials import KINDS, WITHOUT_VALVE, Trial
 from tests.experiments.configured import composed, plain
 from tests.imaging.simulator.made_up_valve import SMALL
@@ -86,24 +79,17 @@ def changed(place: Path) -> dict[str, int]:
 def test_the_study_says_how_far_detectors_are_off(done: Path):
     record = record_of(done)
     assert (record.status, record.reason) == ("converged", "trained and tested")
-    settings = ["in distribution", "shifted"]
-    main_rows = record.table_of().rows
-    assert [row["setting"] for row in main_rows] == settings
-    assert [row["volumes"] for row in main_rows] == [2, 2]
-    stages = record.table_of("stages").rows
-    assert [(row["stage"], row["setting"]) for row in stages] == [
-        (stage, setting)
-        for stage in ("position", "pose", "landmarks", "hinge", "surface")
-        for setting in settings
-    ]
-    assert {row["unit"] for row in stages if row["stage"] == "pose"} == {"°"}
-    # Confidences with a valve and without one.
-    kinds = record.table_of("confidence").rows
-    assert {row["kind"] for row in kinds} == set(KINDS)
-    assert [row["volumes"] for row in kinds] == [2, 2, 1, 1, 1, 2, 2, 1, 1]
+    kinds = record.table_of().rows
+    assert {row["kind"]: row["volumes"] for row in kinds} == dict(
+        zip(KINDS, (2, 2, 1, 1, 1, 2, 2, 1, 1), strict=True)
+    )
+    errors = {(row["error"], row["kind"]): row for row in record.table_of("errors").rows}
+    assert errors["annulus_area", "shifted"]["unit"] == "%"
+    assert errors["surface_open", "sequence"]["volumes"] == 2
+    assert ("surface", "calibration") not in errors
     coverage = record.table_of("coverage").rows
-    assert [(row["setting"], row["frame"]) for row in coverage] == [
-        (setting, frame) for setting in settings for frame in ("open", "closed")
+    assert [(row["kind"], row["frame"]) for row in coverage] == [
+        (kind, frame) for kind in ("sequence", "shifted sequence") for frame in ("open", "closed")
     ]
     for row in coverage:
         assert min(row["within_95"], row["within_95_handed_on"]) >= 0
@@ -119,9 +105,9 @@ def test_the_study_says_how_far_detectors_are_off(done: Path):
 
 def test_what_is_tested_on_was_not_trained_on(done: Path):
     record, trained = record_of(done), load_model(done / "run" / "tee.npz").trained_on
-    volumes, over_time = (record.table_of(name).rows for name in ("volumes", "sequences"))
-    calibrated_on = {row["valve"] for row in over_time if "calibration" in row["kind"]}
-    tested = {row["valve"] for row in [*volumes, *over_time]} - calibrated_on
+    trials = record.table_of("trials").rows
+    calibrated_on = {row["valve"] for row in trials if "calibration" in row["kind"]}
+    tested = {row["valve"] for row in trials} - calibrated_on
     assert len(trained["valves"]) == 4
     assert set(trained["calibrated_on"]) == calibrated_on
     assert len(calibrated_on) == len(tested) == 2
@@ -148,9 +134,8 @@ def test_the_model_states_its_errors(done: Path):
 
 def test_tables_and_figures_are_made_and_made_again(done: Path, tmp_path: Path):
     names = {path.name for path in (done / "run").iterdir()}
-    parts = ("", "_over_time", "_confidence", "_coverage", "_stages", "_volumes", "_sequences")
-    assert {f"imaging{part}.csv" for part in parts} | {"imaging.md"} <= names
-    assert {"imaging.png", "imaging_confidence.png"} <= names
+    parts = ("", "_errors", "_coverage", "_trials")
+    assert {f"imaging{part}.csv" for part in parts} | {"imaging.md", "imaging.png"} <= names
     # Overrides keep a run out of the results.
     assert not (done / "results").exists()
     results = tmp_path / "results"
@@ -222,11 +207,14 @@ def test_given_detectors_are_tested_and_calibrated_and_none_is_trained(
     assert changed(tmp_path) == made
     boosters = again.boosters | {"annulus": again.boosters["free_edge"]}
     save_model(tmp_path / "other.npz", DetectionModel(again.shape, boosters, again.trained_on))
-    keys = [store_of(f"imaging.model={file}").model_key for file in (own, tmp_path / "other.npz")]
-    assert keys[0] != keys[1]
+    given = f"imaging.model={tmp_path / 'other.npz'}"
+    assert call(tmp_path, given, "hydra.run.dir=other") == 0
+    assert len([name for name in changed(tmp_path) if name.startswith("trials")]) == 2 * len(
+        [name for name in made if name.startswith("trials")]
+    )
     capsys.readouterr()
     assert call(tmp_path, given, "imaging.train.seed=9", "imaging.calibration.seed=1") == 2
-    assert "is in two populations, expected other valves" in capsys.readouterr().err
+    assert "was trained on, expected other valves" in capsys.readouterr().err
     assert call(tmp_path, given, "imaging.evaluate=false") == 2
     assert "nothing would be done" in capsys.readouterr().err
 
@@ -254,7 +242,7 @@ def test_a_model_is_made_the_one_of_the_package_without_training_again(
         ("imaging.train.count=0", "imaging.train.count = 0, expected 1 to"),
         ("imaging.processes=0", "imaging.processes = 0"),
         ("imaging.held_out.shifted=0", "imaging.held_out.shifted = 0"),
-        ("imaging.training.modes=7", "expected at least 8"),
+        ("imaging.training.modes=7", "imaging.training.modes = 7, expected 8 to"),
         ("imaging.training.acquisition.beats=0", "beats"),
         ("imaging.population.motion.columns=12", "no column"),
         ("imaging.population.motion.frames=30", "frames = 30"),
@@ -270,16 +258,11 @@ def test_wrong_settings_are_refused_in_one_line(tmp_path: Path, override: str, w
     assert not (tmp_path / "outputs" / "detectors").exists()
 
 
-def test_populations_with_a_valve_in_common_are_refused():
-    imaging.require_apart(["a", "b"], ["c"], ["d"])
-    with pytest.raises(ConfigurationError, match="valve b is in two populations"):
-        imaging.require_apart(["a", "b"], ["c"], ["d", "b"])
-
-
 def test_cached_parts_are_named_by_what_they_are_made_of():
     def names(*overrides: str) -> tuple[str, str, str]:
         store = store_of(*overrides)
-        return store._valves("train").path.stem, store.samples_folder().name, store.model_file.stem
+        entries = store._valves("train"), store.samples_entry(0), store.model_entry()
+        return tuple(entry.path.stem for entry in entries)
 
     base = names()
     assert names("imaging.processes=2", "imaging.held_out.volumes=9") == base
@@ -295,12 +278,13 @@ def test_cached_parts_are_named_by_what_they_are_made_of():
     assert not set(names("imaging.train.seed=9")) & set(base)
 
 
-def test_samples_in_files_are_read_stage_by_stage(done: Path):
-    path = next((done / "outputs" / "detectors" / "samples").rglob("00000.npz"))
-    samples = StoredSamples(path)
-    assert list(samples) == list(STAGES)
-    x, y = samples["boundary"]
-    assert len(x) == len(y) == 60
+def test_the_first_volumes_make_a_draft_whose_mistakes_the_others_add(done: Path):
+    files = (done / "outputs" / "detectors" / "samples").glob("*.npz")
+    samples = [read_npz(file) for file in files]
+    assert set(samples[0]) == {f"{stage}.{axis}" for stage in STAGES for axis in "xy"}
+    assert {len(each["boundary.x"]) for each in samples} == {60}
+    # Of six volumes three make the draft; six poses of each other one are mistakes.
+    assert sorted(len(each["pose_fine.y"]) for each in samples) == [24, 24, 24, 30, 30, 30]
 
 
 def test_every_trial_has_a_stream_of_its_own():
@@ -316,10 +300,9 @@ def test_every_trial_has_a_stream_of_its_own():
 
 # -- tables of made-up trials ---------------------------------------------------------------------
 def volume(kind: str, surface: float, confidence: float = 0.9, **more) -> dict:
-    stages = dict.fromkeys(("position", "pose", "landmarks", "hinge"), 3 * surface)
     return {
         "kind": kind, "confidence": confidence, "surface": surface, "points": 2 * surface,
-        "tips": 1.0, "annulus_area": 2.0, "ap_diameter": -0.5, "state_right": 100.0, **stages,
+        "tips": 1.0, "annulus_area": 2.0, "ap_diameter": -0.5, "state_right": 100.0,
     } | more  # fmt: skip
 
 
@@ -346,42 +329,40 @@ ROWS = [
 ]
 
 
-def test_a_setting_is_summarised_over_its_volumes():
-    row, shifted = accuracy_rows(judge(ROWS, 0.5, 5.0, 0.85))
-    assert (row["setting"], row["volumes"]) == ("in distribution", 4)
-    assert row["surface_mean"] == pytest.approx(1.0)
-    assert row["surface_median"] == pytest.approx(0.6)
+def by_kind(rows: list[dict], *limits: float) -> dict:
+    return {row.kind: row for row in kind_rows(judge(rows, *limits)).itertuples()}
+
+
+def test_a_kind_is_summarised_over_its_volumes():
     # A valve that was not found is no valve below 1.5 mm.
-    assert row["called_a_valve"] == pytest.approx(75.0)
-    assert row["below_limit"] == pytest.approx(50.0)
-    assert row["points"] == pytest.approx(2.0)
-    assert row["annulus_area"] == pytest.approx(3.0)
-    assert row["annulus_area_bias"] == pytest.approx(-1.0)
-    assert row["ap_diameter"] == pytest.approx(3.5 / 3)
-    assert row["ap_diameter_bias"] == pytest.approx(-0.5)
-    assert row["state_right"] == 50.0
-    assert row["wrong_yet_like"] == 25.0
-    assert shifted["surface_90"] == pytest.approx(1.0)
+    row = by_kind(ROWS, 0.5, 5.0, 0.85)["in distribution"]
+    assert row.volumes == 4
+    assert row.called_a_valve == pytest.approx(75.0)
+    assert row.below_limit == pytest.approx(50.0)
+    assert row.state_right == 50.0
+    assert row.wrong_yet_like == 25.0
     # Of a confidence at which it would be unlike, what is wrong is not believed.
-    assert accuracy_rows(judge(ROWS, 0.5, 5.0, 0.96))[0]["wrong_yet_like"] == 0.0
+    assert by_kind(ROWS, 0.5, 5.0, 0.96)["in distribution"].wrong_yet_like == 0.0
 
 
-def test_stages_are_summarised_over_all_volumes_with_a_valve():
-    rows = {
-        (row.stage, row.setting): row for row in stage_rows(judge(ROWS, 0.5, 5.0, 0.0)).itertuples()
+def test_errors_are_summarised_over_volumes_that_are_called_a_valve():
+    over_time = [sequence("sequence", 0.9, 1.0), sequence("sequence", 0.8, 2.0),
+                 sequence("sequence", 0.3, 9.0), sequence("calibration", 0.9, 5.0)]  # fmt: skip
+    found = {
+        (row.error, row.kind): row
+        for row in error_rows(judge([*ROWS, *over_time], 0.5, 5.0, 0.0)).itertuples()
     }
-    assert rows["surface", "in distribution"].volumes == 4
-    assert rows["surface", "in distribution"].error == pytest.approx(1.3)
-    assert rows["surface", "in distribution"].error_90 == pytest.approx(2.7)
-    assert rows["pose", "shifted"].error == pytest.approx(3.0)
-    assert rows["pose", "shifted"].unit == "°"
-
-
-def test_volumes_over_time_are_summarised_where_they_are_detected():
-    rows = [sequence("sequence", 0.9, 1.0), sequence("sequence", 0.8, 2.0),
-            sequence("sequence", 0.3, 9.0), sequence("calibration", 0.9, 5.0)]  # fmt: skip
-    (row,) = over_time_rows(judge(rows, 0.5, 5.0, 0.0)).itertuples()
-    assert (row.setting, row.volumes, row.surface_closed) == ("in distribution", 2, 1.5)
+    surface = found["surface", "in distribution"]
+    assert (surface.volumes, surface.mean, surface.median) == pytest.approx((3, 1.0, 0.6))
+    assert surface.percentile_90 == pytest.approx(1.72)
+    assert (found["points", "shifted"].median, found["points", "shifted"].unit) == (2.0, "mm")
+    area, diameter = (found[name, "in distribution"] for name in ("annulus_area", "ap_diameter"))
+    assert (area.mean, area.bias) == pytest.approx((3.0, -1.0))
+    assert (diameter.mean, diameter.bias) == pytest.approx((3.5 / 3, -0.5))
+    closed = found["surface_closed", "sequence"]
+    assert (closed.volumes, closed.mean) == (2, 1.5)
+    assert np.isnan(found["annulus_area", "sequence"].bias)
+    assert not [key for key in found if key[1] == "calibration"]
 
 
 def test_a_wrong_valve_counts_as_none():
@@ -392,7 +373,7 @@ def test_a_wrong_valve_counts_as_none():
         *(without(kind, 0.2) for kind in WITHOUT_VALVE),
         sequence("calibration", 0.8, 1.0),
     ]
-    found = {row.kind: row for row in confidence_rows(judge(rows, 0.5, 5.0, 0.75)).itertuples()}
+    found = by_kind(rows, 0.5, 5.0, 0.75)
     row = found["in distribution"]
     assert (row.volumes, row.lowest, row.median, row.highest) == (3, 0.4, 0.6, 0.9)
     assert row.called_a_valve == pytest.approx(200 / 3)
@@ -413,14 +394,13 @@ def test_errors_are_stated_of_valves_that_were_detected_only():
         return sequence(kind, confidence, off), arrays | {"rest": rest}
 
     right = [seen("calibration", 0.9, 1.0), seen("calibration", 0.9, 2.0)]
-    others = [seen("calibration", 0.8, 30.0), seen("calibration", 0.3, 3.0)]
-    sequences = {"calibration": [*right, *others], "wide calibration": []}
-    accuracy, _, valves = calibrated(sequences, 0.5, 5.0)
+    others = [seen("calibration", 0.8, 30.0), seen("calibration", 0.3, 3.0), seen("sequence", 1, 1)]
+    accuracy, valves = calibrated([*right, *others], 0.5, 5.0)
     assert valves == ["1.0", "2.0"]
     assert len(accuracy.samples) == len(accuracy.shapes) == 2
     assert accuracy.samples.max() < 3.0
     with pytest.raises(InputError, match="in 1 of 3 volumes the valve was detected"):
-        calibrated(sequences | {"calibration": [right[0], *others]}, 0.5, 5.0)
+        calibrated([right[0], *others], 0.5, 5.0)
 
 
 def test_the_small_scanner_is_the_simulators():

@@ -52,7 +52,7 @@ def run(run, monkeypatch, volume):
     )
     told = []
 
-    def detect(volume, given, settings=None, *, landmarks=None, progress=None):
+    def detect(volume, given, *, min_confidence, landmarks=None, progress=None):
         assert given is model
         told.append((volume, landmarks))
         return sequence()
@@ -268,7 +268,7 @@ def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp
         titles.append(title)
 
     monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", nothing)
-    monkeypatch.setattr("mvest.reporting.images.montage.headline", titled)
+    monkeypatch.setattr("mvest.reporting.images.headline", titled)
     status, _, err = run("check=true")
     assert status == 2
     (drawn,) = (tmp_path / "outputs" / "volume").glob("*/candidate.png")
@@ -282,8 +282,8 @@ def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp
 def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypatch):
     asked = []
 
-    def detect(volume, model, settings, *, landmarks=None, progress=None):
-        asked.append(settings.min_confidence)
+    def detect(volume, model, *, min_confidence, landmarks=None, progress=None):
+        asked.append(min_confidence)
         return sequence()
 
     monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", detect)

@@ -12,10 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.imaging.detection import leaflets, pose_search
-from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import MODES
-from mvest.imaging.detection.shape_model import TrueValve
+from mvest.imaging.detection.shape_model import LabelledFrame, TrueValve
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve, landmark_vertices
@@ -24,9 +23,6 @@ from mvest.valve.anatomy.template import Template
 from tests import made_up_sequence
 
 LAYOUT = ValveLayout(16, 7)
-FIT = FitSettings((10, 12, 12), (6.0, 4.0, 3.0))
-"""No more modes than the small shape model has."""
-
 TIPS = np.array([Template().parameters.papillary.tip, Template().parameters.papillary.tip]) * [
     [1, 1, 1],
     [-1, 1, 1],
@@ -104,6 +100,11 @@ class NumberedFrame:
     """Stands in for a frame: says which one it is."""
 
     number: int = 0
+
+
+def labelled(true, shape, seed=0, frame=NumberedFrame()):
+    """A frame to draw samples from."""
+    return LabelledFrame(frame, true, shape, np.random.default_rng(seed))
 
 
 def geometry(frame, pattern, points, axes):

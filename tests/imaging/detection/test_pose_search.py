@@ -1,6 +1,6 @@
 """Orientations are rated at places and refined: with ratings that are right, to the true pose.
 
-Places rated whatever the orientation.
+Places rated whatever the orientation. Shape and tips read off at a pose.
 """
 
 import numpy as np
@@ -11,8 +11,8 @@ from mvest.imaging.detection import pose_search
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
+    MODES,
     REFINEMENTS,
-    SCALE_MM,
     coarse_samples,
     fine_samples,
     likely_places,
@@ -21,18 +21,22 @@ from mvest.imaging.detection.pose_search import (
     refined,
     refinement_samples,
     search_poses,
+    shape_start_samples,
+    starting_shape,
 )
 from tests.imaging.detection.made_up import (
     NumberedFrame,
     Oracle,
     ball_volume,
     geometry,
+    labelled,
     placed,
     poses,
     position_oracle,
     rating_oracle,
     refinement_oracle,
     seen,
+    start_oracle,
     use_geometry,
 )
 
@@ -108,7 +112,7 @@ def test_no_places_give_no_poses(shape, true, monkeypatch):
 
 @pytest.mark.parametrize("step", range(len(REFINEMENTS)))
 def test_what_samples_of_refinement_say_takes_them_back(true, step):
-    x, y = refinement_samples(NumberedFrame(), true, step, 30, np.random.default_rng(step))
+    x, y = refinement_samples(labelled(true, None, step), step, 30)
     centre, rotation, log_scale, _ = seen(x)
     back = Poses(centre, rotation, log_scale).moved(y)
     np.testing.assert_allclose(back.centre, np.tile(true.pose.centre, (30, 1)), atol=1e-9)
@@ -119,7 +123,7 @@ def test_what_samples_of_refinement_say_takes_them_back(true, step):
 
 @pytest.mark.parametrize("samples", [coarse_samples, fine_samples])
 def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true, samples):
-    x, y = samples(NumberedFrame(), true, shape, 120, np.random.default_rng(0))
+    x, y = samples(labelled(true, shape), 120)
     assert y.shape == (120, 1)
     centre, rotation, log_scale, _ = seen(x)
     error = pose_error(Poses(centre, rotation, log_scale), true, shape)
@@ -130,7 +134,7 @@ def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true
 
 def test_the_final_rating_learns_to_tell_front_from_back(shape, true):
     # Poses in place but turned half about the valve's axis: there must be some, and rated low.
-    x, y = fine_samples(NumberedFrame(), true, shape, 240, np.random.default_rng(0))
+    x, y = fine_samples(labelled(true, shape), 240)
     centre, rotation, log_scale, _ = seen(x)
     by = true.pose.repeated(240).towards(Poses(centre, rotation, log_scale))
     back = (np.linalg.norm(by[:, :3], axis=1) < 8) & (np.abs(by[:, 5]) > 2.5)
@@ -146,34 +150,10 @@ def test_mistakes_are_learned_from_with_the_rating_they_deserve(shape, true):
     away = np.zeros((3, 7))
     away[:, 0] = [0.0, 6.0, 60.0]
     mistaken = true.pose.repeated(3).moved(away)
-    x, y = fine_samples(NumberedFrame(), true, shape, 60, np.random.default_rng(0), mistaken)
+    x, y = fine_samples(labelled(true, shape), 60, mistaken)
     assert len(x) == len(y) == 63
     np.testing.assert_allclose(seen(x)[0][-3:], mistaken.centre)
     np.testing.assert_allclose(y[-3:, 0], np.exp(-np.array([0.0, 6.0, 60.0]) / 6.0), atol=1e-9)
-
-
-def test_an_oracle_of_nothing_rates_nothing():
-    # The stand-in itself: as trees do, it answers no rows with no rows.
-    assert Oracle(7, None)(np.zeros((0, 3))).shape == (0, 7)
-
-
-def test_valves_turned_front_to_back_are_among_the_samples_and_rated_low(shape, true):
-    x, y = fine_samples(NumberedFrame(), true, shape, 300, np.random.default_rng(1))
-    rotation = seen(x)[1]
-    about = np.einsum("pij,ij->pj", rotation, true.pose.rotation[0])  # cosines of x, y and z axes
-    turned = (about[:, 0] < -0.9) & (about[:, 2] > 0.9)
-    assert turned.sum() > 20
-    assert y[turned].max() < 0.1
-
-
-def test_mistakes_are_learned_from_with_their_rating(shape, true):
-    by = np.zeros((2, 7))
-    by[:, 0] = [3.0, 30.0]
-    x, y = fine_samples(
-        NumberedFrame(), true, shape, 60, np.random.default_rng(1), true.pose.repeated(2).moved(by)
-    )
-    assert len(x) == 62
-    np.testing.assert_allclose(y[-2:, 0], np.exp(-by[:, 0] / SCALE_MM))
 
 
 POINT = np.array([3.0, -7.0, 50.0])
@@ -239,7 +219,7 @@ def test_samples_are_rated_by_their_distance(shape, frame, monkeypatch):
     centred = type(true)(true.vertices, true.tips, type(true.pose)(
         POINT[None], true.pose.rotation, true.pose.log_scale))  # fmt: skip
     monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    points, y = position_samples(frame, centred, 100, np.random.default_rng(0))
+    points, y = position_samples(labelled(centred, shape, frame=frame), 100)
     assert y.shape == (100, 1)
     gap = np.linalg.norm(points - POINT, axis=1)
     order = np.argsort(gap)
@@ -247,3 +227,29 @@ def test_samples_are_rated_by_their_distance(shape, frame, monkeypatch):
     assert y[gap < 2.0].min() > 0.8
     assert y[gap > 20.0].max() < 0.05
     assert np.any(gap > 15.0)
+
+
+def test_coefficients_and_tips_come_back_as_they_were_learned(shape, monkeypatch):
+    # What samples divide by the deviation or subtract is multiplied and added again.
+    monkeypatch.setattr(pose_search, "features", geometry)
+    b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
+    true = placed(shape, poses(1, 2), b)
+    trees = {"shape": start_oracle([true], shape, MODES)}
+    found, tips = starting_shape(NumberedFrame(), trees, true.pose.repeated(2), shape)
+    assert found.shape == (2, MODES)
+    np.testing.assert_allclose(found[1], b, atol=1e-9)
+    np.testing.assert_allclose(tips[1], true.tips, atol=1e-9)
+
+
+def test_samples_show_the_valve_as_seen_from_a_missed_pose(shape, monkeypatch):
+    # Seen from the true pose instead, all samples would say the same.
+    monkeypatch.setattr(pose_search, "features", geometry)
+    b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
+    true = placed(shape, poses(1, 2), b)
+    x, y = shape_start_samples(labelled(true, shape, 1), 25)
+    assert y.shape == (25, MODES + 6)
+    here = Poses(*seen(x)[:3])
+    tips = here.world(shape.tips + y[:, MODES:].reshape(-1, 2, 3))
+    np.testing.assert_allclose(tips, np.tile(true.tips, (25, 1, 1)), atol=1e-9)
+    assert np.std(y[:, MODES:], axis=0).min() > 0.3
+    np.testing.assert_allclose(y[:, :MODES].mean(axis=0), b / shape.std[:MODES], atol=1.5)

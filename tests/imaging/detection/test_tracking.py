@@ -13,12 +13,11 @@ from mvest.imaging.detection.detect import NoValveError, fit_frame
 from mvest.imaging.detection.leaflets import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import search_poses
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve, smooth_in_time
+from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from tests.imaging.detection.made_up import (
-    FIT,
     LAYOUT,
     NumberedFrame,
     Oracle,
@@ -31,9 +30,13 @@ from tests.imaging.detection.made_up import (
 )
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
-TOLD = TrackingSettings(fit=FIT)
 STEPS = [f"pose_refine_{k}" for k in range(3)]
-UNSMOOTHED = replace(TOLD, smoothing_s=(0.0, 0.0, 0.0))
+NO_HANDS = np.full((len(TIMES), len(LANDMARKS), 3), np.nan)
+
+
+@pytest.fixture
+def unsmoothed(monkeypatch):
+    monkeypatch.setattr(tracking, "SMOOTHING_S", (0.0, 0.0, 0.0))
 
 
 @pytest.fixture
@@ -66,13 +69,12 @@ def volume(count=4):
 # --- whole sequences ----------------------------------------------------------------------------
 
 
-def test_the_valve_is_found_in_every_frame(shape, truths):
+def test_the_valve_is_found_in_every_frame(shape, truths, unsmoothed):
     # Frames or their confidences in the wrong order are seen here.
     told = []
     found = detect_valve(
         volume(),
         oracle_model(shape, truths),
-        UNSMOOTHED,
         progress=lambda done, all_: told.append((done, all_)),
     )
     for k, true in enumerate(truths):
@@ -93,7 +95,7 @@ def test_what_was_measured_of_a_model_goes_with_the_sequence(shape, truths):
     accuracy = DetectionAccuracy(
         np.linspace(1, 2, n), 7.5, np.zeros((1, 2, n, 3)), np.zeros((1, 2, 2, 3))
     )
-    found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy), TOLD)
+    found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy))
     np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
     assert found.correlation_length_mm == 7.5
 
@@ -106,7 +108,7 @@ def test_the_less_a_volume_is_believed_the_wider_its_errors_are_stated(shape, tr
         rng.standard_normal((3, 2, 2, 3)), (1.2, 2.0),
     )  # fmt: skip
     model = oracle_model(shape, truths, best=0.3, accuracy=accuracy, seen=0.6)
-    found = detect_valve(volume(), model, replace(TOLD, min_confidence=0.0))
+    found = detect_valve(volume(), model, min_confidence=0.0)
     factor = 1.2 * np.exp(2.0 * (1.0 - np.median(found.frame_confidence)))
     assert factor > 1.25
     np.testing.assert_allclose(found.std_mm, factor * accuracy.std_mm)
@@ -121,7 +123,7 @@ def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
     # Its own search ended elsewhere; two frames in a row are found one after the other.
     model = oracle_model(shape, truths)
     frames = [NumberedFrame(k) for k in range(4)]
-    valves = [fit_frame(frames[k], model, truths[k].pose, UNSMOOTHED.fit) for k in range(4)]
+    valves = [fit_frame(frames[k], model, truths[k].pose) for k in range(4)]
     for k in (1, 2):
         valves[k] = replace(
             valves[k],
@@ -129,28 +131,30 @@ def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
             vertices=valves[k].vertices + 30.0,
             confidence=0.4,
         )
-    again = tracking._found_again(frames, valves, model, UNSMOOTHED, {})
+    again = tracking._found_again(frames, valves, model, NO_HANDS)
     for k, true in enumerate(truths):
         assert np.linalg.norm(again[k].vertices - true.vertices, axis=1).mean() < 0.6
     # Hands that placed a frame are not overruled.
-    kept = tracking._found_again(frames, valves, model, UNSMOOTHED, {1: {}, 2: {}})
+    placed = NO_HANDS.copy()
+    placed[1:3, 0] = 0.0
+    kept = tracking._found_again(frames, valves, model, placed)
     assert [a is b for a, b in zip(kept, valves, strict=True)] == [True] * 4
 
 
 def test_smoothing_of_a_steady_motion_leaves_it_where_it_is(shape, truths):
-    found = detect_valve(volume(), oracle_model(shape, truths), TOLD)
+    found = detect_valve(volume(), oracle_model(shape, truths))
     for k, true in enumerate(truths):
         assert np.linalg.norm(found.vertices[k] - true.vertices, axis=1).mean() < 0.5
 
 
 def test_a_single_frame_is_enough(shape, truths):
-    found = detect_valve(volume(1), oracle_model(shape, truths), TOLD)
+    found = detect_valve(volume(1), oracle_model(shape, truths))
     assert np.linalg.norm(found.vertices[0] - truths[0].vertices, axis=1).mean() < 0.35
 
 
 def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     with pytest.raises(NoValveError, match="no valve") as told:
-        detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05), TOLD)
+        detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05))
     message = str(told.value)
     assert "made up.nrrd" in message
     assert "0.0" in message
@@ -159,7 +163,7 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     assert candidate.frame_confidence.max() < 0.6
     assert len(candidate.times) == len(volume().times)
     detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05),
-                 replace(TOLD, min_confidence=0.01))  # fmt: skip
+                 min_confidence=0.01)  # fmt: skip
 
 
 # --- by hand ------------------------------------------------------------------------------------
@@ -178,7 +182,7 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
 )
 def test_landmarks_by_hand_are_checked(shape, truths, landmarks, message):
     with pytest.raises(tracking.InputError, match=message) as told:
-        detect_valve(volume(), oracle_model(shape, truths), TOLD, landmarks=landmarks)
+        detect_valve(volume(), oracle_model(shape, truths), landmarks=landmarks)
     assert "\n" not in str(told.value)
 
 
@@ -188,13 +192,16 @@ def test_four_landmarks_by_hand_lay_the_mean_valve_on_them(shape, truths):
     pose = poses(1, 9, 40.0)
     at = list(landmark_vertices(LAYOUT).values())
     points = pose.world(np.concatenate([shape.mean[at], shape.tips]))[0]
-    by_hand = {k: points[k] for k in (11, 3, 0, 6, 9)}
-    found = tracking._pose_by_hand(by_hand, model)
+
+    def by_hand(*numbers):
+        return np.where(np.isin(np.arange(len(points)), numbers)[:, None], points, np.nan)
+
+    found = tracking._pose_by_hand(by_hand(11, 3, 0, 6, 9), model)
     np.testing.assert_allclose(found.centre, pose.centre, atol=1e-6)
     np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-8)
     np.testing.assert_allclose(found.log_scale, pose.log_scale, atol=1e-9)
-    assert tracking._pose_by_hand({k: points[k] for k in (11, 3, 0)}, model) is None
-    assert tracking._pose_by_hand({}, model) is None
+    assert tracking._pose_by_hand(by_hand(11, 3, 0), model) is None
+    assert tracking._pose_by_hand(by_hand(), model) is None
 
 
 @pytest.mark.parametrize("step", [0.0, 5.0])
@@ -202,15 +209,13 @@ def test_landmarks_by_hand_that_give_no_pose_are_refused(shape, truths, step):
     # All at one place, or on one line: any turn about it would do.
     by_hand = {2: {name: np.array([step * k, 0.1, 3.0]) for k, name in enumerate(LANDMARKS[:5])}}
     with pytest.raises(tracking.InputError, match=r"frame 2 lie within .* of one line"):
-        detect_valve(volume(), oracle_model(shape, truths), TOLD, landmarks=by_hand)
+        detect_valve(volume(), oracle_model(shape, truths), landmarks=by_hand)
 
 
 def test_a_tip_by_hand_stays_while_the_others_are_smoothed(shape, truths):
     # Smoothing in time would take it back to what the trees saw before and after.
     by_hand = truths[1].tips[0] + np.array([3.0, 0, 0])
-    found = detect_valve(
-        volume(), oracle_model(shape, truths), TOLD, landmarks={1: {"tip_0": by_hand}}
-    )
+    found = detect_valve(volume(), oracle_model(shape, truths), landmarks={1: {"tip_0": by_hand}})
     np.testing.assert_allclose(found.tips[1, 0], by_hand, atol=1e-9)
     assert np.linalg.norm(found.tips[1, 1] - truths[1].tips[1]) < 0.5
 
@@ -218,10 +223,10 @@ def test_a_tip_by_hand_stays_while_the_others_are_smoothed(shape, truths):
 def test_frames_without_any_place_to_look_at_show_no_valve(shape, truths, monkeypatch):
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
     with pytest.raises(NoValveError, match="no valve found"):
-        detect_valve(volume(), oracle_model(shape, truths), TOLD)
+        detect_valve(volume(), oracle_model(shape, truths))
 
 
-def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths):
+def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths, unsmoothed):
     # The trees rate highest a valve that lies elsewhere; hands in every frame decide otherwise.
     elsewhere = [
         placed(shape, t.pose.moved(np.array([[25.0, 0, 0, 0.6, 0, 0, 0]])), np.zeros(4))
@@ -232,18 +237,15 @@ def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths):
     for name in ("position", "pose_coarse", "pose_fine", *STEPS):
         model.boosters[name] = astray.boosters[name]
     frames = [NumberedFrame(k) for k in range(4)]
-    lost = tracking._trajectory(frames, TIMES, model, UNSMOOTHED, {})
+    lost = tracking._trajectory(frames, TIMES, model, NO_HANDS)
     expected = np.concatenate([t.pose.centre for t in truths])
     assert np.linalg.norm(lost.centre - expected, axis=1).min() > 15.0
     points = [landmark_points(t, LAYOUT) for t in truths]
-    led = tracking._trajectory(
-        frames, TIMES, model, UNSMOOTHED, {k: dict(enumerate(p)) for k, p in enumerate(points)}
-    )
+    led = tracking._trajectory(frames, TIMES, model, np.stack(points))
     assert np.linalg.norm(led.centre - expected, axis=1).max() < 3.0
     by_hand = {k: dict(zip(LANDMARKS, points[k], strict=True)) for k in range(4)}
     found = detect_valve(
-        volume(), model, replace(UNSMOOTHED, min_confidence=0.0),
-        landmarks=by_hand,
+        volume(), model, min_confidence=0.0, landmarks=by_hand
     )  # fmt: skip
     np.testing.assert_allclose(found.tips, np.stack([t.tips for t in truths]), atol=1e-9)
     gap = np.linalg.norm(found.vertices - np.stack([t.vertices for t in truths]), axis=2)
@@ -271,9 +273,9 @@ def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_highe
         hypotheses(shape, [here, there], [0.9, 0.5]),
     ]
     times = np.array([0.0, 0.02, 0.04])
-    assert tracking._best_path(frames, times, model, TrackingSettings()) == [0, 0, 0]
+    assert tracking._best_path(frames, times, model) == [0, 0, 0]
     # Were there minutes in between, it could have moved.
-    assert tracking._best_path(frames, 1e3 * times, model, TrackingSettings()) == [0, 1, 0]
+    assert tracking._best_path(frames, 1e3 * times, model) == [0, 1, 0]
 
 
 def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, truths):
@@ -289,7 +291,7 @@ def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, tru
     model.boosters["position"] = position_oracle([*truths[:2], far, truths[3]])
     alone = search_poses(frames[2], model.boosters, 1)[0]
     assert np.linalg.norm(alone.centre - far.pose.centre) < 6
-    found = tracking._trajectory(frames, TIMES, model, UNSMOOTHED, {})
+    found = tracking._trajectory(frames, TIMES, model, NO_HANDS)
     expected = np.concatenate([t.pose.centre for t in truths])
     assert np.linalg.norm(found.centre - expected, axis=1).max() < 10.0
 
@@ -302,7 +304,7 @@ def test_one_frame_gone_wrong_does_not_drag_the_others_along(shape, truths):
     frames += [hypotheses(shape, [there], [0.9])]
     frames += [hypotheses(shape, [there, here], [0.1, 0.9]) for _ in range(2)]
     times = 0.02 * np.arange(5)
-    path = tracking._best_path(frames, times, model, TrackingSettings())
+    path = tracking._best_path(frames, times, model)
     assert path == [0, 0, 0, 1, 1]
 
 

@@ -12,7 +12,6 @@ from mvest.errors import InputError
 from mvest.imaging.detection.detect import fit_frame
 from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
-from tests.imaging.detection.made_up import FIT
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +58,7 @@ def test_a_valve_is_found_alike(trained, loaded, seen_valve):
     frame, true = seen_valve
     poses = [search_poses(frame, model.boosters, 2)[0] for model in (trained, loaded)]
     np.testing.assert_array_equal(poses[0].centre, poses[1].centre)
-    found = [fit_frame(frame, model, true.pose, FIT) for model in (trained, loaded)]
+    found = [fit_frame(frame, model, true.pose) for model in (trained, loaded)]
     np.testing.assert_allclose(found[0].vertices, found[1].vertices, atol=1e-2)
     np.testing.assert_allclose(found[0].tips, found[1].tips, atol=1e-2)
     assert np.isfinite(found[0].vertices).all()

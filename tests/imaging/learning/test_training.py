@@ -1,4 +1,4 @@
-"""Training: samples of all stages, and the same model however many processes made it."""
+"""Training: samples of all stages, and volumes that are made worse."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,28 +6,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mvest.imaging.detection.frame import features
-from mvest.imaging.detection.pose_search import WIDE, search_poses
+from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning import training
-from mvest.imaging.learning.training import (
-    draw_samples,
-    taken_for_valves,
-    train_model,
-    train_stage,
-    volume_samples,
-)
-from tests.imaging.detection.made_up import moving_valve
+from mvest.imaging.learning.training import degrade, draw_samples, train_stage, volume_samples
+from mvest.imaging.volume import VolumeSequence
+from tests.imaging.detection.made_up import labelled, moving_valve
 
 
 def test_every_stage_gets_samples_that_its_trees_can_learn_from(
     trained, shape, seen_valve, settings
 ):
-    found = draw_samples(*seen_valve, shape, settings.samples, np.random.default_rng(0))
+    frame, true = seen_valve
+    found = draw_samples(labelled(true, shape, frame=frame), settings.samples)
     assert set(found) == set(STAGES)
     for name, (x, y) in found.items():
         assert len(x) == len(y) > 10, name
-        assert x.dtype == y.dtype == np.float32
         assert np.isfinite(x).all(), name
         assert np.isfinite(y).all(), name
         # Trees and samples agree on features and outputs.
@@ -36,7 +30,8 @@ def test_every_stage_gets_samples_that_its_trees_can_learn_from(
 
 
 def test_the_boundary_is_a_probability(trained, shape, seen_valve, settings):
-    x = draw_samples(*seen_valve, shape, settings.samples, np.random.default_rng(1))["boundary"][0]
+    frame, true = seen_valve
+    x = draw_samples(labelled(true, shape, 1, frame), settings.samples)["boundary"][0]
     found = trained.boosters["boundary"](x * 3)
     assert found.min() >= 0
     assert found.max() <= 1
@@ -45,7 +40,8 @@ def test_the_boundary_is_a_probability(trained, shape, seen_valve, settings):
 
 def test_a_stage_learns_from_its_samples(shape, seen_valve, settings):
     # More of it than its mean: on the samples themselves, with enough trees.
-    found = draw_samples(*seen_valve, shape, settings.samples, np.random.default_rng(0))
+    frame, true = seen_valve
+    found = draw_samples(labelled(true, shape, frame=frame), settings.samples)
     more = replace(settings, boosting=replace(settings.boosting, trees=60))
     for name in ("position", "pose_refine_0", "annulus"):
         x, y = found[name]
@@ -71,84 +67,72 @@ def rendered(monkeypatch, seen_valve):
     return calls
 
 
-def learned(valves, settings, seed, given=None, **others):
-    """A model from samples that are made one after another."""
-
-    def sampled(numbers, shape, make_draft):
-        draft = make_draft() if make_draft else None
-        if given is not None:
-            given.extend((number, draft is not None) for number in numbers)
-        return [
-            volume_samples(valves[k % len(valves)], k, shape, settings, seed, draft)
-            for k in numbers
-        ]
-
-    return train_model(valves, settings, seed, sampled=sampled, **others)
-
-
-def test_a_model_is_trained_from_valves_in_turn(rendered, settings):
-    valves, done = [moving_valve(k) for k in range(5)], []
-    model = learned(
-        valves,
-        replace(settings, volumes=6),
-        11,
-        trained_on={"why": "a test"},
-        progress=lambda: done.append(1),
+def test_a_drafts_mistakes_are_its_best_and_some_others(trained, shape, seen_valve, settings):
+    (frame, true), draft, count = seen_valve, trained.boosters, settings.samples.mistaken
+    without, found = (
+        draw_samples(labelled(true, shape, frame=frame), settings.samples, trees)["pose_fine"]
+        for trees in (None, draft)
     )
-    assert set(model.boosters) == set(STAGES)
-    assert model.trained_on == {"why": "a test"}
-    assert model.accuracy is None
-    assert [name for name, *_ in rendered] == [f"made up {k}" for k in (0, 1, 2, 3, 4, 0)]
-    # Every volume has a seed of its own, and not all are of the same frame.
-    assert len({(entropy, key) for *_, entropy, key in rendered}) == 6
-    assert len({which for _, which, *_ in rendered}) > 1
-    assert len(done) == len(STAGES)
+    assert len(found[0]) == len(without[0]) + count
+    rated = draft["pose_fine"](found[0][-count:])[:, 0]
+    _, ratings = search_poses(frame, draft, count // 2)
+    np.testing.assert_allclose(rated[: count // 2], ratings)
+    assert len(np.unique(rated.round(9))) > 2
 
 
-def test_a_draft_of_the_first_volumes_is_searched_with_in_the_others(
-    rendered, settings, monkeypatch
-):
-    # Mistakes of nothing, or of a search that saw the very volume, would be easy ones.
-    given, stages = [], []
-    stage = training.train_stage
-
-    def one_tree(name, x, y, settings, seed):
-        stages.append((name, len(x)))
-        return stage(name, x, y, settings, seed)
-
-    monkeypatch.setattr(training, "train_stage", one_tree)
-    told = replace(settings, volumes=3, draft_volumes=1)
-    learned([moving_valve(k) for k in range(5)], told, 11, given)
-    assert given == [(0, False), (1, True), (2, True)]
-    assert {name for name, _ in stages[: -len(STAGES)]} == {
-        name for name in STAGES if name.startswith("po")
-    }
-    rows = dict(stages[-len(STAGES) :])
-    once = dict(stages[: -len(STAGES)])
-    assert rows["pose_coarse"] == 3 * once["pose_coarse"]
-    assert rows["pose_fine"] == 3 * once["pose_fine"] + 2 * settings.samples.mistaken
+def test_a_volume_has_samples_of_its_own_seed(rendered, shape, settings):
+    valve = moving_valve(3)
+    samples = [
+        volume_samples(valve, k, shape, settings, seed) for k, seed in ((0, 3), (0, 3), (1, 3))
+    ]
+    volume_samples(valve, 0, shape, settings, 4)
+    assert set(samples[0]) == {f"{name}.{axis}" for name in STAGES for axis in "xy"}
+    assert all(array.dtype == np.float32 for array in samples[0].values())
+    first, again, other = (each["position.x"] for each in samples)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    # Every volume is rendered by a stream of its own, whatever the number of volumes.
+    streams = [(entropy, key) for *_, entropy, key in rendered]
+    assert streams[0] == streams[1]
+    assert len(set(streams)) == 3
 
 
-def test_a_drafts_mistakes_are_its_best_and_some_others(trained, seen_valve):
-    frame, draft = seen_valve[0], trained.boosters
-    found = taken_for_valves(frame, draft, 10, np.random.default_rng(0))
-    assert len(found) == 10
-    best, ratings = search_poses(frame, draft, 5)
-    np.testing.assert_allclose(found.centre[:5], best.centre)
-    rated = draft["pose_fine"](features(frame, WIDE, found.centre, found.axes))
-    assert rated.max() == pytest.approx(ratings[0])
-    assert len(np.unique(found.centre.round(9), axis=0)) > 5
+# -- degraded volumes -----------------------------------------------------------------------------
+def volume() -> VolumeSequence:
+    frames = np.zeros((2, 20, 22, 24), np.uint8)
+    frames[:, 5:] = 100
+    frames[:, 12] = 220  # a bright sheet
+    return VolumeSequence(
+        frames, np.full(3, 0.8), np.eye(3), np.zeros(3), np.array([0.0, 0.1]), source="made up"
+    )
 
 
-def test_training_depends_on_its_seed_alone(rendered, settings):
-    valves = [moving_valve(k) for k in range(5)]
-    models = [learned(valves, settings, 3) for _ in range(2)]
-    texts = [{name: b.texts for name, b in m.boosters.items()} for m in models]
-    assert texts[0] == texts[1]
-    # Volume 0 has the same seed among two as among more, and another one with another seed.
-    once = rendered[: settings.volumes]
-    shape = models[0].shape
-    for number, seed in ((0, 3), (0, 4)):
-        training.volume_samples(valves[0], number, shape, settings, seed)
-    assert rendered[-2] == once[0]
-    assert rendered[-1] != once[0]
+def test_about_half_are_changed_and_the_others_are_as_they_were():
+    given = volume()
+    changed = [degrade(given, np.random.default_rng(k)) is not given for k in range(100)]
+    assert 35 < sum(changed) < 65
+
+
+def test_what_lies_outside_stays_outside_and_grey_values_stay_in_their_range():
+    # Noise outside would enlarge the field of view.
+    for seed in range(30):
+        found = degrade(volume(), np.random.default_rng(seed)).frames
+        assert found.dtype == np.uint8
+        assert not found[:, :5].any()
+
+
+def test_every_kind_of_change_occurs():
+    sheets, noises, cuts = [], [], []
+    for seed in range(60):
+        found = degrade(volume(), np.random.default_rng(seed)).frames.astype(float)
+        sheets.append(found[:, 12].mean() - found[:, 7].mean())
+        noises.append(found[:, 16:].std())
+        cuts.append(found[:, 6].mean())
+    assert min(sheets) < 80  # blurred: 120 as it was
+    assert max(noises) > 10
+    assert min(cuts) < 60
+
+
+def test_the_same_generator_gives_the_same_volume():
+    first, second = (degrade(volume(), np.random.default_rng(3)).frames for _ in range(2))
+    np.testing.assert_array_equal(first, second)

@@ -1,4 +1,4 @@
-"""Quality control of a valve from images: its outlines drawn on slices of the volume.
+"""Pictures of a valve found in images: its outlines on slices of the volume, and its measures.
 
 The slices lie in the planes in which a mitral valve is looked at. All positions are LPS mm. A plane
 has its own coordinates: mm to the right and up from its origin.
@@ -6,22 +6,36 @@ has its own coordinates: mm to the right and up from its origin.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import map_coordinates
 
+from mvest.cases.from_images.detected import DetectedValve, called, image_step, write_detected
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence, landmarks
 from mvest.imaging.volume import VolumeSequence
-from mvest.reporting.figures import BAD, LEAFLET_COLOURS, SMALL, headline
-from mvest.typing import BoolArray, FloatArray
+from mvest.reporting.case.tables import unit_of_measure
+from mvest.reporting.figures import (
+    BAD,
+    COLOURS,
+    GREY,
+    LEAFLET_COLOURS,
+    MARKERS,
+    SMALL,
+    headline,
+    panels,
+    save_figure_with,
+)
+from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.measure.annulus import annulus_plane, unit_vector
 
@@ -45,16 +59,82 @@ REACH_MM = 3.0
 SCALE_MM = 10.0
 MARGIN_MM = 7.0
 ROW_INCHES = 2.35
-OUTSIDE = "#3a3f4a"
 DOTS: Mapping[str, Mapping[str, Any]] = {
     "annulus, within 3 mm": {"marker": "o", "ms": 2.4, "mfc": "white", "mew": 0.4},
     "papillary tip, within 3 mm": {"marker": "^", "ms": 7, "mfc": "#F0E442", "mew": 0.8},
+}
+
+OVER_TIME = {
+    "Annulus area": {"annulus_area_mm2": "projected", "annulus_area_3d_mm2": "in space"},
+    "Annulus diameters": {
+        "ap_diameter_mm": "anteroposterior",
+        "commissural_diameter_mm": "commissural",
+    },
+    "Annulus height": {"annulus_height_mm": "height"},
+    "Closed leaflets": {
+        "tenting_height_mm": "tenting height",
+        "billow_height_mm": "billow height",
+    },
+    "Orifice": {"orifice_mm2": "seen from the atrium"},
+    "Coaptation": {"coaptation_length_mm": "length in the middle"},
+    "Leaflet areas": {"anterior_area_mm2": "anterior", "posterior_area_mm2": "posterior"},
+    "Papillary tips": {"tip_separation_mm": "between the tips", "tip_depth_mm": "mean depth"},
+}
+"""Title of a panel -> the measures in it, and what readers call them."""
+
+CAPTIONS = {
+    "montage": "The valve as it was detected, drawn on the volume.",
+    "measures_over_time": (
+        "Measures of the valve over time. Hollow: frames of low confidence. Bands: where 95 % of "
+        "true values are expected, from the detectors' errors on simulated valves."
+    ),
 }
 
 Extent = tuple[float, float, float, float]
 """Left, right, bottom and top in a plane, mm."""
 
 
+# -- what the image step leaves in a folder -------------------------------------------------------
+def write_image_step(
+    detected: DetectedValve, folder: Path
+) -> dict[str, tuple[Mapping[str, Any], ...]]:
+    """Draw and write a detected valve; returns what its record says of the images.
+
+    Parameters
+    ----------
+    detected : DetectedValve
+    folder : Path
+        Existing folder.
+
+    Returns
+    -------
+    dict
+        As `mvest.cases.from_images.detected.image_step` has it.
+    """
+    files = write_detected(detected, folder)
+    volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
+    name, low = detected.case.name, detected.settings.min_confidence
+    drawn = {
+        "montage": montage_figure(volume, valve, title=name, closed=closed, low_confidence=low),
+        "measures_over_time": measures_figure(detected.rows, title=name, low_confidence=low),
+    }
+    for key, figure in drawn.items():
+        save_figure_with(folder / key, figure, called(volume))
+    pictures = [{"file": f"{key}.png", "caption": CAPTIONS[key]} for key in drawn]
+    return image_step(detected, files, pictures)
+
+
+def draw_candidate(
+    volume: VolumeSequence, candidate: ValveSequence, low_confidence: float, folder: Path
+) -> Path:
+    """Draw a candidate that was not accepted, marked as such; returns the picture."""
+    folder.mkdir(parents=True, exist_ok=True)
+    title = f"NO VALVE FOUND; best candidate, not accepted: {called(volume)}"
+    figure = montage_figure(volume, candidate, title=title, low_confidence=low_confidence)
+    return save_figure_with(folder / "candidate", figure, called(volume))[0]
+
+
+# -- the valve on slices of the volume ------------------------------------------------------------
 @dataclass(frozen=True, slots=True, eq=False)
 class SlicePlane:
     """A plane with its own axes.
@@ -169,7 +249,6 @@ def montage_figure(
     title: str,
     closed: int | None = None,
     low_confidence: float = MIN_CONFIDENCE,
-    accepted: bool = True,
 ) -> Figure:
     """Frames in rows, the planes of `valve_planes` in columns, with what the valve cuts drawn on.
 
@@ -185,9 +264,7 @@ def montage_figure(
     closed : int, optional
         A frame that must be among those shown.
     low_confidence : float
-        Frames below this are marked in words.
-    accepted : bool
-        False for the best candidate of a volume in which no valve was found: the head says so.
+        Frames below this are marked in words and by a dashed frame.
 
     Raises
     ------
@@ -213,8 +290,7 @@ def montage_figure(
         for name, plane in named.items()
     }
     # Grey values drawn black and white: all but the darkest and brightest 0.5 %.
-    seen = [image[np.isfinite(image)] for image in slices.values()]
-    values = np.concatenate([np.zeros(0), *seen])
+    values = np.concatenate([[], *(image[np.isfinite(image)] for image in slices.values())])
     window = np.quantile(values, [0.005, 0.995]) if len(values) else (0.0, 1.0)
     widths = [right - left for left, right, _, _ in extents.values()]
     tallest = max(top - bottom for _, _, bottom, top in extents.values())
@@ -228,10 +304,14 @@ def montage_figure(
         words += "\nLOW CONFIDENCE" if low[frame] else ""
         row[0].set_ylabel(words, fontsize=SMALL)
         for axes, name in zip(row, COLUMNS, strict=True):
-            _bare(axes, extents[name], marked=bool(low[frame]))
+            extent = extents[name]
+            axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[], facecolor="#3a3f4a")
+            axes.set(aspect="equal", anchor="N")
+            if low[frame]:
+                axes.spines[:].set(color=BAD, linewidth=2.2, linestyle="--")
             if frame in planes:
                 axes.imshow(
-                    slices[frame, name], "gray", origin="lower", extent=extents[name],
+                    slices[frame, name], "gray", origin="lower", extent=extent,
                     vmin=window[0], vmax=window[1], interpolation="nearest",
                 )  # fmt: skip
                 _draw_valve(axes, valve, frame, planes[frame][name])
@@ -240,21 +320,15 @@ def montage_figure(
     for axes, (name, how) in zip(grid[0], COLUMNS.items(), strict=True):
         axes.set_title(f"{name}\n({how})", fontsize=9)
         _scale_bar(axes, extents[name])
-    if not accepted:
-        title = f"NO VALVE FOUND; best candidate, not accepted: {title}"
-    headline(figure, title, _note(low, low_confidence))
+    note = f"All {count} frames have a confidence of {low_confidence:g} or more."
+    if low.any():
+        named = ", ".join(map(str, np.flatnonzero(low)))
+        note = f"Confidence below {low_confidence:g} in {low.sum()} of {count} frames: {named}."
+    headline(figure, title, note)
     if planes:
         keys = grid[frames.index(min(planes)), 0].get_legend_handles_labels()
         figure.legend(*keys, loc="outside lower center", ncols=4, fontsize=SMALL, frameon=False)
     return figure
-
-
-def _note(low: BoolArray, low_confidence: float) -> str:
-    """Which of all frames are not trusted, shown or not."""
-    if not low.any():
-        return f"All {len(low)} frames have a confidence of {low_confidence:g} or more."
-    named = ", ".join(map(str, np.flatnonzero(low)[:12])) + (", ..." if low.sum() > 12 else "")
-    return f"Confidence below {low_confidence:g} in {low.sum()} of {len(low)} frames: {named}."
 
 
 def _extent(
@@ -271,19 +345,11 @@ def _extent(
     return float(left), float(right), float(bottom), float(top)
 
 
-def _bare(axes: Any, extent: Extent, *, marked: bool) -> None:
-    """A panel without ticks; with a dashed frame where its frame is not trusted."""
-    axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[], facecolor=OUTSIDE)
-    axes.set(aspect="equal", anchor="N")
-    if marked:
-        for spine in axes.spines.values():
-            spine.set(color=BAD, linewidth=2.2, linestyle="--")
-
-
 def _draw_valve(axes: Any, valve: ValveSequence, frame: int, plane: SlicePlane) -> None:
     contours = leaflet_contours(valve, frame, plane)
-    names = valve.layout.region_names
-    for name, colour, segments in zip(names, LEAFLET_COLOURS[: len(names)], contours, strict=True):
+    for name, colour, segments in zip(
+        valve.layout.region_names, LEAFLET_COLOURS, contours, strict=False
+    ):
         lines = LineCollection(list(segments), colors=colour, linewidths=1.3)
         lines.set_label(f"{name} leaflet")
         axes.add_collection(lines)
@@ -297,12 +363,65 @@ def _draw_valve(axes: Any, valve: ValveSequence, frame: int, plane: SlicePlane) 
 
 def _scale_bar(axes: Any, extent: Extent) -> None:
     left, bottom = extent[0] + 2.0, extent[2] + 2.5
-    edge = [withStroke(linewidth=4, foreground="black")]
     axes.plot(
         [left, left + SCALE_MM], [bottom, bottom], color="white", lw=2.2, label="_scale",
-        path_effects=edge, solid_capstyle="butt",
+        path_effects=[withStroke(linewidth=4, foreground="black")], solid_capstyle="butt",
     )  # fmt: skip
     axes.text(
         left + 0.5 * SCALE_MM, bottom + 1.0, f"{SCALE_MM:.0f} mm", color="white", fontsize=7.5,
         ha="center", va="bottom", path_effects=[withStroke(linewidth=2, foreground="black")],
     )  # fmt: skip
+
+
+# -- measures over time ---------------------------------------------------------------------------
+def measures_figure(
+    rows: Sequence[Mapping[str, Any]], *, title: str, low_confidence: float
+) -> Figure:
+    """Measures of a valve over time.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        From `mvest.cases.from_images.measures.measure_sequence`: for each frame ``time_s``,
+        ``confidence`` and the measures; None leaves a gap. Of those that have bounds
+        (`mvest.cases.from_images.detector_errors.with_bands`) the band is drawn, too.
+    title : str
+    low_confidence : float
+        Frames below this are drawn hollow.
+    """
+    table = pd.DataFrame(list(rows))
+    time, sure = 1e3 * table["time_s"], table["confidence"] >= low_confidence
+    figure, grid = panels(4, 2, 9.6, sharex=True)
+    for axes, (heading, curves) in zip(grid.flat, OVER_TIME.items(), strict=True):
+        axes.set_title(heading, fontsize=SMALL + 0.5, loc="left")
+        axes.set_ylabel(unit_of_measure(next(iter(curves))))
+        bounds = [f"{name}_{end}" for name in curves for end in ("low", "high")]
+        shown = table.reindex(columns=[*curves, *bounds]).astype(float)
+        for k, (name, words) in enumerate(curves.items()):
+            colour = COLOURS[k]
+            axes.plot(time, shown[name], color=colour, lw=1.2, label=words)
+            if f"{name}_low" in table:
+                band = shown[f"{name}_low"], shown[f"{name}_high"]
+                axes.fill_between(time, *band, color=colour, alpha=0.16, lw=0)
+            for which, face in ((sure, colour), (~sure, "white")):
+                style = {"marker": MARKERS[k], "ms": 4.2, "mec": colour, "mfc": face}
+                axes.plot(time[which], shown[name][which], ls="none", **style)
+        if len(curves) > 1:
+            axes.legend(fontsize=SMALL - 0.5, frameon=False, handlelength=1.4)
+        if shown.isna().all(axis=None):
+            axes.text(
+                0.5, 0.5, "not measured in any frame", transform=axes.transAxes, ha="center",
+                fontsize=SMALL, color=GREY,
+            )  # fmt: skip
+            continue
+        # Limits that neither magnify noise nor let the legend cover a curve.
+        low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+        span, middle = max(high - low, 0.1 * max(abs(high), abs(low)), 0.5), 0.5 * (high + low)
+        axes.set_ylim(middle - 0.6 * span, middle + 0.95 * span)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [ms]")
+    note = f"Hollow: confidence below {low_confidence:g} ({(~sure).sum()} of {len(sure)} frames). "
+    banded = table.columns.str.endswith("_low").any()
+    note += "Gaps: the shape defies the measure" + (". Bands: 95 %." if banded else ".")
+    headline(figure, title, note)
+    return figure

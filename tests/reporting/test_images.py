@@ -1,4 +1,4 @@
-"""Slices with the valve drawn on: where the planes lie, and what is drawn where."""
+"""Pictures of a valve in images: where planes lie, what is drawn where, gaps and limits."""
 
 import dataclasses
 
@@ -8,12 +8,13 @@ from matplotlib.collections import LineCollection
 
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.reporting.images.montage import (
+from mvest.reporting.images import (
     ALONG,
     COLUMNS,
     STEP_MM,
     chosen_frames,
     leaflet_contours,
+    measures_figure,
     montage_figure,
     resample,
     valve_planes,
@@ -190,3 +191,65 @@ def test_a_valve_at_other_times_is_refused(valve, volume):
     other = dataclasses.replace(valve, times=np.array([0.0, 0.05]))
     with pytest.raises(InputError, match="same times"):
         montage_figure(volume, other, title="made up")
+
+
+# -- measures over time ---------------------------------------------------------------------------
+def measures(t, **changes):
+    row = {
+        "frame": t, "time_s": 0.05 * t, "confidence": 0.9,
+        "annulus_area_mm2": 800.0 + t, "annulus_area_3d_mm2": 830.0 + t, "ap_diameter_mm": 28.0,
+        "commissural_diameter_mm": 36.0, "annulus_height_mm": 6.0, "tenting_height_mm": 5.0,
+        "billow_height_mm": 0.0, "orifice_mm2": 10.0 * t, "coaptation_length_mm": 4.0,
+        "anterior_area_mm2": 600.0, "posterior_area_mm2": 650.0, "tip_separation_mm": 32.0,
+        "tip_depth_mm": 24.0,
+    }  # fmt: skip
+    return row | changes
+
+
+def titled(figure, title):
+    return next(axes for axes in figure.axes if axes.get_title(loc="left") == title)
+
+
+def test_measures_over_time_have_gaps_and_hollow_frames():
+    rows = [
+        measures(0),
+        measures(1, tenting_height_mm=None, confidence=0.2),
+        measures(2, coaptation_length_mm=None),
+    ]
+    rows = [row | {"coaptation_length_mm": None} for row in rows]
+    figure = measures_figure(rows, title="made up", low_confidence=0.7)
+    assert len(figure.axes) == 8
+    area = titled(figure, "Annulus area")
+    curves = {line.get_label(): line for line in area.lines}
+    np.testing.assert_allclose(curves["projected"].get_xdata(), [0, 50, 100])
+    np.testing.assert_allclose(curves["projected"].get_ydata(), [800, 801, 802])
+    np.testing.assert_allclose(curves["in space"].get_ydata(), [830, 831, 832])
+    hollow = [line for line in area.lines if line.get_markerfacecolor() == "white"]
+    assert [list(line.get_xdata()) for line in hollow] == [[50.0], [50.0]]
+    tenting = next(
+        line for line in titled(figure, "Closed leaflets").lines
+        if line.get_label() == "tenting height"
+    )  # fmt: skip
+    assert np.isnan(tenting.get_ydata()).tolist() == [False, True, False]
+    nothing = titled(figure, "Coaptation")
+    assert [text.get_text() for text in nothing.texts] == ["not measured in any frame"]
+    assert any("1 of 3 frames" in text.get_text() for text in figure.texts)
+
+
+def test_bands_are_drawn_where_measures_have_bounds():
+    bounds = {"ap_diameter_mm_low": 20.0, "ap_diameter_mm_high": 31.0}
+    rows = [measures(0) | bounds, measures(1) | dict.fromkeys(bounds), measures(2) | bounds]
+    rows.append(measures(3) | bounds)
+    figure = measures_figure(rows, title="made up", low_confidence=0.7)
+    diameters = titled(figure, "Annulus diameters")
+    (band,) = diameters.collections
+    corners = np.concatenate([path.vertices for path in band.get_paths()])
+    assert (corners[:, 1].min(), corners[:, 1].max()) == (20.0, 31.0)
+    assert 50.0 not in corners[:, 0]
+    low, high = diameters.get_ylim()
+    assert low < 20.0
+    assert high > 36.0
+    assert not titled(figure, "Annulus area").collections
+    assert any("Bands: 95 %" in text.get_text() for text in figure.texts)
+    plain = measures_figure([measures(0)], title="made up", low_confidence=0.7)
+    assert not any("Bands" in text.get_text() for text in plain.texts)
