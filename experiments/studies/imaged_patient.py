@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mvest.personalisation.error_budget import EVERYTHING
 from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
@@ -284,15 +283,15 @@ def _segmented(
 def summary(results: Results) -> dict[str, Table]:
     """Moduli beside the truth, what they are worth, and what costs them how much."""
     estimates = _estimates(results)
-    budgets = _budgets(estimates)
+    shares = _shares(estimates)
     tables = {
         "": _moduli_table(estimates),
         "skill": _skill(estimates),
         "bias": _bias(estimates),
         "verdicts": verdict_table(estimates),
         "chordae": _chordae(results),
-        "budget": _medians(budgets),
-        "budget_of_patients": table(budgets),
+        "shares": _medians(shares),
+        "shares_of_patients": table(shares),
     }
     return {name: one for name, one in tables.items() if len(one)}
 
@@ -423,28 +422,24 @@ def _chordae(results: Results) -> Table:
     return table(rows.reset_index(), **about)
 
 
-def _budgets(estimates: Sequence[EstimateRecord]) -> list[dict[str, Any]]:
-    """SD of each modulus' logarithm in each patient, to first order.
-
-    ``without`` a part: it is known exactly and all else as it is; ``alone``: all else is known
-    exactly (everything alone: nothing but the noise of single points).
-    """
+def _shares(estimates: Sequence[EstimateRecord]) -> list[dict[str, Any]]:
+    """Where the variance of each modulus' logarithm comes from in each patient, to first order."""
     return [
         {"patient": estimate.case, **row}
         for estimate in estimates
-        for row in estimate.detail_rows("budget")
+        for row in estimate.detail_rows("shares")
     ]
 
 
-def _medians(budgets: Sequence[Mapping[str, Any]]) -> Table:
+def _medians(shares: Sequence[Mapping[str, Any]]) -> Table:
     """Medians over patients."""
     import pandas as pd
 
-    if not budgets:
+    if not shares:
         return table([])
-    parts = pd.DataFrame(budgets).groupby(["part", "modulus"], sort=False)
-    medians = parts[["without", "alone"]].median().reset_index()
-    return table(medians, part="", modulus="", without=":.3f", alone=":.3f")
+    sources = pd.DataFrame(shares).groupby(["source", "parameter"], sort=False)
+    medians = sources[["share"]].median().reset_index()
+    return table(medians, source="", parameter="::modulus", share=":.3f")
 
 
 # -- figure ---------------------------------------------------------------------------------------
@@ -460,7 +455,7 @@ def keep(record: Record) -> Record:
     """What tables and figures need of a record."""
     kept = []
     for estimate in record.estimates:
-        short = estimate.without_details("budget")
+        short = estimate.without_details("shares")
         better = {
             name: other.model_copy(update={"unknowns": other.moduli})
             for name, other in short.alternatives.items()

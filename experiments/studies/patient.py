@@ -29,6 +29,7 @@ from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
+from mvest.cases.folder import read_case
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
 from mvest.problem.skill import GENERIC, prior_alone, score

@@ -16,7 +16,7 @@ from experiments.studies.case import STUDY, Settings
 from mvest.cases.case import ErrorSamples
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.personalisation import Treatment, default_settings
+from mvest.personalisation import Treatment, check, default_settings
 from mvest.problem.verdict import ONE_STATE
 from tests.experiments.configured import composed, plain
 from tests.made_up_closure import made_up_case, use

@@ -24,7 +24,6 @@ from experiments.studies.imaged_patient import (
 )
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
 from mvest.errors import InputError
-from mvest.personalisation.error_budget import EVERYTHING, IMAGES
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, Verdict
 from mvest.reporting.tables import table
@@ -230,31 +229,26 @@ def test_lengths_of_chordae_are_of_all_patients_that_have_them():
     assert row["SD of patients"] == pytest.approx(0.02828, abs=1e-5)
 
 
-def budget(scale: float) -> dict[str, Any]:
+def shares(scale: float) -> dict[str, Any]:
     return {
-        "budget": tuple(
-            {"part": part, "modulus": name, "without": scale * without, "alone": scale * alone}
+        "shares": tuple(
+            {"source": source, "parameter": name, "share": share}
             for name in ("E_f.anterior", "E_f.posterior")
-            for part, without, alone in (
-                (EVERYTHING, 0.2, 0.05),
-                (IMAGES, 0.1, 0.15),
-                ("pressure", 0.17, 0.1),
-            )
+            for source, share in (("images", 1.0 - 0.2 * scale), ("pressure", 0.2 * scale))
         )
     }
 
 
-def test_what_errors_cost_is_a_median_over_patients():
+def test_where_the_variance_comes_from_is_a_median_over_patients():
     records = [
-        record(f"p{k}", MODULI, (5.0, 2.0), (5.0, 2.0), details=budget(scale))
+        record(f"p{k}", MODULI, (5.0, 2.0), (5.0, 2.0), details=shares(scale))
         for k, scale in enumerate((1.0, 2.0, 1.1))
     ]
     records.append(FIRST)
-    found = {(row["part"], row["modulus"]): row for row in rows(records, "budget")}
-    pressure = found["pressure", "E_f.posterior"]
-    assert (pressure["without"], pressure["alone"]) == pytest.approx((0.187, 0.11))
-    assert len(rows(records, "budget_of_patients")) == 3 * 6
-    assert "budget" not in summary(Results({"one": FIRST}))
+    found = {(row["source"], row["parameter"]): row for row in rows(records, "shares")}
+    assert found["pressure", "E_f.posterior"]["share"] == pytest.approx(0.22)
+    assert len(rows(records, "shares_of_patients")) == 3 * 4
+    assert "shares" not in summary(Results({"one": FIRST}))
     assert set(figure(Results({"one": FIRST}))) == {"moduli"}
 
 
@@ -266,6 +260,6 @@ def test_the_table_is_that_of_all_patients(tmp_path):
     assert kept is not None
     assert list(kept.records) == ["volumes-one", "volumes-two"]
     assert (tmp_path / "volume.csv").read_text().count("E_f.anterior") == 2
-    full = record("one", MODULI, (5.0, 2.0), (5.0, 2.0), details=budget(1.0), correlation=((1.0,),))
+    full = record("one", MODULI, (5.0, 2.0), (5.0, 2.0), details=shares(1.0), correlation=((1.0,),))
     for name, own in summary(Results({"one": full})).items():
         assert summary(Results({"one": keep(full)}))[name].csv() == own.csv()
