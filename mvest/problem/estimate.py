@@ -22,22 +22,6 @@ from mvest.problem.synthetic import Truth
 from mvest.typing import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class Modulus:
-    """One elastic modulus of one region; MPa, and the error as a signed part of the truth."""
-
-    region: str
-    name: str
-    estimate: float
-    std: float
-    truth: float | None = None
-
-    @property
-    def relative_error(self) -> float | None:
-        """(estimate - truth) / truth."""
-        return None if self.truth is None else (self.estimate - self.truth) / self.truth
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyResult:
     """An estimate from an observation, or the reason why there is none.
@@ -134,31 +118,6 @@ class StudyResult:
         if self.fitted is None or self.truth is None:
             return None
         return np.linalg.norm(self.fitted[-1] - self.truth.positions[-1], axis=1)
-
-    @property
-    def moduli(self) -> tuple[Modulus, ...]:
-        """All moduli that follow from the estimated E_f through the fixed ratios of the tissue."""
-        if self.estimate is None or self.std is None:
-            return ()
-        truth = None if self.truth is None else self.truth.values
-        moduli = []
-        for k, parameter in enumerate(self.parameters):
-            kind, _, region = parameter.partition(".")
-            if kind != "E_f" or region not in self.tissue:
-                continue
-            unit = self.tissue[region].material(1.0)
-            for name, factor in (("E_f", 1.0), ("E_perp", unit.E_p), ("G", unit.G)):
-                true = None if truth is None else factor * float(truth[k])
-                moduli.append(
-                    Modulus(
-                        region,
-                        name,
-                        factor * float(self.estimate[k]),
-                        factor * float(self.std[k]),
-                        true,
-                    )
-                )
-        return tuple(moduli)
 
 
 def estimate(

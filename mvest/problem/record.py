@@ -449,26 +449,17 @@ def _unknowns(result: StudyResult) -> tuple[Unknown, ...]:
 
 def derived_moduli(result: StudyResult, unknowns: Sequence[Unknown]) -> list[Unknown]:
     """The moduli that follow from the estimated ones through the fixed ratios of the tissue."""
-    by_name = {unknown.name: unknown for unknown in unknowns}
     rows = []
-    for modulus in result.moduli:
-        own = by_name[f"E_f.{modulus.region}"]
-        if modulus.name == "E_f" or not own.estimate:
+    for own in unknowns:
+        if not (own.is_modulus and own.region in result.tissue and own.estimate):
             continue
-        share = modulus.estimate / own.estimate
-        rows.append(
-            Unknown(
-                name=f"{modulus.name}.{modulus.region}",
-                unit=own.unit,
-                kind="derived",
-                treatment=own.treatment,
-                estimate=modulus.estimate,
-                std=modulus.std,
-                low=None if own.low is None else share * own.low,
-                high=None if own.high is None else share * own.high,
-                truth=modulus.truth,
-            )
-        )
+        unit = result.tissue[own.region].material(1.0)
+        for name, share in (("E_perp", unit.E_p), ("G", unit.G)):
+            values = {key: getattr(own, key) for key in ("estimate", "std", "low", "high", "truth")}
+            scaled = {key: v if v is None else share * v for key, v in values.items()}
+            about = {"name": f"{name}.{own.region}", "kind": "derived"}
+            nothing = dict.fromkeys(("prior_mean", "prior_std", "bound"))
+            rows.append(own.model_copy(update=about | scaled | nothing))
     return rows
 
 

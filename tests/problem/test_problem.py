@@ -14,6 +14,7 @@ from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteN
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Problem
+from mvest.problem.record import record_of
 from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth, TwinData, simulate_observation
 
@@ -79,20 +80,23 @@ def test_all_six_moduli_follow_through_the_fixed_ratios() -> None:
     data = observe(noise_mm=0.05)
     assert data.observation is not None
     result = estimate(case(), data.observation).against(data.truth)
-    truths = [(m.region, m.name, round(m.truth or 0, 2)) for m in result.moduli]
-    assert truths == [
-        ("anterior", "E_f", 6.23),
-        ("anterior", "E_perp", 2.35),
-        ("anterior", "G", 2.09),
-        ("posterior", "E_f", 2.09),
-        ("posterior", "E_perp", 1.89),
-        ("posterior", "G", 0.70),
-    ]
+    unknowns = record_of(result).unknowns
+    assert {one.name: round(one.truth or 0, 2) for one in unknowns} == {
+        "E_f.anterior": 6.23,
+        "E_perp.anterior": 2.35,
+        "G.anterior": 2.09,
+        "E_f.posterior": 2.09,
+        "E_perp.posterior": 1.89,
+        "G.posterior": 0.70,
+    }
+    own = {one.name: one for one in unknowns}
     assert result.relative_error is not None
-    for k, error in enumerate(np.repeat(result.relative_error, 3)):
-        assert result.moduli[k].relative_error == pytest.approx(error, rel=1e-12)
+    for region, error in zip(("anterior", "posterior"), result.relative_error, strict=True):
         assert abs(error) > 1e-5
-    assert result.moduli[1].std == pytest.approx(result.moduli[0].std * 2.35 / 6.23)
+        for name in ("E_f", "E_perp", "G"):
+            assert own[f"{name}.{region}"].relative_error == pytest.approx(error, rel=1e-12)
+    fibre, across = own["E_f.anterior"], own["E_perp.anterior"]
+    assert across.std == pytest.approx(fibre.std * 2.35 / 6.23)
 
 
 def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
