@@ -12,8 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
+from mvest.closure.model import ClosureModel
 from mvest.estimation.estimate import OnIterate
 from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.prediction import Prediction
 from mvest.observation.surfaces import surface_distance
 from mvest.personalisation.estimation import (
     CaseEstimate,
@@ -255,14 +257,22 @@ def _distance(problem: CaseProblem, frame: Frame, positions: FloatArray) -> Floa
 
 
 def largest_difference_anew(problem: CaseProblem, estimate: CaseEstimate) -> float | None:
-    """Largest distance (mm) of the fitted closed valve from one closed from the open state."""
-    closure, result = estimate.place.closure, estimate.result
-    assert result.estimate is not None
-    assert result.fitted is not None
-    anew = replace(closure.model, continuation=False, guide=None, repeat=True)
-    frames = closure.frames and replace(closure.frames, model=anew)
-    prediction = RegisteredModel(frames or anew, problem.names)(result.estimate)
-    if not prediction.converged:
+    """Largest distance (mm) of the fitted closed valve from one closed from the open state.
+
+    Both are on the mesh of the guide where there is one, which leads all closures of the other.
+    None if one of them does not close.
+    """
+    closure, m = estimate.place.closure, estimate.result.estimate
+    assert m is not None
+    model = closure.model.guide or closure.model
+    anew = replace(model, continuation=False, guide=None, repeat=True)
+
+    def closed(one: ClosureModel) -> Prediction:
+        frames = closure.frames and replace(closure.frames, model=one)
+        return RegisteredModel(frames or one, problem.names)(m)
+
+    found = [closed(one) for one in (model, anew)]
+    if not all(one.converged for one in found):
         return None
-    closed = prediction.y.reshape(1 + len(problem.fitted.frames), -1, 3)[-1]
-    return float(np.linalg.norm(closed - result.fitted[-1], axis=1).max())
+    continued, again = (one.y.reshape(-1, len(problem.case.surface.vertices), 3) for one in found)
+    return float(np.linalg.norm(continued[-1] - again[-1], axis=1).max())

@@ -88,23 +88,36 @@ class CaseClosure:
         names: tuple[str, ...],
         start: FloatArray,
         displacement: Mapping[str, FloatArray] | None = None,
+        begin: ClosedState | None = None,
     ) -> CaseClosure:
-        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``."""
-        registered = RegisteredModel(frames or model, names)
+        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``.
+
+        It begins with the open valve, or with a closed state that is ``begin``.
+        """
+        registered = RegisteredModel(frames or model, names, begin)
         return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
 
-    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
+    def displaced(
+        self,
+        parts: Mapping[str, FloatArray],
+        start: FloatArray,
+        near: ClosureModel | None = None,
+    ) -> CaseClosure:
         """Of the valve with another geometry, see `RestGeometry.displaced`.
 
-        All closed frames have the same errors of annulus and tips, as their derivatives say.
+        All closed frames have the same errors of annulus and tips, as their derivatives say. It
+        begins where ``near`` is closed, if that has another geometry of the same valve: displaced
+        as the mesh at rest is, that is nearly an equilibrium, and it is the same closed state.
         """
         model = RestGeometry(self.model).displaced(parts)
-        closure = self.of(model, self.frames, self.registered.names, start, parts)
+        begin = None if near is None else _carried(near, model)
+        names = self.registered.names
+        closure = self.of(model, self.frames, names, start, parts, begin)
         if self.frames is None:
             return closure
         states = {name: closure.held(state) for name, state in self.frames.states.items()}
         frames = replace(self.frames, model=model, states=states)
-        return self.of(model, frames, self.registered.names, start, parts)
+        return self.of(model, frames, names, start, parts, begin)
 
     def held(self, state: HeldState) -> HeldState:
         """A state as it was seen, whose annulus and tips are off as those of this valve."""
@@ -113,6 +126,18 @@ class CaseClosure:
             annulus=state.annulus + self.displacement.get("annulus", 0.0),
             papillary_tips=state.papillary_tips + self.displacement.get("tips", 0.0),
         )
+
+
+def _carried(near: ClosureModel, model: ClosureModel) -> ClosedState | None:
+    """The closed state of a valve, displaced as the mesh at rest of another geometry is."""
+    closed = near.closed
+    if closed is None:
+        return None
+    guide = None
+    if near.guide is not None and model.guide is not None:
+        guide = _carried(near.guide, model.guide)
+    moved = closed.positions + model.mesh.nodes - near.mesh.nodes
+    return replace(closed, positions=moved, guide=guide)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -484,6 +509,7 @@ def _nearer(problem: CaseProblem, result: StudyResult, place: Place) -> Place | 
             tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
             problem.transform.inverse(begin + share * (end - begin)),
             posterior,
+            place,
         )
         return there if isinstance(there, str) else (improbability(there), there)
 
@@ -512,18 +538,27 @@ def joint(problem: CaseProblem, result: StudyResult, errors: FrameErrors) -> Joi
 
 
 def _displaced(
-    problem: CaseProblem, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
+    problem: CaseProblem,
+    modes: tuple[FloatArray, ...],
+    m: FloatArray,
+    posterior: JointPosterior,
+    place: Place,
 ) -> Place | str:
     """The valve with a geometry displaced by modes, or why it does not close.
 
-    It is closed at ``m (p,)``, and from there with what fits best to this geometry.
+    It is closed at ``m (p,)``, from where it was closed at ``place`` or else from the open valve,
+    and from there with what fits best to this geometry.
     """
     kinds = [source.modes for source in posterior.errors.geometry if source.modes is not None]
+    parts = displacement(kinds, modes)
     try:
-        closure = problem.stated.displaced(displacement(kinds, modes), m)
+        closure = problem.stated.displaced(parts, m, place.closure.model)
+        first = closure.shared(m)
+        if not first.converged:
+            closure = problem.stated.displaced(parts, m)
+            first = closure.shared(m)
     except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
         return str(error)
-    first = closure.shared(m)
     if not first.converged:
         return first.reason
     errors = posterior.errors.displaced(modes)

@@ -153,7 +153,7 @@ def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
 
 
 def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
-    if mesh.source == "structured":
+    if mesh.source == "structured" or (mesh.source == "automatic" and shape.band is not None):
         return shape.layers("hex18", mesh.columns, mesh.rows)
     return shape.tetrahedra(mesh.edge_length, "tet10", store)
 

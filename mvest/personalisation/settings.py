@@ -119,7 +119,8 @@ class CaseMesh:
     ----------
     source : str
         ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
-        unstructured mesh of the thickened leaflets.
+        unstructured mesh of the thickened leaflets; ``automatic``: the first where there are two
+        leaflets, otherwise the second.
     columns, rows : int
         Cells of a structured mesh.
     guide_columns, guide_rows : int
@@ -130,7 +131,7 @@ class CaseMesh:
         Samples of contact.
     """
 
-    source: str = "structured"
+    source: str = "automatic"
     columns: CellsAround = 40
     rows: CellsAlong = 5
     guide_columns: CellsAround = 24
@@ -146,14 +147,16 @@ class CaseMesh:
         Of a structured one by the extrapolation of Richardson for errors of second order; of an
         unstructured one, which is no refinement of the guide, all of it.
         """
-        if self.source == "structured":
+        if self.source != "tetwild":
             finer = self.columns / self.guide_columns
             return 1.0 / (finer**2 - 1.0) if finer > 1.0 else 0.0
         return 1.0
 
     def __post_init__(self) -> None:
-        if self.source not in ("structured", "tetwild"):
-            raise InputError(f"mesh source {self.source!r}, expected structured or tetwild")
+        if self.source not in ("automatic", "structured", "tetwild"):
+            raise InputError(
+                f"mesh source {self.source!r}, expected automatic, structured or tetwild"
+            )
 
 
 @dataclass(frozen=True, slots=True)

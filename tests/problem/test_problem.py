@@ -110,7 +110,7 @@ def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
     result = estimate(case(), data.observation)
     assert result.truth is None
     assert result.relative_error is None
-    assert all(m.truth is None for m in result.moduli)
+    assert all(one.truth is None for one in record_of(result).unknowns)
 
 
 def test_noise_has_the_stated_size_and_follows_the_seed() -> None:
