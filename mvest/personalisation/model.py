@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,15 @@ import numpy as np
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.closure.anchors import Anchors
 from mvest.closure.frames import FramesModel, is_frame_pressure
-from mvest.closure.model import ClosureModel
+from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.rest_geometry import RestGeometry
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
+from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.valve_system import HeldState, check_parameters
 from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior, Treatment
-from mvest.problem.registration import REGISTRATION
+from mvest.problem.registration import REGISTRATION, RegisteredModel
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
 from mvest.valve.mesh.given import GivenValve
 from mvest.valve.mesh.solid_mesh import SolidMesh
@@ -156,6 +160,90 @@ def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
     if mesh.source == "structured" or (mesh.source == "automatic" and shape.band is not None):
         return shape.layers("hex18", mesh.columns, mesh.rows)
     return shape.tetrahedra(mesh.edge_length, "tet10", store)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseClosure:
+    """The closure of a case's valve, in the forms in which the parts of an estimation take it.
+
+    Attributes
+    ----------
+    model : ClosureModel
+    frames : FramesModel or None
+        All closed frames that are fitted, if they are several.
+    registered : RegisteredModel
+        The same, displaced as a whole before it is seen.
+    shared : SharedStart
+        The same, for many estimations.
+    displacement : mapping
+        Part -> by what the geometry differs from the one that was seen; see
+        `RestGeometry.displaced`.
+    """
+
+    model: ClosureModel
+    frames: FramesModel | None
+    registered: RegisteredModel
+    shared: SharedStart[ClosedState]
+    displacement: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(
+        cls,
+        model: ClosureModel,
+        frames: FramesModel | None,
+        names: tuple[str, ...],
+        start: FloatArray,
+        displacement: Mapping[str, FloatArray] | None = None,
+        begin: ClosedState | None = None,
+    ) -> CaseClosure:
+        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``.
+
+        It begins with the open valve, or with a closed state that is ``begin``.
+        """
+        registered = RegisteredModel(frames or model, names, begin)
+        return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
+
+    def displaced(
+        self,
+        parts: Mapping[str, FloatArray],
+        start: FloatArray,
+        near: ClosureModel | None = None,
+    ) -> CaseClosure:
+        """Of the valve with another geometry, see `RestGeometry.displaced`.
+
+        All closed frames have the same errors of annulus and tips, as their derivatives say. It
+        begins where ``near`` is closed, if that has another geometry of the same valve: displaced
+        as the mesh at rest is, that is nearly an equilibrium, and it is the same closed state.
+        """
+        model = RestGeometry(self.model).displaced(parts)
+        begin = None if near is None else _carried(near, model)
+        names = self.registered.names
+        closure = self.of(model, self.frames, names, start, parts, begin)
+        if self.frames is None:
+            return closure
+        states = {name: closure.held(state) for name, state in self.frames.states.items()}
+        frames = replace(self.frames, model=model, states=states)
+        return self.of(model, frames, names, start, parts, begin)
+
+    def held(self, state: HeldState) -> HeldState:
+        """A state as it was seen, whose annulus and tips are off as those of this valve."""
+        return replace(
+            state,
+            annulus=state.annulus + self.displacement.get("annulus", 0.0),
+            papillary_tips=state.papillary_tips + self.displacement.get("tips", 0.0),
+        )
+
+
+def _carried(near: ClosureModel, model: ClosureModel) -> ClosedState | None:
+    """The closed state of a valve, displaced as the mesh at rest of another geometry is."""
+    closed = near.closed
+    if closed is None:
+        return None
+    guide = None
+    if near.guide is not None and model.guide is not None:
+        guide = _carried(near.guide, model.guide)
+    moved = closed.positions + model.mesh.nodes - near.mesh.nodes
+    return replace(closed, positions=moved, guide=guide)
 
 
 def gate_case(

@@ -24,7 +24,6 @@ from mvest.personalisation import Treatment, estimation, personalise
 from mvest.personalisation.chain import predicted_frames
 from mvest.personalisation.estimation import (
     SETTLED,
-    CaseClosure,
     CaseProblem,
     linearised,
 )
@@ -39,6 +38,7 @@ from mvest.personalisation.geometry import (
     smooth_modes,
 )
 from mvest.personalisation.indications import indications_of
+from mvest.personalisation.model import CaseClosure
 from mvest.personalisation.sources import geometry_sources
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.problem.verdict import MOVED
@@ -321,7 +321,7 @@ def bent_case(monkeypatch, curve, std):
         return (error_source(slope, MODE),)
 
     monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
-    monkeypatch.setattr("mvest.personalisation.estimation.RestGeometry", BentGeometry)
+    monkeypatch.setattr("mvest.personalisation.model.RestGeometry", BentGeometry)
     straight = made_up_case(std, displaced=False)
     closed = straight.frame(Role.CLOSED)
     frame = replace(closed, vertices=bent(closed.vertices.ravel(), 0.6).reshape(-1, 3))
@@ -514,7 +514,7 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
         return (error_source(BENT[:, None], MODE),)
 
     monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
-    monkeypatch.setattr("mvest.personalisation.estimation.RestGeometry", Torn)
+    monkeypatch.setattr("mvest.personalisation.model.RestGeometry", Torn)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     plain, torn = (
         personalise(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))

@@ -384,7 +384,10 @@ def test_a_structured_mesh_is_of_two_leaflets():
     )
     given = (*unknowns()[:2], Prior("E_f.septal", 2.0, 1.0))
     with pytest.raises(InputError, match="two leaflets; expected mesh source tetwild"):
-        build_model(replace(case, surface=three), settings(*given))
+        build_model(
+            replace(case, surface=three),
+            replace(settings(*given), mesh=CaseMesh(source="structured")),
+        )
     with pytest.raises(InputError, match="mesh source 'voxels'"):
         CaseMesh(source="voxels")
 
