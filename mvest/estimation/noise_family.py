@@ -388,11 +388,30 @@ class NoiseFamily:
         """The errors of single observations alone."""
         return replace(self, columns=())
 
-    def at(self, log: FloatArray) -> ObservationNoise:
-        """The noise for logarithms ``(h,)`` of the quantities; those of columns come last."""
+    def at(self, log: FloatArray, beats: float = 1.0) -> ObservationNoise:
+        """The noise for given quantities.
+
+        Parameters
+        ----------
+        log : (h,)
+            Logarithms of the quantities; those of columns come last.
+        beats : float
+            Heart beats whose mean is observed, may be infinite. The smooth and the rough part are
+            independent from beat to beat, so that their variance falls by this factor. Resolution
+            and added columns are the same in every beat and stay.
+
+        Raises
+        ------
+        InputError
+            If there is less than one beat, or no noise is left.
+        """
+        if not beats >= 1.0:
+            raise InputError(f"mean of {beats} beats, expected >= 1")
+        if np.isinf(beats) and not self.resolution > 0.0:
+            raise InputError("the mean of any number of beats has no noise without a resolution")
         of = self.rows
         parts, start = [], 0
-        v = of.variances(log)[0]
+        v = of.variances(log, beats)[0]
         for block, count in zip(self.blocks, of.sizes, strict=True):
             own = v[start : start + count]
             parts.append(block.noise(own[: count - 1], float(own[-1])))
@@ -457,11 +476,16 @@ class VarianceRows:
     sizes: tuple[int, ...]
     resolution: float
 
-    def variances(self, log: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The variances ``(r,)``, and the shares in each of the smooth and of the rough part."""
+    def variances(
+        self, log: FloatArray, beats: float = 1.0
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The variances ``(r,)``, and the shares in each of the smooth and of the rough part.
+
+        See `NoiseFamily.at` for the arguments.
+        """
         log = np.clip(log, -LARGEST, LARGEST)
         smooth = np.where(self.weight > 0.0, np.exp(2.0 * log[self.band]) * self.weight, 0.0)
-        rough = np.exp(2.0 * log[self.rough])
+        smooth, rough = smooth / beats, np.exp(2.0 * log[self.rough]) / beats
         within = smooth + rough + self.resolution
         f = np.where(self.frame >= 0, np.exp(2.0 * log[self.frame]), 1.0)
         return f * within, smooth / within, rough / within

@@ -364,22 +364,21 @@ def narrower(estimation: CaseEstimation, result: StudyResult) -> Mapping[str, Fl
     doubt = np.zeros_like(prior.covariance) if learned is None else learned.covariance
     groups = _measurable(estimation)
 
-    def widened(covariance: FloatArray, scale: float) -> FloatArray:
-        own, more = np.diag(covariance), np.diag(doubt) / scale**2
+    def widened(covariance: FloatArray, beats: float) -> FloatArray:
+        own, more = np.diag(covariance), np.diag(doubt) / beats
         # The doubt of now: of less it may take more away than there is.
         return np.sqrt(np.where(own + more > 0.0, own + more, own))[moduli]
 
-    def linear(P: FloatArray, scale: float = 1.0, without: Collection[str] = ()) -> FloatArray:
-        # What is considered stays what it is where the frame is seen better.
-        plain = estimation.errors.noise(learned, considered=scale, without=without, stated=True)
-        update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, plain)
-        return widened(update.posterior.covariance, scale)
+    def linear(P: FloatArray, beats: float = 1.0, without: Collection[str] = ()) -> FloatArray:
+        plain = estimation.errors.noise(learned, beats=beats, without=without, stated=True)
+        update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H, plain)
+        return widened(update.posterior.covariance, beats)
 
-    def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
+    def std(P: FloatArray, beats: float = 1.0) -> FloatArray:
         if errors is None:
-            return linear(P, scale)
-        own = estimation.errors.weighing(errors, learned, considered=scale)
-        return widened(own.posterior(H * scale, P).covariance, scale)
+            return linear(P, beats)
+        own = estimation.errors.weighing(errors, learned, beats=beats)
+        return widened(own.posterior(H, P).covariance, beats)
 
     stds = {"now": std(prior.covariance)}
     for words, members in groups.items():
@@ -387,8 +386,11 @@ def narrower(estimation: CaseEstimation, result: StudyResult) -> Mapping[str, Fl
         if known.any():
             share = np.where(known, 1 / BETTER, 1.0)
             stds[words] = std(prior.covariance * np.outer(share, share))
-    stds["4 beats averaged"] = std(prior.covariance, 2.0)
-    stds["any number of beats averaged"] = std(prior.covariance, 1e3)
+    stds["4 beats averaged"] = std(prior.covariance, 4.0)
+    family = estimation.errors.single_errors
+    # Without a resolution errors of single observations have no floor.
+    most = np.inf if family is not None and family.resolution > 0.0 else 1e6
+    stds["any number of beats averaged"] = std(prior.covariance, most)
     if errors is not None:
         stds["geometry known exactly"] = linear(prior.covariance, without=estimation.errors.kinds)
         return stds

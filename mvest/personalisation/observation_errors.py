@@ -16,7 +16,12 @@ from mvest.cases.case import Role
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError
 from mvest.estimation.evidence import LearnedNoise
-from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
+from mvest.estimation.noise import (
+    ObservationNoise,
+    low_rank_noise,
+    observation_noise,
+    scaled_noise,
+)
 from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
 from mvest.estimation.sampled import SampledErrors
 from mvest.observation.learned import error_family
@@ -195,7 +200,7 @@ class ObservationErrors:
         self,
         learned: LearnedNoise | None = None,
         *,
-        considered: float = 1.0,
+        beats: float = 1.0,
         without: Collection[str] = (),
         beside: FloatArray | None = None,
         stated: bool = False,
@@ -206,8 +211,9 @@ class ObservationErrors:
         ----------
         learned : LearnedNoise, optional
             By which it is known, and not as it is stated.
-        considered : float
-            Factor on what is added by all that is considered.
+        beats : float
+            Heart beats whose mean is observed: errors of single observations are averaged, down to
+            the resolution where they are learned; all others stay.
         without : collection of str
             Kinds of it that are left out.
         beside : (k, q), optional
@@ -220,12 +226,14 @@ class ObservationErrors:
         if family is None:
             observation = self.fitted.observation(stated=stated)
             base = observation_noise(observation.R, len(observation.y))
+            if beats != 1.0:
+                base = scaled_noise(base, np.full(base.size, beats**-0.5))
         else:
             log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
             first = len(family.names) - len(family.columns)
-            base = family.without_columns().at(log[:first])
+            base = family.without_columns().at(log[:first], beats)
         columns = [
-            considered * scales.get(own.name, 1.0) * own.columns
+            scales.get(own.name, 1.0) * own.columns
             for own in self.considered
             if own.name not in without
         ]
@@ -238,14 +246,14 @@ class ObservationErrors:
         samples: SampledErrors,
         learned: LearnedNoise | None = None,
         *,
-        considered: float = 1.0,
+        beats: float = 1.0,
     ) -> SampledErrors:
         """Samples with the noise of all other errors, see `noise`."""
         scales = self._learned_sizes(learned)
-        columns = [considered * scales.get(c.name, 1.0) * c.columns for c in self.considered]
+        columns = [scales.get(c.name, 1.0) * c.columns for c in self.considered]
         return replace(
             samples,
-            base=self.noise(learned, considered=considered),
+            base=self.noise(learned, beats=beats),
             beside=np.concatenate(columns, axis=1) if columns else None,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -85,8 +86,8 @@ def mixed_family() -> NoiseFamily:
     return family.plus(ErrorColumns("open shape", 0.3 * rng.standard_normal((family.size, 3)), 2.0))
 
 
-def dense(family: NoiseFamily, log: FloatArray) -> FloatArray:
-    """R by its definition, entry by entry."""
+def dense(family: NoiseFamily, log: FloatArray, beats: float = 1.0) -> FloatArray:
+    """R of the mean of a number of beats by its definition, entry by entry."""
     value = dict(zip(family.names, np.exp(log), strict=True))
     blocks = []
     for block in family.blocks:
@@ -100,7 +101,7 @@ def dense(family: NoiseFamily, log: FloatArray) -> FloatArray:
             np.testing.assert_allclose(basis.across, 0.0, atol=1e-6)
             if len(basis.w) < k:
                 R += np.exp(2.0 * log[BANDS - 1]) * basis.across * (np.eye(k) - U @ U.T)
-        R += (value[block.rough] ** 2 + family.resolution**2) * np.eye(k)
+        R = (R + value[block.rough] ** 2 * np.eye(k)) / beats + family.resolution**2 * np.eye(k)
         R *= np.outer(block.scale, block.scale)
         if block.frame is not None:
             R *= value[block.frame] ** 2
@@ -144,6 +145,20 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution(seed: int) -> Non
     mean, covariance = Evidence.of(family, e, columns).update(log, 5)
     np.testing.assert_allclose(mean, update.posterior.mean, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(covariance, update.posterior.covariance, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("beats", [1.0, 4.0, 1e3, np.inf])
+def test_what_differs_from_beat_to_beat_is_averaged_and_nothing_else(beats: float) -> None:
+    family = mixed_family()
+    e, B, log = some(family, 3)
+    update = kalman_update(Gaussian(np.zeros(5), np.eye(5)), e, B, family.at(log, beats))
+    S = dense(family, log, beats) + B @ B.T
+    expected = np.eye(5) - B.T @ np.linalg.solve(S, B)
+    np.testing.assert_allclose(update.posterior.covariance, expected, rtol=1e-6, atol=1e-12)
+    # The same frame seen without any error but the resolution tells no less.
+    exact = dense(family, log, np.inf) + B @ B.T
+    gained = np.eye(5) - B.T @ np.linalg.solve(exact, B)
+    assert np.linalg.eigvalsh(update.posterior.covariance - gained).min() > -1e-12
 
 
 def test_its_derivatives_are_those_of_differences() -> None:
@@ -374,6 +389,12 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "median": (lambda: LogNormal(0.0), "median 0.0, expected > 0"),
     "factor": (lambda: LogNormal(1.0, 0.5), "factor 0.5, expected >= 1"),
+    "less than a beat": (
+        lambda: FAMILY.at(FAMILY.prior.mean, 0.5), "mean of 0.5 beats, expected >= 1"
+    ),
+    "all averaged away": (
+        lambda: replace(FAMILY, resolution=0.0).at(FAMILY.prior.mean, np.inf), "no noise without"
+    ),
     "resolution": (
         lambda: NoiseFamily(FAMILY.blocks, {"rough": ROUGH}, FAMILY.bands, -1.0),
         "resolution of -1.0",

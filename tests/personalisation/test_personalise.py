@@ -597,9 +597,9 @@ def test_a_law_that_is_not_known_is_not_averaged_away_beside_error_samples(monke
     alone = personalise(replace(case, error_samples=None), given)
     known = personalise(case, settings(*right_nuisances()))
     assert told.result.std[0] > 1.05 * known.result.std[0]
-    # Of the linear model at another estimate.
+    # Nor are the samples: what the law alone leaves is less.
     averaged = [one.narrower["any number of beats averaged"][0] for one in (told, alone)]
-    assert averaged[0] == pytest.approx(averaged[1], rel=0.3)
+    assert averaged[0] > averaged[1] > 0.05
 
 
 def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
