@@ -225,12 +225,19 @@ def posterior_of(learned: LearnedNoise, e: FloatArray, columns: FloatArray) -> G
     return Gaussian(update.posterior.mean, update.posterior.covariance + learned.covariance)
 
 
+def alternating() -> FloatArray:
+    """Anticorrelated at 8 mm: no coarse part, (1 - d²/2a²) exp(-d²/2a²) in the plane."""
+    d = cdist(POINTS[:, :2], POINTS[:, :2]) / 4.0
+    return np.asarray((1.0 - 0.5 * d**2) * np.exp(-0.5 * d**2))
+
+
 WORLDS: dict[str, tuple[Callable[[], FloatArray], float]] = {
     "as stated": (lambda: matern(DISTANCE, 10.0), 0.0),
     "half the length": (lambda: matern(DISTANCE, 5.0), 0.0),
     "twice the length": (lambda: matern(DISTANCE, 20.0), 0.0),
     "Gaussian kernel": (lambda: np.exp(-0.5 * (DISTANCE / 10.0) ** 2), 0.0),
     "exponential kernel": (lambda: np.exp(-DISTANCE / 10.0), 0.0),
+    "anticorrelated": (alternating, 0.0),
     "0.1 mm rough": (lambda: matern(DISTANCE, 10.0), 0.1),
     "0.2 mm rough": (lambda: matern(DISTANCE, 10.0), 0.2),
     "0.3 mm rough": (lambda: matern(DISTANCE, 10.0), 0.3),
@@ -244,7 +251,7 @@ def test_intervals_hold_whatever_made_the_errors(world: str) -> None:
     F = scipy.linalg.cholesky(K + 1e-9 * np.eye(len(K)), lower=True)
     stated = scipy.linalg.cholesky(matern(DISTANCE, 10.0) + 1e-10 * np.eye(len(K)), lower=True)
     rng = np.random.default_rng(5)
-    inside, fixed, nis = [], [], []
+    inside, fixed, nis, errors = [], [], [], []
     for _ in range(40):
         x = rng.standard_normal(B.shape[1])
         noise = 0.6 * F @ rng.standard_normal((len(K), 3)) + rough * rng.standard_normal(
@@ -260,10 +267,14 @@ def test_intervals_hold_whatever_made_the_errors(world: str) -> None:
         w = scipy.linalg.solve_triangular(stated, e.reshape(len(K), -1), lower=True).ravel() / 0.6
         P = np.linalg.inv(np.eye(B.shape[1]) + A.T @ A)
         fixed.append(np.abs(P @ A.T @ w - x) < 1.96 * np.sqrt(np.diag(P)))
+        errors.append((posterior.mean - x, P @ A.T @ w - x))
     # Of 320 intervals the share has an SD of 1.2 percent.
     assert 0.90 <= np.mean(inside) <= 0.98
     if world in ("half the length", "exponential kernel") or rough > 0.1:
         assert np.mean(fixed) < 0.8
+    if world == "anticorrelated":
+        learned_error, stated_error = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+        assert learned_error < 0.9 * stated_error
     if rough:
         quantity = learned.quantities[-1]
         assert quantity.learned.median == pytest.approx(rough, rel=0.1)
