@@ -119,7 +119,6 @@ COLUMNS: dict[str, Column | str] = {
     "runs": "",
     "check": ":.2g",
     "check limit": "",
-    "check runs": Column(hidden=True),
     "ended": Column(hidden=True),
     "detail": Column(hidden=True),
 }
@@ -214,7 +213,6 @@ class Problem:
                 "runs": found.forward_solves,
                 "check": check and check.value,
                 "check limit": check and check.limit,
-                "check runs": check and check.extra_runs,
                 "ended": found.why,
                 "detail": found.detail,
             }

@@ -143,7 +143,6 @@ BAD = {
     ),
     "no rounds": (lambda: PaperFilter(max_iterations=0), "at least one iteration; got 0"),
     "no iterations": (lambda: IteratedFilter(max_iterations=0), "at least one iteration; got 0"),
-    "negative rejections": (lambda: IteratedFilter(max_rejections=-1), "not be negative; got -1"),
     "start of wrong length": (
         lambda: filtered(method=IteratedFilter(start=(1.0,))),
         r"start must be 2 finite numbers; got \(1.0,\)",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,13 +9,11 @@ from scipy.special import logsumexp
 
 from mvest.errors import InputError
 from mvest.estimation.check import ApproximationCheck
-from mvest.estimation.estimate import Estimate, Filter, OnIterate, Reason
+from mvest.estimation.estimate import Estimate, Filter, Reason
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian, standard
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.run import FilterRun, by_filter
-from mvest.estimation.transform import Transform
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.run import FilterRun, RunFilter, by_filter
 from mvest.typing import FloatArray, IntArray
 
 K_HAT_LIMIT = 0.7
@@ -45,7 +42,7 @@ DRAWS = 4000
 
 
 @dataclass(frozen=True, slots=True)
-class ImportanceFilter:
+class ImportanceFilter(RunFilter):
     """Weighted draws from the posterior, from proposals that learn from the model's derivatives.
 
     In coordinates x in which the prior is N(0, I), with π(x) = exp(−J(x)):
@@ -99,20 +96,11 @@ class ImportanceFilter:
                 f"one effective draw; got {self.batch}, {self.runs} and {self.effective:g}"
             )
 
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Draw from the posterior; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
-        first = self.start(model, prior, y, R, names=names, transform=transform)
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Draw from the posterior."""
+        first = self.start(
+            run.model, run.physical_prior, run.y, run.R, names=run.names, transform=run.transform
+        )
         run.forward_solves += first.forward_solves
         if first.prediction is None:
             z = first.transformed
@@ -123,7 +111,7 @@ class ImportanceFilter:
             float(first.objective[-1]),
             float(first.log_likelihood[-1]),
         )
-        rng, L = np.random.default_rng(self.seed), run.prior.factor
+        rng, L = np.random.default_rng(self.seed), run.L
         draws = _Draws(run, standard(run.prior, first.transformed))
         while True:
             draws.more(min(self.batch, self.runs - len(draws.points)), rng)
@@ -147,7 +135,7 @@ class ImportanceFilter:
             ),
         ]
         return run.finish_with_slope(
-            run.prior.mean + L @ x,
+            run.z(x),
             L @ (spread.T * weights) @ spread @ L.T,
             by_filter(draws.slope, L),
             Reason.COMPLETED if good else Reason.NOT_SAMPLED,
@@ -226,14 +214,14 @@ class _Draws:
 
     def _evaluate(self, x: FloatArray) -> float:
         """Logarithm of π(x); −∞ where the model gives no prediction."""
-        z = self._run.prior.mean + self._run.prior.factor @ x
+        z = self._run.z(x)
         prediction = self._run.predict(z, derivatives=False)
         covariance = self._laplace.covariance
         value = -np.inf
         if prediction.converged:
             value = -self._run.misfit(prediction) - 0.5 * float(x @ x)
             if prediction.differentiated:
-                self.slope = self._run.jacobian(z, prediction) @ self._run.prior.factor
+                self.slope = self._run.jacobian(z, prediction) @ self._run.L
                 A = self._run.noise.whiten(self.slope)
                 covariance = np.asarray(np.linalg.inv(np.eye(len(x)) + A.T @ A), np.float64)
                 e = self._run.noise.whiten(self._run.y - prediction.y)
