@@ -1,7 +1,7 @@
 """Learning the noise together with the parameters, from one linearisation of a model.
 
 With the innovation e = y − h(z) + H (z − m) of the prior N(m, P), linearised at z, and the noise
-R(θ) of quantities θ (see ``noise_family``)::
+R(θ) of quantities θ (see `mvest.estimation.noise`)::
 
     log p(e | θ) = log N(e; 0, S),   S = R(θ) + H P Hᵀ + C Cᵀ
 
@@ -26,16 +26,8 @@ import scipy
 from scipy.spatial.distance import cdist
 
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import ObservationNoise
-from mvest.estimation.noise_family import (
-    BANDS,
-    Basis,
-    LogNormal,
-    NoiseFamily,
-    VarianceRows,
-    matern,
-    spread_points,
-)
+from mvest.estimation.noise import NoiseFamily, ObservationNoise, VarianceRows
+from mvest.estimation.spectrum import BANDS, Basis, LogNormal, matern, spread_points
 from mvest.typing import FloatArray, IntArray
 
 TOLERANCE = 1e-3
@@ -104,53 +96,9 @@ class LearnedNoise:
     log_likelihood: float
     covariance: FloatArray
 
-    def __str__(self) -> str:
-        return "\n".join(
-            f"{q.name}: {q.learned.median:.3g} [{q.learned.interval()[0]:.3g}, "
-            f"{q.learned.interval()[1]:.3g}], believed {q.believed.median:.3g} "
-            f"[{q.believed.interval()[0]:.3g}, {q.believed.interval()[1]:.3g}]"
-            for q in self.quantities
-        )
-
-
-class NoiseLearner:
-    """Learns the noise of one estimation, again and again as its linearisation improves."""
-
-    def __init__(self, family: NoiseFamily) -> None:
-        self.family = family
-        self._evidence: Evidence | None = None
-        self._posterior: _Posterior | None = None
-
-    def learn(self, innovation: FloatArray, B: FloatArray) -> ObservationNoise:
-        """The noise at the mean of what is known of it.
-
-        Parameters
-        ----------
-        innovation : (n,)
-            e.
-        B : (n, p)
-            H L, with the prior's covariance P = L Lᵀ.
-        """
-        self._evidence = Evidence.of(self.family, innovation, B)
-        start = None if self._posterior is None else self._posterior.mode
-        self._posterior = self._evidence.posterior(start)
-        return self.family.at(self._evidence.log(self._posterior.mean))
-
-    def learned(self, L: FloatArray) -> LearnedNoise:
-        """What is known of the noise, from the innovation that was given last.
-
-        Parameters
-        ----------
-        L : (p, p)
-            Root of the prior's covariance in filter coordinates.
-        """
-        assert self._evidence is not None
-        assert self._posterior is not None
-        return self._evidence.learned(self._posterior, L)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Posterior:
+class Posterior:
     """Of coordinates u: the mode, the mean, and a root of the covariance."""
 
     mode: FloatArray
@@ -195,7 +143,16 @@ class Evidence:
 
     @classmethod
     def of(cls, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> Evidence:
-        """Project an innovation ``(n,)`` and B ``(n, p)``, see `NoiseLearner.learn`."""
+        """The evidence of an innovation.
+
+        Parameters
+        ----------
+        family : NoiseFamily
+        innovation : (n,)
+            e.
+        B : (n, p)
+            H L, with the prior's covariance P = L Lᵀ.
+        """
         added, start = [], B.shape[1]
         for k, columns in enumerate(family.columns, len(family.names) - len(family.columns)):
             added.append((k, slice(start, start + columns.columns.shape[1])))
@@ -242,7 +199,7 @@ class Evidence:
         """Logarithms of θ ``(h,)``."""
         return np.asarray(self.prior.mean + self.root @ u)
 
-    def posterior(self, start: FloatArray | None = None) -> _Posterior:
+    def posterior(self, start: FloatArray | None = None) -> Posterior:
         """What is known of u, near normal about its mean.
 
         Of a variance that few observations tell the most probable value is too small. The mean is
@@ -253,7 +210,7 @@ class Evidence:
         h = self.prior.size
         u = np.zeros(h) if start is None else start
         if not self.root.any():
-            return _Posterior(u, u, np.zeros((h, h)))
+            return Posterior(u, u, np.zeros((h, h)))
         u = np.asarray(
             scipy.optimize.minimize(
                 self.objective, u, jac=True, method="BFGS", options={"gtol": TOLERANCE}
@@ -273,7 +230,7 @@ class Evidence:
         )
         moved = -0.5 * spread.T @ bend
         moved /= max(1.0, float(np.linalg.norm(moved)))
-        return _Posterior(u, u + spread @ moved, spread)
+        return Posterior(u, u + spread @ moved, spread)
 
     def objective(self, u: FloatArray) -> tuple[float, FloatArray]:
         """−log p(e | θ) − log p(θ) but for a constant, and its derivatives by u."""
@@ -333,8 +290,8 @@ class Evidence:
         root = scipy.linalg.cholesky(M, lower=True, check_finite=False)
         return e, B, root, scipy.linalg.cho_solve((root, True), B.T @ e, check_finite=False)
 
-    def learned(self, posterior: _Posterior, L: FloatArray) -> LearnedNoise:
-        """What is known of the noise, in a reader's terms; L as in `NoiseLearner.learned`."""
+    def learned(self, posterior: Posterior, L: FloatArray) -> LearnedNoise:
+        """What is known of the noise, in a reader's terms; P = L Lᵀ is the prior's covariance."""
         u, h, p = posterior.mean, self.prior.size, len(L)
         P = self.update(self.log(u), p)[1]
         more = np.zeros((p, p))

@@ -182,6 +182,13 @@ def read_only(values: FloatArray) -> FloatArray:
     return view
 
 
+def require_positive(values: FloatArray, what: str) -> None:
+    """Raise InputError unless all entries of `values` are finite and positive."""
+    require_finite(np.atleast_1d(values), what)
+    if np.any(values <= 0.0):
+        raise InputError(f"{what} is {np.min(values):g}, expected > 0")
+
+
 def require_finite(values: FloatArray, what: str) -> None:
     """Raise InputError naming the first entry of `values` that is NaN or infinite."""
     bad = np.argwhere(~np.isfinite(values))

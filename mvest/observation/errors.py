@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.noise import ObservationNoise, kronecker_noise
-from mvest.estimation.noise_family import matern
+from mvest.estimation.spectrum import matern
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points

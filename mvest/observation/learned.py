@@ -3,7 +3,7 @@
 What is stated of the errors of a case, a standard deviation and over which length they are alike,
 is the median of a belief and no more: how smooth and how rough they are, each over which distance,
 and how much larger in one frame than in another follows from the observation itself, together with
-the parameters (see `mvest.estimation.noise_family` and `mvest.estimation.evidence`).
+the parameters (see `mvest.estimation.noise` and `mvest.estimation.evidence`).
 """
 
 from __future__ import annotations
@@ -15,13 +15,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError, require_numbers
-from mvest.estimation.noise_family import (
-    LogNormal,
-    NoiseBlock,
-    NoiseFamily,
-    Spectrum,
-    smooth_basis,
-)
+from mvest.estimation.noise import NoiseBlock, NoiseFamily
+from mvest.estimation.spectrum import LogNormal, Spectrum, smooth_basis
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.quantities import Factor, Length, Share

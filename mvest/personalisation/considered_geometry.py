@@ -21,9 +21,9 @@ from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError, require_numbers
-from mvest.estimation.noise import ObservationNoise
-from mvest.estimation.noise_family import ErrorColumns, smooth_basis
+from mvest.estimation.noise import ErrorColumns, ObservationNoise
 from mvest.estimation.prediction import Prediction, predict
+from mvest.estimation.spectrum import smooth_basis
 from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.valve_system import HeldState
 from mvest.problem.problem import Observed

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import Simulation

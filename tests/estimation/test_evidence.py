@@ -14,17 +14,9 @@ from scipy.stats import multivariate_normal
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Prediction, kalman_update
-from mvest.estimation.evidence import Evidence, LearnedNoise, NoiseLearner
-from mvest.estimation.noise_family import (
-    BANDS,
-    ErrorColumns,
-    LogNormal,
-    NoiseBlock,
-    NoiseFamily,
-    Spectrum,
-    matern,
-    smooth_basis,
-)
+from mvest.estimation.evidence import Evidence, LearnedNoise
+from mvest.estimation.noise import ErrorColumns, NoiseBlock, NoiseFamily
+from mvest.estimation.spectrum import BANDS, LogNormal, Spectrum, matern, smooth_basis
 from mvest.typing import FloatArray
 
 BELIEVED = Spectrum(LogNormal(0.6, 2.0), LogNormal(10.0, 2.0))
@@ -33,9 +25,8 @@ ROUGH = LogNormal(0.12, 3.0)
 
 def learn_noise(family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> LearnedNoise:
     """The most probable noise of a linear model whose prior covariance is the unit matrix."""
-    learner = NoiseLearner(family)
-    learner.learn(innovation, B)
-    return learner.learned(np.eye(B.shape[1]))
+    evidence = Evidence.of(family, innovation, B)
+    return evidence.learned(evidence.posterior(), np.eye(B.shape[1]))
 
 
 def sheet(rows: int, columns: int, spacing: float) -> FloatArray:

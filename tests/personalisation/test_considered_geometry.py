@@ -14,8 +14,7 @@ from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import observation_noise
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns, observation_noise
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Log, to_filter
 from mvest.mechanics.settings import ExponentialTissue

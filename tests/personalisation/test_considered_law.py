@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.closure.model import ClosureModel
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import StepReason

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.personalisation import personalise

@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.case import ErrorSamples, Role, Uncertainty
 from mvest.errors import GeometryError, InputError
 from mvest.estimation import Prediction, observation_noise
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ClosureProtocol, ExponentialTissue
 from mvest.observation.errors import SpatialCorrelation

@@ -6,9 +6,9 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, Reason
-from mvest.estimation.evidence import NoiseLearner
+from mvest.estimation.evidence import Evidence
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise_family import NoiseFamily
+from mvest.estimation.noise import NoiseFamily
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.run import FilterRun, RunFilter, require_settings
 from mvest.estimation.update import kalman_update
@@ -129,12 +129,15 @@ class IteratedFilter(RunFilter):
         if isinstance(point, Prediction):
             return run.fail(run.z(x), run.prior.covariance, point)
 
-        learner = NoiseLearner(run.R) if isinstance(run.R, NoiseFamily) else None
+        evidence: Evidence | None = None
+        mode: FloatArray | None = None
         damping, iterations = 0.0, 0
         while True:
             innovation = run.y - point.prediction.y + point.H @ point.x
-            if learner is not None and iterations < self.max_learned:
-                run.noise = learner.learn(innovation, point.H)
+            if isinstance(run.R, NoiseFamily) and iterations < self.max_learned:
+                evidence = Evidence.of(run.R, innovation, point.H)
+                noise = evidence.posterior(mode)
+                mode, run.noise = noise.mode, run.R.at(evidence.log(noise.mean))
                 point = replace(point, objective=_objective(run, point.x, point.prediction))
             update = kalman_update(run.unit, innovation, point.H, run.noise)
             P = L @ update.posterior.covariance @ L.T
@@ -163,7 +166,7 @@ class IteratedFilter(RunFilter):
                     reason = Reason.NO_DECREASE
             if reason is not None:
                 curvature: FloatArray | None = None
-                learned = None if learner is None else learner.learned(L)
+                learned = None if evidence is None else evidence.learned(noise, L)
                 if self.second_order and reason is not Reason.MODEL_FAILED:
                     check = run.check(point.prediction)
                     if reason is not Reason.CONVERGED or not (check is None or check.holds):

@@ -5,13 +5,13 @@ Navigation (2001), section 5.4. Each takes plain arrays.
 """
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import checked_covariance
-from mvest.estimation.noise import SparseMatrix, csc
 from mvest.estimation.prediction import require_finite
 from mvest.typing import FloatArray
 
@@ -97,7 +97,7 @@ def zero_mean(innovation: FloatArray) -> ZTest:
     return ZTest(float(w.mean()), 0.0, float(w.std(ddof=1) / np.sqrt(w.size)))
 
 
-def moran(innovation: FloatArray, neighbours: SparseMatrix) -> ZTest:
+def moran(innovation: FloatArray, neighbours: "scipy.sparse.sparray[Any, Any]") -> ZTest:
     """Moran's I: test that innovations at neighbouring points are uncorrelated.
 
     Parameters
@@ -116,7 +116,7 @@ def moran(innovation: FloatArray, neighbours: SparseMatrix) -> ZTest:
     """
     w = _series(innovation)
     n = w.size
-    A = csc(neighbours)
+    A = scipy.sparse.csc_array(cast(Any, neighbours), dtype=np.float64)
     if A.shape != (n, n):
         raise InputError(f"neighbours must have shape ({n}, {n}); got {A.shape}")
     if A.nnz == 0 or np.any(A.data < 0.0) or np.any(A.diagonal() != 0.0):
