@@ -48,7 +48,7 @@ class InnovationSummary:
 
     It is what the prior leaves unexplained, e = y − h(z) + H (z − m), linearised at the estimate z:
     with a linear model y less what the prior's mean m predicts. What the estimate leaves is the
-    residual y − h(z), and smaller (`Estimate.residual_rms`).
+    residual y − h(z), and smaller (`residual_rms`).
 
     The paper's filter sees the same y again in each round, so that there y is not independent of
     the state it is compared with, and its `nis` is smaller than a chi-square number.
@@ -63,8 +63,6 @@ class InnovationSummary:
         Root mean square of the residual y − h(z), of the estimate itself.
     nis : float
         eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right.
-    nis_band : (float, float)
-        Band that holds such a number with 95 % probability.
     log_likelihood : float
         log N(e; 0, S).
     standardised : (n,)
@@ -76,7 +74,6 @@ class InnovationSummary:
     max_abs: float
     residual_rms: float
     nis: float
-    nis_band: tuple[float, float]
     log_likelihood: float
     standardised: FloatArray
 
@@ -91,10 +88,14 @@ class InnovationSummary:
             max_abs=float(np.max(np.abs(innovation))),
             residual_rms=float(np.sqrt(np.mean(residual**2))),
             nis=update.nis,
-            nis_band=chi_square_band(innovation.size),
             log_likelihood=update.log_likelihood,
             standardised=update.standardised_innovation,
         )
+
+    @property
+    def nis_band(self) -> tuple[float, float]:
+        """Band that holds such a number as `nis` with 95 % probability."""
+        return chi_square_band(self.size)
 
     @property
     def consistent(self) -> bool:
@@ -208,12 +209,6 @@ class Estimate:
     def iterations(self) -> int:
         """Number of updates, one less than the number of iterates."""
         return len(self.transformed_iterates) - 1
-
-    def residual_rms(self, y: FloatArray) -> float | None:
-        """Root mean square of y (n,) less what is predicted at the estimate, in its units."""
-        if self.prediction is None:
-            return None
-        return float(np.sqrt(np.mean((y - self.prediction.y) ** 2)))
 
     @property
     def iterates(self) -> FloatArray:

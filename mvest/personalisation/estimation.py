@@ -11,17 +11,16 @@ import numpy as np
 
 from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
-from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import Prediction, predict
+from mvest.estimation.prediction import Prediction, SharedStart, of_some, predict
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
-from mvest.estimation.wrappers import SharedStart, of_some
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalisation.considered_geometry import displacement
 from mvest.personalisation.fitted_frames import FittedFrames
@@ -57,7 +56,7 @@ class CaseClosure:
     model: ClosureModel
     frames: FramesModel | None
     registered: RegisteredModel
-    shared: SharedStart[ClosedState]
+    shared: SharedStart
     displacement: Mapping[str, FloatArray]
 
     @classmethod
@@ -374,7 +373,7 @@ class CaseEstimation:
         return self._closure.registered
 
     @property
-    def shared(self) -> SharedStart[ClosedState]:
+    def shared(self) -> SharedStart:
         """The same, for many estimations."""
         return self._closure.shared
 

@@ -8,7 +8,7 @@ import pytest
 from mvest.closure.model import ClosedState
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
-from mvest.estimation.wrappers import SharedStart
+from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.observation.vertices import Observation

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from mvest.errors import InputError
-from mvest.estimation.gaussian import checked_covariance
+from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import require_finite
 from mvest.typing import FloatArray
 
@@ -49,16 +49,13 @@ def nees(error: FloatArray, covariance: FloatArray) -> float:
     float
         Chi-square with p degrees of freedom if the estimate is unbiased and P is its covariance.
     """
-    error = np.asarray(error, dtype=np.float64)
-    if error.ndim != 1:
-        raise InputError(f"an error must have shape (p,); got {error.shape}")
-    require_finite(error, "the error")
-    P = checked_covariance(covariance, error.size, "the covariance")
+    of = Gaussian(error, covariance)
     try:
-        root = np.linalg.cholesky(P)
+        whitened = np.linalg.solve(np.linalg.cholesky(of.covariance), of.mean)
     except np.linalg.LinAlgError as problem:
-        raise InputError(f"NEES needs a positive definite covariance; got\n{P}") from problem
-    whitened = np.linalg.solve(root, error)
+        raise InputError(
+            f"NEES needs a positive definite covariance; got\n{covariance}"
+        ) from problem
     return float(whitened @ whitened)
 
 
