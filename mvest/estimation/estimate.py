@@ -284,6 +284,11 @@ class Filter(Protocol):
 
         `prior` is N(m, P) of the parameters themselves, `transform` (default `Identity`) chooses
         the coordinates to work in, `on_iterate` is called with each iterate.
+
+        Raises
+        ------
+        InputError
+            If a setting, a shape or a covariance is not admissible; never for a failing model.
         """
         ...
 

@@ -26,9 +26,9 @@ import scipy
 from scipy.spatial.distance import cdist
 
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import NoiseFamily, ObservationNoise, VarianceRows
+from mvest.estimation.noise import NoiseFamily, ObservationNoise
 from mvest.estimation.spectrum import BANDS, Basis, LogNormal, matern, spread_points
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 
 TOLERANCE = 1e-3
 """Slope of the evidence, per standard deviation of the prior, at which it is greatest."""
@@ -82,8 +82,6 @@ class LearnedNoise:
         of what is rough.
     noise : ObservationNoise
         At the mean, added columns included.
-    log_likelihood : float
-        log p(e | θ) there.
     covariance : (p, p) in filter coordinates
         What the doubt of θ adds to the covariance of the estimate.
     """
@@ -93,7 +91,6 @@ class LearnedNoise:
     posterior: Gaussian
     quantities: tuple[LearnedQuantity, ...]
     noise: ObservationNoise
-    log_likelihood: float
     covariance: FloatArray
 
 
@@ -106,11 +103,18 @@ class Posterior:
     spread: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """log p(e | θ) as a function, after everything is projected.
 
     Coordinates u are those in which the prior of log θ is N(0, I): log θ = mean + L u.
+
+    Parameters
+    ----------
+    family : NoiseFamily
+    innovation : (n,)
+        e.
+    B : (n, p)
+        H L, with the prior's covariance P = L Lᵀ.
 
     Attributes
     ----------
@@ -125,75 +129,42 @@ class Evidence:
         Which of the variances is that of a row.
     count : (v,)
         Observations of each variance, for the determinant.
-    added : tuple of (int, slice)
+    added : list of (int, slice)
         Which quantity is the factor of which columns.
     log_scale : float
         log det D².
     """
 
-    family: NoiseFamily
-    prior: Gaussian
-    root: FloatArray
-    variances: VarianceRows
-    rows: FloatArray
-    kind: IntArray
-    count: FloatArray
-    added: tuple[tuple[int, slice], ...]
-    log_scale: float
-
-    @classmethod
-    def of(cls, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> Evidence:
-        """The evidence of an innovation.
-
-        Parameters
-        ----------
-        family : NoiseFamily
-        innovation : (n,)
-            e.
-        B : (n, p)
-            H L, with the prior's covariance P = L Lᵀ.
-        """
-        added, start = [], B.shape[1]
-        for k, columns in enumerate(family.columns, len(family.names) - len(family.columns)):
-            added.append((k, slice(start, start + columns.columns.shape[1])))
-            start += columns.columns.shape[1]
-        data = np.concatenate(
-            [innovation[:, None], B, *(columns.columns for columns in family.columns)], axis=1
-        )
+    def __init__(self, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> None:
+        self.family, self.prior = family, family.prior
+        self.root, self.variances = self.prior.factor, family.rows
+        columns = [own.columns for own in family.columns]
+        data = np.concatenate([innovation[:, None], B, *columns], axis=1)
+        ends = np.cumsum([B.shape[1], *(own.shape[1] for own in columns)]).tolist()
+        quantities = range(len(family.names) - len(columns), len(family.names))
+        self.added = list(zip(quantities, map(slice, ends, ends[1:]), strict=True))
         width = data.shape[1]
-        variances = family.rows
         rows, kind = [], []
-        count = np.zeros(sum(variances.sizes))
-        log_scale, at, first = 0.0, 0, 0
-        for block, size in zip(family.blocks, variances.sizes, strict=True):
+        self.count = np.zeros(sum(self.variances.sizes))
+        self.log_scale, at, first = 0.0, 0, 0
+        for block, size in zip(family.blocks, self.variances.sizes, strict=True):
             k, copies, m = len(block.scale), block.coordinates, size - 1
             part = data[at : at + block.size].reshape(k, -1) / block.scale[:, None]
             at += block.size
-            log_scale += 2.0 * copies * float(np.sum(np.log(block.scale)))
+            self.log_scale += 2.0 * copies * float(np.sum(np.log(block.scale)))
             if block.basis is not None:
                 inside = block.basis.U.T @ part
                 part = part - block.basis.U @ inside
                 rows.append(inside.reshape(-1, width))
                 kind.append(np.repeat(np.arange(first, first + m), copies))
-                count[first : first + m] = copies
+                self.count[first : first + m] = copies
             if k > m:
                 triangle = np.asarray(np.linalg.qr(part.reshape(-1, width), mode="r"))
                 rows.append(triangle)
                 kind.append(np.full(len(triangle), first + m))
-                count[first + m] = (k - m) * copies
+                self.count[first + m] = (k - m) * copies
             first += size
-        prior = family.prior
-        return cls(
-            family,
-            prior,
-            prior.factor,
-            variances,
-            np.concatenate(rows),
-            np.concatenate(kind),
-            count,
-            tuple(added),
-            log_scale,
-        )
+        self.rows, self.kind = np.concatenate(rows), np.concatenate(kind)
 
     def log(self, u: FloatArray) -> FloatArray:
         """Logarithms of θ ``(h,)``."""
@@ -308,7 +279,6 @@ class Evidence:
             found,
             _in_words(self.family, self.prior, found),
             self.family.at(found.mean),
-            self.log_likelihood(found.mean),
             L @ more @ L.T,
         )
 

@@ -25,7 +25,7 @@ ROUGH = LogNormal(0.12, 3.0)
 
 def learn_noise(family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> LearnedNoise:
     """The most probable noise of a linear model whose prior covariance is the unit matrix."""
-    evidence = Evidence.of(family, innovation, B)
+    evidence = Evidence(family, innovation, B)
     return evidence.learned(evidence.posterior(), np.eye(B.shape[1]))
 
 
@@ -114,7 +114,7 @@ def test_errors_far_beyond_what_is_believed_are_learned_all_the_same() -> None:
     # A thousand times as large as believed: on its way a search tries what no number holds.
     rng = np.random.default_rng(3)
     errors = 1e3 * rng.standard_normal(3 * len(POINTS))
-    evidence = Evidence.of(FAMILY, errors, np.zeros((errors.size, 1)))
+    evidence = Evidence(FAMILY, errors, np.zeros((errors.size, 1)))
     u = np.full(evidence.prior.size, 1e3)
     assert np.isfinite(evidence.objective(u)[0])
     rough = np.exp(evidence.log(evidence.posterior().mean))[list(FAMILY.names).index("rough")]
@@ -127,13 +127,13 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution(seed: int) -> Non
     e, columns, log = some(family, seed)
     S = dense(family, log) + columns @ columns.T
     expected = multivariate_normal(np.zeros(family.size), S).logpdf(e)
-    found = Evidence.of(family, e, columns).log_likelihood(log)
+    found = Evidence(family, e, columns).log_likelihood(log)
     assert found == pytest.approx(expected, rel=1e-8)
     # The same from the noise itself, as the filter uses it.
     unit = Gaussian(np.zeros(5), np.eye(5))
     update = kalman_update(unit, e, columns, family.at(log))
     assert update.log_likelihood == pytest.approx(expected, rel=1e-8)
-    mean, covariance = Evidence.of(family, e, columns).update(log, 5)
+    mean, covariance = Evidence(family, e, columns).update(log, 5)
     np.testing.assert_allclose(mean, update.posterior.mean, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(covariance, update.posterior.covariance, rtol=1e-7, atol=1e-12)
 
@@ -155,7 +155,7 @@ def test_what_differs_from_beat_to_beat_is_averaged_and_nothing_else(beats: floa
 def test_its_derivatives_are_those_of_differences() -> None:
     family = mixed_family()
     e, columns, log = some(family, 7)
-    evidence = Evidence.of(family, e, columns)
+    evidence = Evidence(family, e, columns)
     _, slope = evidence.misfit(log)
     # Fourth order: central differences at two steps, extrapolated.
     for k in range(len(log)):

@@ -61,11 +61,6 @@ class EnsembleFilter(RunFilter):
         ``square_root`` or ``perturbed``.
     seed : int
         Of all random numbers.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     members: int = 30

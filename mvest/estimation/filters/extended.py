@@ -21,11 +21,6 @@ class ExtendedFilter(RunFilter):
 
     It is the first step of `IteratedFilter`, kept to be compared with: what it lacks is what a
     non-linear model needs.
-
-    Raises
-    ------
-    InputError
-        If a shape or a covariance is not admissible; never for a failing model.
     """
 
     def estimate(self, run: FilterRun) -> Estimate:

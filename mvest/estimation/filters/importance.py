@@ -76,11 +76,6 @@ class ImportanceFilter(RunFilter):
         Finds x₀ and P₀.
     seed : int
         Of all random numbers.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     runs: int = 320

@@ -100,11 +100,6 @@ class IteratedFilter(RunFilter):
         Where Gauss-Newton does not come to its end, or its posterior is not that of the model's
         runs, find the second derivatives that it neglects from 2p further runs, and with them the
         mode and its covariance; see `_with_second_derivatives`.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     tolerance: float = 1e-4
@@ -135,7 +130,7 @@ class IteratedFilter(RunFilter):
         while True:
             innovation = run.y - point.prediction.y + point.H @ point.x
             if isinstance(run.R, NoiseFamily) and iterations < self.max_learned:
-                evidence = Evidence.of(run.R, innovation, point.H)
+                evidence = Evidence(run.R, innovation, point.H)
                 noise = evidence.posterior(mode)
                 mode, run.noise = noise.mode, run.R.at(evidence.log(noise.mean))
                 point = replace(point, objective=_objective(run, point.x, point.prediction))

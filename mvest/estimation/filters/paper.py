@@ -41,11 +41,6 @@ class PaperFilter(RunFilter):
         deviation if that is larger).
     max_iterations : int
         Largest number of rounds.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     Q: float | FloatArray = 0.01

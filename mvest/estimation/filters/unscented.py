@@ -54,11 +54,6 @@ class UnscentedFilter(RunFilter):
         Rounds. 1 is the filter of Moireau and Chapelle.
     spread : float
         Distance of the points from their mean, in parts of the simplex whose covariance is P.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     tolerance: float = 1e-3
