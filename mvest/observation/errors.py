@@ -176,8 +176,6 @@ class CoaptationDropout:
 
     def __call__(self, seen: FloatArray, true: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Hide the vertices."""
-        if self.distance == 0.0:
-            return seen
         joined = self._near(self.surface.vertices)
         hidden = np.array([self._near(frame) & ~joined for frame in true])
         if hidden.all(axis=1).any():

@@ -69,9 +69,6 @@ from mvest.valve.geometry.triangles import directed_edges, refined
 UNKNOWN = -1
 """Region of a point that may be of any leaflet."""
 
-MAX_CORRELATED_POINTS = 2000
-"""Largest number of points of a frame whose correlation is factorised: 32 MB and half a second."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedSurface:
@@ -282,7 +279,7 @@ class SurfaceObservation:
     ------
     InputError
         On inadmissible standard deviations, frames, or curves and leaflets that the model's surface
-        does not have; and if more than ``MAX_CORRELATED_POINTS`` points are to be correlated.
+        does not have.
     """
 
     seen: tuple[ObservedSurface, ...]
@@ -388,13 +385,6 @@ class SurfaceObservation:
             if self.curve_std_mm is None:
                 raise InputError("the free edge is seen, but curve_std_mm is not given")
             require_numbers(self, "observation", "curve_std_mm")
-        q = len(seen.points)
-        if self.correlation_length_mm and q > MAX_CORRELATED_POINTS:
-            raise InputError(
-                f"frame {seen.frame}: {q} points with correlated errors, expected at most "
-                f"{MAX_CORRELATED_POINTS}; thin them: points nearer to each other than the "
-                f"correlation length of {self.correlation_length_mm:g} mm say little that is new"
-            )
 
     def size_of(self, seen: ObservedSurface) -> int:
         """How many numbers are observed in one of the frames."""

@@ -75,7 +75,7 @@ class Observation:
                 f"{len(self.frames)} observed frames"
             )
         variance = np.broadcast_to(variance, len(self.frames)).copy()
-        require_positive(variance, "R (mm^2)")
+        require_positive(variance, "R")
         correlation = self.correlation
         if correlation is not None and len(correlation.points) != positions.shape[1]:
             raise InputError(

@@ -17,7 +17,6 @@ from mvest.estimation import (
 )
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.surfaces import (
-    MAX_CORRELATED_POINTS,
     UNKNOWN,
     ObservedSurface,
     PredictedSurface,
@@ -608,14 +607,6 @@ def test_the_side_flips_beyond_the_border_and_inner_points_do_not_care() -> None
     y = observation.of(model(translated(vertices)))(np.zeros(3)).y
     np.testing.assert_allclose(y, np.hypot(0.5, 0.01) * np.array([1, -1]), atol=1e-14)
     assert len(seen(pair).inner(3 * 0.5, vertices[surface.free_edge]).points) == 0
-
-
-def test_too_many_correlated_points_are_to_be_thinned() -> None:
-    _, surface = plane()
-    points = scattered(MAX_CORRELATED_POINTS + 1, 0.0)
-    with pytest.raises(InputError, match="thin them"):
-        SurfaceObservation((seen(points),), surface, 0.5, None, 3.0)
-    assert SurfaceObservation((seen(points),), surface, 0.5).y.size == MAX_CORRELATED_POINTS + 1
 
 
 # --- frames and failures ------------------------------------------------------------------------

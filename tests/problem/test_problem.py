@@ -203,11 +203,11 @@ def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"noise_mm": -1.0}, "noise of -1.0 mm"),
+        ({"noise_mm": -1.0}, "noise std = -1.0"),
         ({"frames": ("shut",)}, "shut"),
         ({"frames": ()}, "expected some of"),
         ({"frames": ("closed", "closed")}, "expected some of"),
-        ({"variance": 0.0}, "R = 0"),
+        ({"variance": 0.0}, "R is 0"),
         ({"variance": [0.1, 0.1, 0.1]}, "R has shape"),
         ({"variance": np.nan}, "R must be finite"),
     ],
