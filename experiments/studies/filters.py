@@ -17,9 +17,10 @@ from experiments.common.schema import BY_PARAMETER, Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
-from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, predict
+from mvest.estimation.run import Filter
 from mvest.estimation.transform import Log
 from mvest.observation.vertices import observed_frames
 from mvest.quantities import Length, Logarithm, PointsAlong, PointsAround, Value

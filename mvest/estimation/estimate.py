@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import scipy
@@ -13,8 +13,7 @@ from mvest.estimation.check import ApproximationCheck
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.consistency import chi_square_band
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Transform, covariance_to_physical
 from mvest.estimation.update import Update
 from mvest.typing import FloatArray
@@ -264,33 +263,6 @@ class Estimate:
         return self.transform.inverse(z.mean - half_width), self.transform.inverse(
             z.mean + half_width
         )
-
-
-class Filter(Protocol):
-    """What every filter is: settings that can be called on a model, a prior and observations."""
-
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Estimate the parameters of `model` from the observation y (n,) with noise R.
-
-        `prior` is N(m, P) of the parameters themselves, `transform` (default `Identity`) chooses
-        the coordinates to work in, `on_iterate` is called with each iterate.
-
-        Raises
-        ------
-        InputError
-            If a setting, a shape or a covariance is not admissible; never for a failing model.
-        """
-        ...
 
 
 def _std(covariances: FloatArray) -> FloatArray:

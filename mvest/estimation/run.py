@@ -261,8 +261,11 @@ class FilterRun:
         )
 
 
-class RunFilter:
-    """A filter that is written as a function of its `FilterRun`: what all of them begin with."""
+class Filter:
+    """What every filter is: settings that can be called on a model, a prior and observations.
+
+    A filter is written as a function of its `FilterRun`, with which all of them begin.
+    """
 
     __slots__ = ()
 
@@ -277,7 +280,27 @@ class RunFilter:
         transform: Transform | None = None,
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
-        """Estimate the parameters of a model; see `Filter` for the arguments."""
+        """Estimate the parameters of a model.
+
+        Parameters
+        ----------
+        model : ObservationModel
+        prior : Gaussian
+            N(m, P) of the parameters themselves.
+        y : (n,)
+            Observation.
+        R : NoiseCovariance
+        names : sequence of str, (p,), optional
+        transform : Transform, optional
+            Coordinates to work in; default `Identity`.
+        on_iterate : callable, optional
+            Called with each iterate.
+
+        Raises
+        ------
+        InputError
+            If a setting, a shape or a covariance is not admissible; never for a failing model.
+        """
         return self.estimate(FilterRun(model, prior, y, R, names, transform, on_iterate))
 
     def estimate(self, run: FilterRun) -> Estimate:
@@ -288,11 +311,3 @@ class RunFilter:
 def by_filter(slope: FloatArray, L: FloatArray) -> FloatArray:
     """dh/dz (n, p) from dh/dx where z = m + L x; 0 for what the prior holds fixed."""
     return np.asarray(np.linalg.lstsq(L.T, slope.T, rcond=None)[0].T, dtype=np.float64)
-
-
-def require_settings(*, tolerance: float, max_iterations: int) -> None:
-    """Raise InputError unless a filter's tolerance and iteration limit make sense."""
-    if not (np.isfinite(tolerance) and tolerance > 0.0):
-        raise InputError(f"a filter's tolerance must be positive; got {tolerance}")
-    if max_iterations < 1:
-        raise InputError(f"a filter needs at least one iteration; got {max_iterations}")

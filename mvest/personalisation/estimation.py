@@ -14,11 +14,12 @@ from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
-from mvest.estimation.estimate import Estimate, Filter, OnIterate
+from mvest.estimation.estimate import Estimate, OnIterate
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction, SharedStart, of_some, predict
+from mvest.estimation.run import Filter
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.mechanics.valve_system import HeldState

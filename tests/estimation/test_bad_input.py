@@ -115,14 +115,17 @@ BAD = {
         lambda: filtered(method=PaperFilter(Q=-0.01)),
         "Q has a negative variance -0.01",
     ),
-    "tolerance zero": (lambda: PaperFilter(tolerance=0.0), "tolerance must be positive; got 0"),
-    "tolerance NaN": (lambda: IteratedFilter(tolerance=np.nan), "tolerance must be positive"),
+    "tolerance zero": (lambda: PaperFilter(tolerance=0.0), "filter tolerance = 0.0, expected > 0"),
+    "tolerance NaN": (lambda: IteratedFilter(tolerance=np.nan), "filter tolerance = nan"),
     "objective tolerance": (
         lambda: IteratedFilter(objective_tolerance=-1.0),
-        "objective's tolerance must be positive; got -1",
+        "filter objective_tolerance = -1.0",
     ),
-    "no rounds": (lambda: PaperFilter(max_iterations=0), "at least one iteration; got 0"),
-    "no iterations": (lambda: IteratedFilter(max_iterations=0), "at least one iteration; got 0"),
+    "no rounds": (lambda: PaperFilter(max_iterations=0), "max_iterations = 0, expected >= 1"),
+    "no iterations": (
+        lambda: IteratedFilter(max_iterations=0),
+        "max_iterations = 0, expected >= 1",
+    ),
     "start of wrong length": (
         lambda: filtered(method=IteratedFilter(start=(1.0,))),
         r"start must be 2 finite numbers; got \(1.0,\)",

@@ -11,7 +11,7 @@ from mvest.estimation.check import STEP_LIMIT, ApproximationCheck
 from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.run import FilterRun, RunFilter
+from mvest.estimation.run import Filter, FilterRun
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
@@ -19,7 +19,7 @@ KINDS = ("square_root", "perturbed")
 
 
 @dataclass(frozen=True, slots=True)
-class EnsembleFilter(RunFilter):
+class EnsembleFilter(Filter):
     """Conditions an ensemble on the observation, at once or in several smaller steps.
 
     N members xⱼ are drawn from the prior, which is N(0, I) in these coordinates. One step with the

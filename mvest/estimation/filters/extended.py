@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mvest.estimation.estimate import Estimate, Reason
-from mvest.estimation.run import FilterRun, RunFilter
+from mvest.estimation.run import Filter, FilterRun
 from mvest.estimation.update import kalman_update
 
 
 @dataclass(frozen=True, slots=True)
-class ExtendedFilter(RunFilter):
+class ExtendedFilter(Filter):
     """One Kalman update, each observation counted once, nothing iterated.
 
     With the prior N(m, P) in filter coordinates (Jazwinski, Stochastic Processes and Filtering

@@ -9,11 +9,11 @@ from scipy.special import logsumexp
 
 from mvest.errors import InputError
 from mvest.estimation.check import ApproximationCheck
-from mvest.estimation.estimate import Estimate, Filter, Reason
+from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian, standard
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.run import FilterRun, RunFilter, by_filter
+from mvest.estimation.run import Filter, FilterRun, by_filter
 from mvest.typing import FloatArray, IntArray
 
 K_HAT_LIMIT = 0.7
@@ -42,7 +42,7 @@ DRAWS = 4000
 
 
 @dataclass(frozen=True, slots=True)
-class ImportanceFilter(RunFilter):
+class ImportanceFilter(Filter):
     """Weighted draws from the posterior, from proposals that learn from the model's derivatives.
 
     In coordinates x in which the prior is N(0, I), with π(x) = exp(−J(x)):

@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.evidence import Evidence
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseFamily
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.run import FilterRun, RunFilter, require_settings
+from mvest.estimation.run import Filter, FilterRun
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
@@ -52,7 +52,7 @@ MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 2, 6, 5
 
 
 @dataclass(frozen=True, slots=True)
-class IteratedFilter(RunFilter):
+class IteratedFilter(Filter):
     """Posterior mode and its covariance, each observation counted once.
 
     Minimises, in filter coordinates z with the prior N(m, P), the objective::
@@ -110,11 +110,8 @@ class IteratedFilter(RunFilter):
     second_order: bool = False
 
     def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
-        if not (np.isfinite(self.objective_tolerance) and self.objective_tolerance > 0.0):
-            raise InputError(
-                f"the objective's tolerance must be positive; got {self.objective_tolerance}"
-            )
+        require_numbers(self, "filter", "tolerance", "objective_tolerance")
+        require_numbers(self, "filter", "max_iterations", least=1)
 
     def estimate(self, run: FilterRun) -> Estimate:
         """Find the posterior mode."""

@@ -4,17 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvest.errors import require_numbers
 from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian, as_covariance
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.run import FilterRun, RunFilter, require_settings
+from mvest.estimation.run import Filter, FilterRun
 from mvest.estimation.transform import covariance_to_filter
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperFilter(RunFilter):
+class PaperFilter(Filter):
     """Extended Kalman filter that cycles the same frames as new observations.
 
     Estimation of patient-specific material properties of the mitral valve using 4D transesophageal
@@ -48,7 +49,8 @@ class PaperFilter(RunFilter):
     max_iterations: int = 50
 
     def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
+        require_numbers(self, "filter", "tolerance")
+        require_numbers(self, "filter", "max_iterations", least=1)
 
     def estimate(self, run: FilterRun) -> Estimate:
         """Run rounds until they agree."""

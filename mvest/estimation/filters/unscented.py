@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from mvest.errors import InputError
+from mvest.errors import require_numbers
 from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.run import FilterRun, RunFilter, by_filter, require_settings
+from mvest.estimation.run import Filter, FilterRun, by_filter
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
@@ -20,7 +20,7 @@ MAX_REJECTIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class UnscentedFilter(RunFilter):
+class UnscentedFilter(Filter):
     """Statistical linearisation with the corners of a simplex, iterated about the posterior.
 
     In coordinates x in which the prior is N(0, I), and with the p + 1 corners σⱼ of a regular
@@ -61,9 +61,8 @@ class UnscentedFilter(RunFilter):
     spread: float = 1.0
 
     def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
-        if not (np.isfinite(self.spread) and self.spread > 0.0):
-            raise InputError(f"the spread of sigma points must be positive; got {self.spread}")
+        require_numbers(self, "filter", "tolerance", "spread")
+        require_numbers(self, "filter", "max_iterations", least=1)
 
     def estimate(self, run: FilterRun) -> Estimate:
         """Estimate without derivatives."""

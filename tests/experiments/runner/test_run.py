@@ -102,7 +102,7 @@ ERRORS = [
     ("filter=magic", "Could not find 'filter/magic'; known: "),
     ("filter.transform=exp", "filter.transform = 'exp'"),
     ("filter.method.tolerance=0", "tolerance must be positive"),
-    ("filter.method.max_iterations=0", "at least one iteration"),
+    ("filter.method.max_iterations=0", "max_iterations = 0"),
     ("observation.noise_mm=-1", "observation.noise_mm = -1, expected 0 to 1000 mm"),
     ("observation.frames=[shut]", "observed frames ['shut']"),
     ("observation.columns=7", "template of 7 x 7 vertices"),
