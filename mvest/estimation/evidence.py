@@ -297,8 +297,7 @@ def _in_words(
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:
         first = BANDS
-        correlation = _Correlation.of(basis)
-        for name, amount in ((SMOOTH, correlation.log_std), (LENGTH, correlation.log_length)):
+        for name, amount in _amounts(basis).items():
             believed, learned = (
                 _log_normal(amount, Gaussian(of.mean[:BANDS], of.covariance[:BANDS, :BANDS]))
                 for of in (prior, posterior)
@@ -335,49 +334,45 @@ def _log_normal(amount: Callable[[FloatArray], float], of: Gaussian) -> LogNorma
     return LogNormal(float(np.exp(amount(of.mean))), float(np.exp(np.sqrt(variance))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Correlation:
-    """Covariance of the smooth part at the shells' distances ``(BANDS, SHELLS)`` per unit s_b²."""
+def _amounts(basis: Basis) -> dict[str, Callable[[FloatArray], float]]:
+    """Logarithms of the smooth part's standard deviation and length as functions of its bands.
 
-    distance: FloatArray
-    by_band: FloatArray
+    From its covariance at the shells' distances per unit s_b².
+    """
+    centres = spread_points(basis.points, min(len(basis.points), CENTRES))
+    apart = cdist(basis.points[centres], basis.points)
+    near = apart < RANGE * basis.length
+    apart = apart[near]
+    edges = np.linspace(0.0, float(apart.max()), SHELLS + 1)[1:-1]
+    shell = np.digitize(apart, edges)
+    count = np.bincount(shell, minlength=SHELLS)
+    filled = count > 0
 
-    @classmethod
-    def of(cls, basis: Basis) -> _Correlation:
-        centres = spread_points(basis.points, min(len(basis.points), CENTRES))
-        apart = cdist(basis.points[centres], basis.points)
-        near = apart < RANGE * basis.length
-        apart = apart[near]
-        edges = np.linspace(0.0, float(apart.max()), SHELLS + 1)[1:-1]
-        shell = np.digitize(apart, edges)
-        count = np.bincount(shell, minlength=SHELLS)
-        filled = count > 0
-        k = len(basis.U)
+    def mean(values: FloatArray) -> FloatArray:
+        return np.bincount(shell, values, SHELLS)[filled] / count[filled]
 
-        def mean(values: FloatArray) -> FloatArray:
-            return np.bincount(shell, values, SHELLS)[filled] / count[filled]
+    own = np.sum(basis.U**2, axis=0) / len(basis.U)
+    by_band = np.zeros((BANDS, 1 + np.count_nonzero(filled)))
+    for band in np.unique(basis.band):
+        members = basis.band == band
+        U, w = basis.U[:, members], basis.w[members]
+        by_band[band, 1:] = mean(((U[centres] * w) @ U.T)[near])
+        by_band[band, 0] = float(own[members] @ w)
+    distance = np.append(0.0, mean(apart))
+    level = float(matern(np.ones(1), 1.0)[0])
 
-        own = np.sum(basis.U**2, axis=0) / k
-        table = np.zeros((BANDS, 1 + np.count_nonzero(filled)))
-        for band in np.unique(basis.band):
-            members = basis.band == band
-            U, w = basis.U[:, members], basis.w[members]
-            covariance = (U[centres] * w) @ U.T
-            table[band, 1:] = mean(covariance[near])
-            table[band, 0] = float(own[members] @ w)
-        return cls(np.append(0.0, mean(apart)), table)
+    def log_std(bands: FloatArray) -> float:
+        return float(0.5 * np.log(np.exp(2.0 * bands) @ by_band[:, 0]))
 
-    def log_std(self, bands: FloatArray) -> float:
-        return float(0.5 * np.log(np.exp(2.0 * bands) @ self.by_band[:, 0]))
-
-    def log_length(self, bands: FloatArray) -> float:
+    def log_length(bands: FloatArray) -> float:
         """Of the distance at which the correlation is as a Matérn one's at its length."""
-        covariance = np.exp(2.0 * bands) @ self.by_band
-        level = float(matern(np.ones(1), 1.0)[0])
+        covariance = np.exp(2.0 * bands) @ by_band
         below = np.flatnonzero(covariance[1:] < level * covariance[0])
         if not below.size:
-            return float(np.log(self.distance[-1]))
+            return float(np.log(distance[-1]))
         j = int(below[0]) + 1
         share = covariance[j - 1 : j + 1] / covariance[0]
         at = (share[0] - level) / (share[0] - share[1])
-        return float(np.log(self.distance[j - 1] + at * (self.distance[j] - self.distance[j - 1])))
+        return float(np.log(distance[j - 1] + at * (distance[j] - distance[j - 1])))
+
+    return {SMOOTH: log_std, LENGTH: log_length}
