@@ -100,34 +100,26 @@ class ImportanceFilter(Filter):
         if first.prediction is None:
             z = first.transformed
             return run.fail(z.mean, z.covariance, Prediction.failed(first.detail))
-        run.record(
-            first.transformed.mean,
-            first.transformed.covariance,
-            float(first.objective[-1]),
-            float(first.log_likelihood[-1]),
-        )
+        at, last = first.transformed, (first.objective[-1], first.log_likelihood[-1])
+        run.record(at.mean, at.covariance, *map(float, last))
         rng, L = np.random.default_rng(self.seed), run.L
-        draws = _Draws(run, standard(run.prior, first.transformed))
+        draws = _Draws(run, standard(run.prior, at))
         while True:
             draws.more(min(self.batch, self.runs - len(draws.points)), rng)
             weights, k_hat, effective = draws.weights()
             good = effective >= self.effective and k_hat <= K_HAT_LIMIT
-            good = good and draws.rounds > EXPLORING
+            good = good and len(draws.rounds) > EXPLORING
             if good or len(draws.points) >= self.runs:
                 break
         x = weights @ draws.points
         spread = draws.points - x
         chosen = draws.points[rng.choice(len(weights), DRAWS, p=weights)]
         checks = [
-            ApproximationCheck(
-                "effective draws, how many times too few",
-                self.effective / effective,
-                1.0,
-                len(weights),
-            ),
-            ApproximationCheck(
-                "tail of the weights, Pareto k", max(k_hat, 0.0), K_HAT_LIMIT, len(weights)
-            ),
+            ApproximationCheck(compared, value, limit, len(weights))
+            for compared, value, limit in (
+                ("effective draws, how many times too few", self.effective / effective, 1.0),
+                ("tail of the weights, Pareto k", max(k_hat, 0.0), K_HAT_LIMIT),
+            )
         ]
         return run.finish_with_slope(
             run.z(x),
@@ -146,46 +138,38 @@ class _Draws:
     Attributes
     ----------
     points : (s, p)
+    rounds : list of (int, list)
+        How many were drawn in each from which mixture: shares, means and covariances.
     slope : (n, p)
         dh/dx at the last run with derivatives; 0 without any.
     """
 
     def __init__(self, run: FilterRun, laplace: Gaussian) -> None:
         self._run, self._laplace = run, laplace
-        p = laplace.mean.size
-        self.points = np.empty((0, p))
-        self.slope = np.zeros((run.y.size, p))
+        self.points = np.empty((0, laplace.size))
+        self.slope = np.zeros((run.y.size, laplace.size))
         self._log_target = np.empty(0)
         self._moved: list[tuple[FloatArray, FloatArray]] = []
         self._covariances: list[FloatArray] = []
-        self._rounds: list[tuple[int, list[tuple[float, FloatArray, FloatArray]]]] = []
+        self.rounds: list[tuple[int, list[tuple[float, FloatArray, FloatArray]]]] = []
 
     def more(self, count: int, rng: np.random.Generator) -> None:
         """Draw from the next mixture, and run the model there."""
-        mixture = self._mixture(rng)
+        mixture, p = self._mixture(), self._laplace.size
         shares = np.array([share for share, _, _ in mixture])
         # Stratified: each part as often as its share says, but for the rounding.
         edges = (np.arange(count) + rng.random()) / count
         which = np.searchsorted(np.cumsum(shares / shares.sum()), edges)
         drawn = np.array(
             [
-                mixture[k][1] + np.linalg.cholesky(mixture[k][2]) @ rng.standard_normal(len(self))
+                mixture[k][1] + np.linalg.cholesky(mixture[k][2]) @ rng.standard_normal(p)
                 for k in np.minimum(which, len(mixture) - 1)
             ]
         )
-        self._rounds.append((count, mixture))
+        self.rounds.append((count, mixture))
         values = [self._evaluate(x) for x in drawn]
         self.points = np.vstack([self.points, drawn])
         self._log_target = np.append(self._log_target, values)
-
-    @property
-    def rounds(self) -> int:
-        """How many there were."""
-        return len(self._rounds)
-
-    def __len__(self) -> int:
-        """Number p of unknowns."""
-        return self._laplace.mean.size
 
     def weights(self) -> tuple[FloatArray, float, float]:
         """Smoothed weights (s,) that sum to 1, their k̂, and how many draws are effective."""
@@ -193,7 +177,7 @@ class _Draws:
 
         count = len(self.points)
         parts = [
-            np.log(drawn / count) + self._log_mixture(mixture) for drawn, mixture in self._rounds
+            np.log(drawn / count) + self._log_mixture(mixture) for drawn, mixture in self.rounds
         ]
         raw = self._log_target - logsumexp(parts, axis=0)
         possible = raw > max(float(np.max(raw)), -1e300) - NOTHING
@@ -224,14 +208,14 @@ class _Draws:
         self._covariances.append(0.5 * (covariance + covariance.T))
         return value
 
-    def _mixture(self, rng: np.random.Generator) -> list[tuple[float, FloatArray, FloatArray]]:
+    def _mixture(self) -> list[tuple[float, FloatArray, FloatArray]]:
         """Shares, means and covariances of the next proposal."""
-        p = len(self)
+        p = self._laplace.size
         wide = self._laplace.covariance * 1.3**2
         prior = (PRIOR_SHARE, np.zeros(p), np.eye(p))
-        if not self._rounds:
+        if not self.rounds:
             return [(0.5, self._laplace.mean, wide), (0.5, *prior[1:])]
-        if len(self._rounds) < EXPLORING and self._moved:
+        if len(self.rounds) < EXPLORING and self._moved:
             share = (0.9 - PRIOR_SHARE) / len(self._moved)
             moved = [(share, mean, 0.25 * P) for mean, P in self._moved]
             self._moved = []

@@ -9,7 +9,7 @@ from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian, as_covariance
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.run import Filter, FilterRun
-from mvest.estimation.transform import covariance_to_filter
+from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
@@ -54,9 +54,8 @@ class PaperFilter(Filter):
 
     def estimate(self, run: FilterRun) -> Estimate:
         """Run rounds until they agree."""
-        Q = covariance_to_filter(
-            run.transform, run.prior.mean, as_covariance(self.Q, run.prior.size, "Q")
-        )
+        step = Gaussian(run.physical_prior.mean, as_covariance(self.Q, run.prior.size, "Q"))
+        Q = to_filter(run.transform, step).covariance
         m, P = run.prior.mean, run.prior.covariance
         converged, rounds = False, 0
         while True:
