@@ -15,7 +15,7 @@ import numpy as np
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation import Prediction
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalisation import CaseMesh, PersonaliseSettings, Prior, Treatment

@@ -26,8 +26,7 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.information.consistency import nees
 from mvest.estimation.information.identifiability import identifiability
-from mvest.estimation.prediction import predict
-from mvest.estimation.wrappers import Remembered
+from mvest.estimation.prediction import Remembered, predict
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.expectation import expect
@@ -308,7 +307,7 @@ def _rows(fits: Sequence[Fit], bounds: Sequence[Row]) -> Iterator[Row]:
                 "bound": best[TWO if one.label == TWO else WHOLE, name],
                 "NEES": squared,
                 "runs": found.forward_solves,
-                "residual": found.residual_rms(one.result.observation.y),
+                "residual": found.innovation and found.innovation.residual_rms,
                 "status": "converged" if one.result.converged else "failed",
             }
 

@@ -22,9 +22,9 @@ from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, build, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, predict
+from mvest.estimation.run import Filter
 from mvest.estimation.transform import Transform
 from mvest.exchange.external.contract import (
     Command,

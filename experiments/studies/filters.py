@@ -17,9 +17,10 @@ from experiments.common.schema import BY_PARAMETER, Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
-from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, predict
+from mvest.estimation.run import Filter
 from mvest.estimation.transform import Log
 from mvest.observation.vertices import observed_frames
 from mvest.quantities import Length, Logarithm, PointsAlong, PointsAround, Value
@@ -119,7 +120,6 @@ COLUMNS: dict[str, Column | str] = {
     "runs": "",
     "check": ":.2g",
     "check limit": "",
-    "check runs": Column(hidden=True),
     "ended": Column(hidden=True),
     "detail": Column(hidden=True),
 }
@@ -214,7 +214,6 @@ class Problem:
                 "runs": found.forward_solves,
                 "check": check and check.value,
                 "check limit": check and check.limit,
-                "check runs": check and check.extra_runs,
                 "ended": found.why,
                 "detail": found.detail,
             }

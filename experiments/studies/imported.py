@@ -48,8 +48,7 @@ from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, run_gate
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
-from mvest.estimation.prediction import Prediction
-from mvest.estimation.wrappers import Remembered, SharedStart
+from mvest.estimation.prediction import Prediction, Remembered, SharedStart
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.regions import part_of

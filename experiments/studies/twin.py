@@ -19,7 +19,7 @@ from experiments.common.records.record import Mesh, Number, model_of_values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, MvestError
-from mvest.estimation.wrappers import SharedStart
+from mvest.estimation.prediction import SharedStart
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.fields import valve_fields

@@ -1,6 +1,5 @@
 from .check import ApproximationCheck as ApproximationCheck
 from .estimate import Estimate as Estimate
-from .estimate import Filter as Filter
 from .estimate import InnovationSummary as InnovationSummary
 from .estimate import Reason as Reason
 from .filters.ensemble import EnsembleFilter as EnsembleFilter
@@ -28,6 +27,7 @@ from .noise import ObservationNoise as ObservationNoise
 from .noise import observation_noise as observation_noise
 from .prediction import ObservationModel as ObservationModel
 from .prediction import Prediction as Prediction
+from .run import Filter as Filter
 from .transform import Identity as Identity
 from .transform import Log as Log
 from .transform import Transform as Transform

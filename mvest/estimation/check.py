@@ -57,15 +57,12 @@ class ApproximationCheck:
         Largest value at which the estimate's interval means what it says.
     runs : int
         Runs of the model that it rests on.
-    extra_runs : int
-        Of these, how many were made for it.
     """
 
     compared: str
     value: float
     limit: float
     runs: int
-    extra_runs: int = 0
 
     def __post_init__(self) -> None:
         if np.isnan(self.value) or not self.limit > 0.0:
@@ -102,7 +99,6 @@ def check_against_runs(
     predicted: FloatArray,
     H: FloatArray,
     runs: Sequence[Run],
-    extra_runs: int = 0,
 ) -> list[ApproximationCheck]:
     """Compare N(z, P) with the objective J at runs of the model, and with one more update.
 
@@ -133,8 +129,6 @@ def check_against_runs(
     H : (n, p)
         Derivative, or slope, of the prediction there.
     runs : sequence of Run
-    extra_runs : int
-        How many of the runs were made for the check.
     """
     z, C = posterior.mean, posterior.factor
     e = noise.whiten(y - predicted)
@@ -184,7 +178,7 @@ def check_against_runs(
         (curved, DISTANCE_LIMIT, "curvature of the model over one posterior standard deviation"),
     ):
         if values:
-            checks.append(ApproximationCheck(what, max(values), limit, compared, extra_runs))
+            checks.append(ApproximationCheck(what, max(values), limit, compared))
     update = kalman_update(prior, y - predicted + H @ (z - prior.mean), H, noise)
     step = _coordinates(C, update.posterior.mean - z)[0]
     checks.append(
@@ -196,14 +190,6 @@ def check_against_runs(
         )
     )
     return checks
-
-
-def principal_points(posterior: Gaussian, count: int) -> FloatArray:
-    """Points (count, p) at ± 1 standard deviation along the principal axes, widest axis first."""
-    values, axes = np.linalg.eigh(posterior.covariance)
-    steps = (axes * np.sqrt(np.maximum(values, 0.0))).T[::-1]
-    both = np.stack([steps, -steps], axis=1).reshape(-1, posterior.size)
-    return posterior.mean + both[: min(count, len(both))]
 
 
 def _change_of_distance(q: FloatArray, e: FloatArray, a: FloatArray, more: float) -> float:

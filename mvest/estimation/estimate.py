@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import scipy
@@ -13,8 +13,7 @@ from mvest.estimation.check import ApproximationCheck
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.consistency import chi_square_band
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Transform, covariance_to_physical
 from mvest.estimation.update import Update
 from mvest.typing import FloatArray
@@ -48,7 +47,7 @@ class InnovationSummary:
 
     It is what the prior leaves unexplained, e = y − h(z) + H (z − m), linearised at the estimate z:
     with a linear model y less what the prior's mean m predicts. What the estimate leaves is the
-    residual y − h(z), and smaller (`Estimate.residual_rms`).
+    residual y − h(z), and smaller (`residual_rms`).
 
     The paper's filter sees the same y again in each round, so that there y is not independent of
     the state it is compared with, and its `nis` is smaller than a chi-square number.
@@ -63,8 +62,6 @@ class InnovationSummary:
         Root mean square of the residual y − h(z), of the estimate itself.
     nis : float
         eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right.
-    nis_band : (float, float)
-        Band that holds such a number with 95 % probability.
     log_likelihood : float
         log N(e; 0, S).
     standardised : (n,)
@@ -76,7 +73,6 @@ class InnovationSummary:
     max_abs: float
     residual_rms: float
     nis: float
-    nis_band: tuple[float, float]
     log_likelihood: float
     standardised: FloatArray
 
@@ -91,10 +87,14 @@ class InnovationSummary:
             max_abs=float(np.max(np.abs(innovation))),
             residual_rms=float(np.sqrt(np.mean(residual**2))),
             nis=update.nis,
-            nis_band=chi_square_band(innovation.size),
             log_likelihood=update.log_likelihood,
             standardised=update.standardised_innovation,
         )
+
+    @property
+    def nis_band(self) -> tuple[float, float]:
+        """Band that holds such a number as `nis` with 95 % probability."""
+        return chi_square_band(self.size)
 
     @property
     def consistent(self) -> bool:
@@ -209,12 +209,6 @@ class Estimate:
         """Number of updates, one less than the number of iterates."""
         return len(self.transformed_iterates) - 1
 
-    def residual_rms(self, y: FloatArray) -> float | None:
-        """Root mean square of y (n,) less what is predicted at the estimate, in its units."""
-        if self.prediction is None:
-            return None
-        return float(np.sqrt(np.mean((y - self.prediction.y) ** 2)))
-
     @property
     def iterates(self) -> FloatArray:
         """Parameters at each iterate (k, p)."""
@@ -269,28 +263,6 @@ class Estimate:
         return self.transform.inverse(z.mean - half_width), self.transform.inverse(
             z.mean + half_width
         )
-
-
-class Filter(Protocol):
-    """What every filter is: settings that can be called on a model, a prior and observations."""
-
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Estimate the parameters of `model` from the observation y (n,) with noise R.
-
-        `prior` is N(m, P) of the parameters themselves, `transform` (default `Identity`) chooses
-        the coordinates to work in, `on_iterate` is called with each iterate.
-        """
-        ...
 
 
 def _std(covariances: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Learning the noise together with the parameters, from one linearisation of a model.
 
 With the innovation e = y − h(z) + H (z − m) of the prior N(m, P), linearised at z, and the noise
-R(θ) of quantities θ (see ``noise_family``)::
+R(θ) of quantities θ (see `mvest.estimation.noise`)::
 
     log p(e | θ) = log N(e; 0, S),   S = R(θ) + H P Hᵀ + C Cᵀ
 
@@ -26,17 +26,9 @@ import scipy
 from scipy.spatial.distance import cdist
 
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import ObservationNoise
-from mvest.estimation.noise_family import (
-    BANDS,
-    Basis,
-    LogNormal,
-    NoiseFamily,
-    VarianceRows,
-    matern,
-    spread_points,
-)
-from mvest.typing import FloatArray, IntArray
+from mvest.estimation.noise import NoiseFamily, ObservationNoise
+from mvest.estimation.spectrum import BANDS, Basis, LogNormal, matern, spread_points
+from mvest.typing import FloatArray
 
 TOLERANCE = 1e-3
 """Slope of the evidence, per standard deviation of the prior, at which it is greatest."""
@@ -90,8 +82,6 @@ class LearnedNoise:
         of what is rough.
     noise : ObservationNoise
         At the mean, added columns included.
-    log_likelihood : float
-        log p(e | θ) there.
     covariance : (p, p) in filter coordinates
         What the doubt of θ adds to the covariance of the estimate.
     """
@@ -101,56 +91,11 @@ class LearnedNoise:
     posterior: Gaussian
     quantities: tuple[LearnedQuantity, ...]
     noise: ObservationNoise
-    log_likelihood: float
     covariance: FloatArray
-
-    def __str__(self) -> str:
-        return "\n".join(
-            f"{q.name}: {q.learned.median:.3g} [{q.learned.interval()[0]:.3g}, "
-            f"{q.learned.interval()[1]:.3g}], believed {q.believed.median:.3g} "
-            f"[{q.believed.interval()[0]:.3g}, {q.believed.interval()[1]:.3g}]"
-            for q in self.quantities
-        )
-
-
-class NoiseLearner:
-    """Learns the noise of one estimation, again and again as its linearisation improves."""
-
-    def __init__(self, family: NoiseFamily) -> None:
-        self.family = family
-        self._evidence: Evidence | None = None
-        self._posterior: _Posterior | None = None
-
-    def learn(self, innovation: FloatArray, B: FloatArray) -> ObservationNoise:
-        """The noise at the mean of what is known of it.
-
-        Parameters
-        ----------
-        innovation : (n,)
-            e.
-        B : (n, p)
-            H L, with the prior's covariance P = L Lᵀ.
-        """
-        self._evidence = Evidence.of(self.family, innovation, B)
-        start = None if self._posterior is None else self._posterior.mode
-        self._posterior = self._evidence.posterior(start)
-        return self.family.at(self._evidence.log(self._posterior.mean))
-
-    def learned(self, L: FloatArray) -> LearnedNoise:
-        """What is known of the noise, from the innovation that was given last.
-
-        Parameters
-        ----------
-        L : (p, p)
-            Root of the prior's covariance in filter coordinates.
-        """
-        assert self._evidence is not None
-        assert self._posterior is not None
-        return self._evidence.learned(self._posterior, L)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Posterior:
+class Posterior:
     """Of coordinates u: the mode, the mean, and a root of the covariance."""
 
     mode: FloatArray
@@ -158,11 +103,18 @@ class _Posterior:
     spread: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """log p(e | θ) as a function, after everything is projected.
 
     Coordinates u are those in which the prior of log θ is N(0, I): log θ = mean + L u.
+
+    Parameters
+    ----------
+    family : NoiseFamily
+    innovation : (n,)
+        e.
+    B : (n, p)
+        H L, with the prior's covariance P = L Lᵀ.
 
     Attributes
     ----------
@@ -177,72 +129,48 @@ class Evidence:
         Which of the variances is that of a row.
     count : (v,)
         Observations of each variance, for the determinant.
-    added : tuple of (int, slice)
+    added : list of (int, slice)
         Which quantity is the factor of which columns.
     log_scale : float
         log det D².
     """
 
-    family: NoiseFamily
-    prior: Gaussian
-    root: FloatArray
-    variances: VarianceRows
-    rows: FloatArray
-    kind: IntArray
-    count: FloatArray
-    added: tuple[tuple[int, slice], ...]
-    log_scale: float
-
-    @classmethod
-    def of(cls, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> Evidence:
-        """Project an innovation ``(n,)`` and B ``(n, p)``, see `NoiseLearner.learn`."""
-        added, start = [], B.shape[1]
-        for k, columns in enumerate(family.columns, len(family.names) - len(family.columns)):
-            added.append((k, slice(start, start + columns.columns.shape[1])))
-            start += columns.columns.shape[1]
-        data = np.concatenate(
-            [innovation[:, None], B, *(columns.columns for columns in family.columns)], axis=1
-        )
+    def __init__(self, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> None:
+        self.family, self.prior = family, family.prior
+        self.root, self.variances = self.prior.factor, family.rows
+        columns = [own.columns for own in family.columns]
+        data = np.concatenate([innovation[:, None], B, *columns], axis=1)
+        ends = np.cumsum([B.shape[1], *(own.shape[1] for own in columns)]).tolist()
+        quantities = range(len(family.names) - len(columns), len(family.names))
+        self.added = list(zip(quantities, map(slice, ends, ends[1:]), strict=True))
         width = data.shape[1]
-        variances = family.rows
         rows, kind = [], []
-        count = np.zeros(sum(variances.sizes))
-        log_scale, at, first = 0.0, 0, 0
-        for block, size in zip(family.blocks, variances.sizes, strict=True):
+        self.count = np.zeros(sum(self.variances.sizes))
+        self.log_scale, at, first = 0.0, 0, 0
+        for block, size in zip(family.blocks, self.variances.sizes, strict=True):
             k, copies, m = len(block.scale), block.coordinates, size - 1
             part = data[at : at + block.size].reshape(k, -1) / block.scale[:, None]
             at += block.size
-            log_scale += 2.0 * copies * float(np.sum(np.log(block.scale)))
+            self.log_scale += 2.0 * copies * float(np.sum(np.log(block.scale)))
             if block.basis is not None:
                 inside = block.basis.U.T @ part
                 part = part - block.basis.U @ inside
                 rows.append(inside.reshape(-1, width))
                 kind.append(np.repeat(np.arange(first, first + m), copies))
-                count[first : first + m] = copies
+                self.count[first : first + m] = copies
             if k > m:
                 triangle = np.asarray(np.linalg.qr(part.reshape(-1, width), mode="r"))
                 rows.append(triangle)
                 kind.append(np.full(len(triangle), first + m))
-                count[first + m] = (k - m) * copies
+                self.count[first + m] = (k - m) * copies
             first += size
-        prior = family.prior
-        return cls(
-            family,
-            prior,
-            prior.factor,
-            variances,
-            np.concatenate(rows),
-            np.concatenate(kind),
-            count,
-            tuple(added),
-            log_scale,
-        )
+        self.rows, self.kind = np.concatenate(rows), np.concatenate(kind)
 
     def log(self, u: FloatArray) -> FloatArray:
         """Logarithms of θ ``(h,)``."""
         return np.asarray(self.prior.mean + self.root @ u)
 
-    def posterior(self, start: FloatArray | None = None) -> _Posterior:
+    def posterior(self, start: FloatArray | None = None) -> Posterior:
         """What is known of u, near normal about its mean.
 
         Of a variance that few observations tell the most probable value is too small. The mean is
@@ -253,7 +181,7 @@ class Evidence:
         h = self.prior.size
         u = np.zeros(h) if start is None else start
         if not self.root.any():
-            return _Posterior(u, u, np.zeros((h, h)))
+            return Posterior(u, u, np.zeros((h, h)))
         u = np.asarray(
             scipy.optimize.minimize(
                 self.objective, u, jac=True, method="BFGS", options={"gtol": TOLERANCE}
@@ -273,7 +201,7 @@ class Evidence:
         )
         moved = -0.5 * spread.T @ bend
         moved /= max(1.0, float(np.linalg.norm(moved)))
-        return _Posterior(u, u + spread @ moved, spread)
+        return Posterior(u, u + spread @ moved, spread)
 
     def objective(self, u: FloatArray) -> tuple[float, FloatArray]:
         """−log p(e | θ) − log p(θ) but for a constant, and its derivatives by u."""
@@ -333,8 +261,8 @@ class Evidence:
         root = scipy.linalg.cholesky(M, lower=True, check_finite=False)
         return e, B, root, scipy.linalg.cho_solve((root, True), B.T @ e, check_finite=False)
 
-    def learned(self, posterior: _Posterior, L: FloatArray) -> LearnedNoise:
-        """What is known of the noise, in a reader's terms; L as in `NoiseLearner.learned`."""
+    def learned(self, posterior: Posterior, L: FloatArray) -> LearnedNoise:
+        """What is known of the noise, in a reader's terms; P = L Lᵀ is the prior's covariance."""
         u, h, p = posterior.mean, self.prior.size, len(L)
         P = self.update(self.log(u), p)[1]
         more = np.zeros((p, p))
@@ -351,7 +279,6 @@ class Evidence:
             found,
             _in_words(self.family, self.prior, found),
             self.family.at(found.mean),
-            self.log_likelihood(found.mean),
             L @ more @ L.T,
         )
 
@@ -370,8 +297,7 @@ def _in_words(
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:
         first = BANDS
-        correlation = _Correlation.of(basis)
-        for name, amount in ((SMOOTH, correlation.log_std), (LENGTH, correlation.log_length)):
+        for name, amount in _amounts(basis).items():
             believed, learned = (
                 _log_normal(amount, Gaussian(of.mean[:BANDS], of.covariance[:BANDS, :BANDS]))
                 for of in (prior, posterior)
@@ -408,49 +334,45 @@ def _log_normal(amount: Callable[[FloatArray], float], of: Gaussian) -> LogNorma
     return LogNormal(float(np.exp(amount(of.mean))), float(np.exp(np.sqrt(variance))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Correlation:
-    """Covariance of the smooth part at the shells' distances ``(BANDS, SHELLS)`` per unit s_b²."""
+def _amounts(basis: Basis) -> dict[str, Callable[[FloatArray], float]]:
+    """Logarithms of the smooth part's standard deviation and length as functions of its bands.
 
-    distance: FloatArray
-    by_band: FloatArray
+    From its covariance at the shells' distances per unit s_b².
+    """
+    centres = spread_points(basis.points, min(len(basis.points), CENTRES))
+    apart = cdist(basis.points[centres], basis.points)
+    near = apart < RANGE * basis.length
+    apart = apart[near]
+    edges = np.linspace(0.0, float(apart.max()), SHELLS + 1)[1:-1]
+    shell = np.digitize(apart, edges)
+    count = np.bincount(shell, minlength=SHELLS)
+    filled = count > 0
 
-    @classmethod
-    def of(cls, basis: Basis) -> _Correlation:
-        centres = spread_points(basis.points, min(len(basis.points), CENTRES))
-        apart = cdist(basis.points[centres], basis.points)
-        near = apart < RANGE * basis.length
-        apart = apart[near]
-        edges = np.linspace(0.0, float(apart.max()), SHELLS + 1)[1:-1]
-        shell = np.digitize(apart, edges)
-        count = np.bincount(shell, minlength=SHELLS)
-        filled = count > 0
-        k = len(basis.U)
+    def mean(values: FloatArray) -> FloatArray:
+        return np.bincount(shell, values, SHELLS)[filled] / count[filled]
 
-        def mean(values: FloatArray) -> FloatArray:
-            return np.bincount(shell, values, SHELLS)[filled] / count[filled]
+    own = np.sum(basis.U**2, axis=0) / len(basis.U)
+    by_band = np.zeros((BANDS, 1 + np.count_nonzero(filled)))
+    for band in np.unique(basis.band):
+        members = basis.band == band
+        U, w = basis.U[:, members], basis.w[members]
+        by_band[band, 1:] = mean(((U[centres] * w) @ U.T)[near])
+        by_band[band, 0] = float(own[members] @ w)
+    distance = np.append(0.0, mean(apart))
+    level = float(matern(np.ones(1), 1.0)[0])
 
-        own = np.sum(basis.U**2, axis=0) / k
-        table = np.zeros((BANDS, 1 + np.count_nonzero(filled)))
-        for band in np.unique(basis.band):
-            members = basis.band == band
-            U, w = basis.U[:, members], basis.w[members]
-            covariance = (U[centres] * w) @ U.T
-            table[band, 1:] = mean(covariance[near])
-            table[band, 0] = float(own[members] @ w)
-        return cls(np.append(0.0, mean(apart)), table)
+    def log_std(bands: FloatArray) -> float:
+        return float(0.5 * np.log(np.exp(2.0 * bands) @ by_band[:, 0]))
 
-    def log_std(self, bands: FloatArray) -> float:
-        return float(0.5 * np.log(np.exp(2.0 * bands) @ self.by_band[:, 0]))
-
-    def log_length(self, bands: FloatArray) -> float:
+    def log_length(bands: FloatArray) -> float:
         """Of the distance at which the correlation is as a Matérn one's at its length."""
-        covariance = np.exp(2.0 * bands) @ self.by_band
-        level = float(matern(np.ones(1), 1.0)[0])
+        covariance = np.exp(2.0 * bands) @ by_band
         below = np.flatnonzero(covariance[1:] < level * covariance[0])
         if not below.size:
-            return float(np.log(self.distance[-1]))
+            return float(np.log(distance[-1]))
         j = int(below[0]) + 1
         share = covariance[j - 1 : j + 1] / covariance[0]
         at = (share[0] - level) / (share[0] - share[1])
-        return float(np.log(self.distance[j - 1] + at * (self.distance[j] - self.distance[j - 1])))
+        return float(np.log(distance[j - 1] + at * (distance[j] - distance[j - 1])))
+
+    return {SMOOTH: log_std, LENGTH: log_length}

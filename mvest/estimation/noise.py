@@ -1,26 +1,35 @@
-"""Covariance R of the observation noise, used only through W with Wᵀ W = R⁻¹.
+"""The noise of an observation: covariance R, used only through W with Wᵀ W = R⁻¹.
 
-An n × n matrix is never formed densely: R is one variance, n variances, or a sparse matrix. Noise
-with a structure of its own (see `kronecker_noise`) is given factorised.
+R is known, or known up to a few quantities: a smooth part, a rough part, and further columns.
+Errors of neighbouring points are alike in part. Of a block of k points, each observed in several
+coordinates that are independent of each other::
+
+    R = f² D (Σ s_b² U_b diag(w_b) U_bᵀ + τ² I + δ² I) D
+
+with U_b and w_b of the bands of `mvest.estimation.spectrum`. s_b is the standard deviation of the
+smooth part in one band, τ that of the rough part, δ a resolution below which nothing is believed, f
+the factor of a frame and D the scales of single points. The logarithms of the quantities have a
+normal prior; `mvest.estimation.evidence` learns them. Columns C, by which what is not known beside
+the observation changes it, add C Cᵀ.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import scipy
 
 from mvest.errors import InputError
-from mvest.estimation.gaussian import SYMMETRY_TOLERANCE
-from mvest.estimation.prediction import require_finite
-from mvest.typing import FloatArray
+from mvest.estimation.gaussian import SYMMETRY_TOLERANCE, Gaussian
+from mvest.estimation.prediction import read_only, require_finite, require_positive
+from mvest.estimation.spectrum import BANDS, Basis, LogNormal, bands_of
+from mvest.typing import FloatArray, IntArray
 
-SparseMatrix: TypeAlias = "scipy.sparse.sparray[Any, Any] | scipy.sparse.spmatrix[Any]"
-"""A sparse matrix of SciPy in any of its formats."""
-
-CscMatrix: TypeAlias = "scipy.sparse.csc_array[np.float64]"
-"""A sparse matrix by columns in double precision."""
+LARGEST = 300.0
+"""Logarithm of a standard deviation beyond which it is that: a search may try any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,25 +52,6 @@ class ObservationNoise:
     whiten: Callable[[FloatArray], FloatArray]
 
 
-@runtime_checkable
-class UncertainNoise(Protocol):
-    """Noise that is not quite known: what is stated of it stands where nobody learns more."""
-
-    @property
-    def size(self) -> int:
-        """Number n of observations."""
-        ...
-
-    def stated(self) -> ObservationNoise:
-        """The noise as it is stated."""
-        ...
-
-
-NoiseCovariance: TypeAlias = "float | FloatArray | SparseMatrix | ObservationNoise | UncertainNoise"
-"""R as one variance, n variances (n,), a sparse symmetric positive definite (n, n) matrix,
-factorised already, or not quite known (see `mvest.estimation.noise_family`)."""
-
-
 def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     """Check a noise covariance and factorise it once.
 
@@ -74,30 +64,37 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     Raises
     ------
     InputError
-        If R is dense, has the wrong size, or is not symmetric positive definite.
+        If R has the wrong size, or is not symmetric positive definite.
     """
-    if isinstance(R, ObservationNoise | UncertainNoise):
+    if isinstance(R, ObservationNoise | NoiseFamily):
         if R.size != size:
             raise InputError(f"R is of {R.size} observations, expected {size}")
         return R if isinstance(R, ObservationNoise) else R.stated()
-    if isinstance(R, scipy.sparse.sparray | scipy.sparse.spmatrix):
-        return _sparse_noise(csc(R), size)
-    variance = np.asarray(R, dtype=np.float64)
-    if variance.ndim != 0 and variance.shape != (size,):
+    try:
+        values = np.asarray(R, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"R must be numbers, got {type(R).__name__}") from error
+    if values.shape not in ((), (size,), (size, size)):
         raise InputError(
-            f"R must be one variance, the {size} variances of the observations, or a scipy.sparse "
-            f"matrix of shape ({size}, {size}); got a dense array of shape {variance.shape}"
+            f"R must be one variance, the {size} variances of the observations, or their "
+            f"covariance ({size}, {size}); got shape {values.shape}"
         )
-    require_finite(np.atleast_1d(variance), "R")
-    if np.any(variance <= 0.0):
-        i = int(np.argmin(variance))
-        raise InputError(f"R must be positive; variance {i} is {variance.flat[i]:g}")
-    weight = 1.0 / np.sqrt(variance)
+    require_finite(np.atleast_1d(values), "R")
+    if values.ndim == 2:
+        if np.any(np.abs(values - values.T) > SYMMETRY_TOLERANCE * np.max(np.abs(values))):
+            raise InputError("R must be symmetric; it differs from its transpose")
+        try:
+            root = np.asarray(np.linalg.cholesky(values), dtype=np.float64)
+        except np.linalg.LinAlgError as error:
+            raise InputError("R must be positive definite") from error
+        return kronecker_noise(1.0, root, 1)
+    require_positive(values, "variance in R")
+    weight = 1.0 / np.sqrt(values)
 
-    def whiten(values: FloatArray) -> FloatArray:
-        return (weight * values.T).T
+    def whiten(observed: FloatArray) -> FloatArray:
+        return (weight * observed.T).T
 
-    log_determinant = float(np.sum(np.log(np.broadcast_to(variance, (size,)))))
+    log_determinant = float(np.sum(np.log(np.broadcast_to(values, (size,)))))
     return ObservationNoise(size, log_determinant, whiten)
 
 
@@ -156,9 +153,7 @@ def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
     factor = np.asarray(scale, dtype=np.float64)
     if factor.shape != (base.size,):
         raise InputError(f"scale of noise has shape {factor.shape}, expected ({base.size},)")
-    require_finite(factor, "scale of noise")
-    if np.any(factor <= 0.0):
-        raise InputError(f"scale of noise is {factor.min():g}, expected > 0")
+    require_positive(factor, "scale of noise")
 
     def whiten(values: FloatArray) -> FloatArray:
         return base.whiten((np.asarray(values).T / factor).T)
@@ -204,44 +199,265 @@ def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNo
     return ObservationNoise(base.size, base.log_determinant + float(np.sum(np.log1p(s**2))), whiten)
 
 
-def csc(matrix: SparseMatrix) -> CscMatrix:
-    """A sparse matrix of any format and number type as columns in double precision."""
-    # SciPy's stubs know no common constructor for all formats.
-    return scipy.sparse.csc_array(cast(Any, matrix), dtype=np.float64)
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseBlock:
+    """Observations of points that share their kind of error, independent of other blocks.
+
+    Attributes
+    ----------
+    rough : str
+        Name of the standard deviation τ of the rough part.
+    scale : (k,)
+        Factor of each point on the standard deviations.
+    coordinates : int
+        Observed of each point; they are independent and follow one another in the observation.
+    basis : Basis or None
+        Of the smooth part, if there is one.
+    frame : str or None
+        Name of a further factor f on all standard deviations of the block.
+    """
+
+    rough: str
+    scale: FloatArray
+    coordinates: int = 1
+    basis: Basis | None = None
+    frame: str | None = None
+
+    def __post_init__(self) -> None:
+        scale = np.array(self.scale, dtype=np.float64)
+        if scale.ndim != 1 or not scale.size or self.coordinates < 1:
+            raise InputError(f"noise of scale {scale.shape}, expected one for each of its points")
+        require_positive(scale, "scale of noise")
+        if self.basis is not None and len(self.basis.U) != len(scale):
+            raise InputError(f"smooth noise of {len(self.basis.U)} points, expected {len(scale)}")
+        object.__setattr__(self, "scale", read_only(scale))
+
+    @property
+    def size(self) -> int:
+        """Number of observations."""
+        return len(self.scale) * self.coordinates
+
+    def noise(self, v: FloatArray, flat: float) -> ObservationNoise:
+        """Noise with the variances ``v (m,)`` along the basis and ``flat`` across it."""
+        k, copies, scale = len(self.scale), self.coordinates, self.scale[:, None]
+        log_determinant = (k - len(v)) * np.log(flat) + float(np.sum(np.log(v)))
+        log_determinant += 2.0 * float(np.sum(np.log(self.scale)))
+        change = 1.0 / np.sqrt(v) - 1.0 / np.sqrt(flat)
+
+        def whiten(observed: FloatArray) -> FloatArray:
+            x = np.reshape(observed, (k, -1)) / scale
+            white = x / np.sqrt(flat)
+            if self.basis is not None:
+                white += self.basis.U @ (change[:, None] * (self.basis.U.T @ x))
+            return np.asarray(np.reshape(white, np.shape(observed)))
+
+        return ObservationNoise(self.size, copies * log_determinant, whiten)
 
 
-def _sparse_noise(R: CscMatrix, size: int) -> ObservationNoise:
-    from scipy.sparse.linalg import splu, spsolve_triangular
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorColumns:
+    """What q independent quantities that are not known add to the noise, s² C Cᵀ.
 
-    if R.shape != (size, size):
-        raise InputError(f"R must have shape ({size}, {size}); got {R.shape}")
-    require_finite(R.data, "R")
-    asymmetry = float(np.max(np.abs((R - R.T).data), initial=0.0))
-    scale = float(np.max(np.abs(R.data), initial=0.0))
-    if asymmetry > SYMMETRY_TOLERANCE * scale:
-        raise InputError(f"R must be symmetric; it differs from its transpose by {asymmetry:g}")
-    # Without pivoting off the diagonal the LU factors of a symmetric matrix are L and D Lᵀ in one
-    # fill-reducing order; R is positive definite exactly if every pivot in D is positive.
-    try:
-        lu = splu(
-            R,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+    Attributes
+    ----------
+    name : str
+        Of the factor s.
+    columns : (n, q) in units of the observation
+        C: what one standard deviation of each does to the observation.
+    factor : float
+        To which s is known, about 1; 1 holds it there.
+    """
+
+    name: str
+    columns: FloatArray
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        columns = np.array(self.columns, dtype=np.float64)
+        if columns.ndim != 2:
+            raise InputError(f"added noise {self.name} has shape {columns.shape}, expected (n, q)")
+        require_finite(columns, f"added noise {self.name}")
+        LogNormal(1.0, self.factor)
+        object.__setattr__(self, "columns", read_only(columns))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseFamily:
+    """Noise of n observations as a function of a few positive quantities.
+
+    Code that expects a known noise gets that at the medians.
+
+    Attributes
+    ----------
+    blocks : tuple of NoiseBlock
+        One after another in the observation.
+    quantities : mapping of str to LogNormal
+        What is believed of the rough parts and the factors of frames.
+    bands : Gaussian or None
+        What is believed of the logarithms of s_b ``(BANDS,)``; needed if there is a smooth part.
+    resolution : float
+        δ.
+    columns : tuple of ErrorColumns
+        Added, each with a factor of its own.
+    """
+
+    blocks: tuple[NoiseBlock, ...]
+    quantities: Mapping[str, LogNormal]
+    bands: Gaussian | None = None
+    resolution: float = 0.0
+    columns: tuple[ErrorColumns, ...] = ()
+
+    def __post_init__(self) -> None:
+        needed = {block.rough for block in self.blocks}
+        needed |= {block.frame for block in self.blocks if block.frame is not None}
+        if not self.blocks or needed != set(self.quantities):
+            raise InputError(
+                f"noise depends on {', '.join(sorted(needed)) or 'nothing'}; quantities are given "
+                f"for {', '.join(sorted(self.quantities)) or 'none'}"
+            )
+        if self.bands is None and any(block.basis is not None for block in self.blocks):
+            raise InputError("a smooth part, of which nothing is believed; expected its bands")
+        if self.bands is not None and self.bands.size != BANDS:
+            raise InputError(f"{self.bands.size} bands of a smooth part, expected {BANDS}")
+        if not (np.isfinite(self.resolution) and self.resolution >= 0.0):
+            raise InputError(f"resolution of {self.resolution}, expected >= 0")
+        names = self.names
+        if len(set(names)) != len(names):
+            raise InputError(f"noise of {', '.join(names)}: expected different names")
+        for columns in self.columns:
+            if len(columns.columns) != self.size:
+                raise InputError(
+                    f"added noise {columns.name} has shape {columns.columns.shape}, expected "
+                    f"({self.size}, q)"
+                )
+
+    @property
+    def size(self) -> int:
+        """Number n of observations."""
+        return sum(block.size for block in self.blocks)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the h quantities: bands of the smooth part, the others, and added columns."""
+        bands = () if self.bands is None else tuple(f"band {b}" for b in range(BANDS))
+        return (*bands, *self.quantities, *(columns.name for columns in self.columns))
+
+    @property
+    def prior(self) -> Gaussian:
+        """What is believed of their logarithms."""
+        others = [
+            *self.quantities.values(),
+            *(LogNormal(1.0, columns.factor) for columns in self.columns),
+        ]
+        mean = np.log([belief.median for belief in others])
+        covariance = np.diag([belief.log_std**2 for belief in others])
+        if self.bands is None:
+            return Gaussian(mean, covariance)
+        return Gaussian(
+            np.concatenate([self.bands.mean, mean]),
+            scipy.linalg.block_diag(self.bands.covariance, covariance),
         )
-    except RuntimeError as error:
-        raise InputError(f"R must be positive definite; it is singular ({error})") from error
-    pivots = lu.U.diagonal()
-    if np.any(pivots <= 0.0) or np.any(lu.perm_r != lu.perm_c):
-        raise InputError(f"R must be positive definite; its smallest pivot is {pivots.min():g}")
-    position = lu.perm_c
-    lower = scipy.sparse.csr_array(lu.L)
-    weight = 1.0 / np.sqrt(pivots)
 
-    def whiten(values: FloatArray) -> FloatArray:
-        ordered = np.empty_like(values, dtype=np.float64)
-        ordered[position] = values
-        solved = np.asarray(spsolve_triangular(lower, ordered, lower=True, unit_diagonal=True))
-        return (weight * solved.T).T[position]
+    def plus(self, columns: ErrorColumns) -> NoiseFamily:
+        """The family with further columns added."""
+        return replace(self, columns=(*self.columns, columns))
 
-    return ObservationNoise(size, float(np.sum(np.log(pivots))), whiten)
+    def without_columns(self) -> NoiseFamily:
+        """The errors of single observations alone."""
+        return replace(self, columns=())
+
+    def at(self, log: FloatArray, beats: float = 1.0) -> ObservationNoise:
+        """The noise for given quantities.
+
+        Parameters
+        ----------
+        log : (h,)
+            Logarithms of the quantities; those of columns come last.
+        beats : float
+            Heart beats whose mean is observed, may be infinite. The smooth and the rough part are
+            independent from beat to beat, so that their variance falls by this factor. Resolution
+            and added columns are the same in every beat and stay.
+
+        Raises
+        ------
+        InputError
+            If there is less than one beat, or no noise is left.
+        """
+        if not beats >= 1.0:
+            raise InputError(f"mean of {beats} beats, expected >= 1")
+        if np.isinf(beats) and not self.resolution > 0.0:
+            raise InputError("the mean of any number of beats has no noise without a resolution")
+        of = self.rows
+        parts, start = [], 0
+        v = of.variances(log, beats)[0]
+        for block, count in zip(self.blocks, of.sizes, strict=True):
+            own = v[start : start + count]
+            parts.append(block.noise(own[: count - 1], float(own[-1])))
+            start += count
+        noise = stacked_noise(parts)
+        for k, columns in enumerate(self.columns, start=len(self.names) - len(self.columns)):
+            noise = low_rank_noise(noise, np.exp(log[k]) * columns.columns)
+        return noise
+
+    def stated(self) -> ObservationNoise:
+        """The noise at the medians."""
+        return self.at(self.prior.mean)
+
+    @property
+    def rows(self) -> VarianceRows:
+        """Variances of all blocks along their bases and across them, as a function."""
+        each = []
+        for block in self.blocks:
+            w, band = np.zeros(1), np.zeros(1, dtype=np.int64)
+            if (basis := block.basis) is not None:
+                w = np.append(basis.w, basis.across)
+                last = bands_of(np.array([max(basis.across, 1e-300) / len(block.scale)]))
+                band = np.concatenate([basis.band, last])
+            rough = self.names.index(block.rough)
+            frame = -1 if block.frame is None else self.names.index(block.frame)
+            each.append((w, band, np.full(len(w), rough), np.full(len(w), frame)))
+        weight, band, roughs, frames = (np.concatenate(own) for own in zip(*each, strict=True))
+        sizes = tuple(len(w) for w, *_ in each)
+        return VarianceRows(weight, band, roughs, frames, sizes, self.resolution**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VarianceRows:
+    """Variances along and across the bases of all blocks, f² (s_b² w + τ² + δ²).
+
+    Attributes
+    ----------
+    weight : (r,)
+        w; of each block those of its basis, then that across it.
+    band, rough, frame : (r,)
+        Which of the quantities are s_b, τ and f; no f where it is -1.
+    sizes : tuple of int
+        Rows of each block.
+    resolution : float
+        δ².
+    """
+
+    weight: FloatArray
+    band: IntArray
+    rough: IntArray
+    frame: IntArray
+    sizes: tuple[int, ...]
+    resolution: float
+
+    def variances(
+        self, log: FloatArray, beats: float = 1.0
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The variances ``(r,)``, and the shares in each of the smooth and of the rough part.
+
+        See `NoiseFamily.at` for the arguments.
+        """
+        log = np.clip(log, -LARGEST, LARGEST)
+        smooth = np.where(self.weight > 0.0, np.exp(2.0 * log[self.band]) * self.weight, 0.0)
+        smooth, rough = smooth / beats, np.exp(2.0 * log[self.rough]) / beats
+        within = smooth + rough + self.resolution
+        f = np.where(self.frame >= 0, np.exp(2.0 * log[self.frame]), 1.0)
+        return f * within, smooth / within, rough / within
+
+
+NoiseCovariance: TypeAlias = float | FloatArray | ObservationNoise | NoiseFamily
+"""R as one variance, n variances (n,), a covariance (n, n), factorised, or not quite known."""

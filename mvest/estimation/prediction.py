@@ -1,12 +1,16 @@
-"""What a filter needs from a biomechanical model: the observation it predicts, and its Jacobian."""
+"""What a filter needs from a model: the observation it predicts, and its Jacobian.
 
-from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+Beside it models that are made of others: of some of the parameters, with a memory.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from mvest.errors import InputError, MaterialError
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +140,18 @@ def as_prediction(
         If the model breaks its contract: it returned something else, or other shapes than (n,) and
         (n, p).
     """
-    prediction = returned if isinstance(returned, Prediction) else _from_pair(returned, p)
+    if isinstance(returned, Prediction):
+        prediction = returned
+    else:
+        try:
+            pair = returned if isinstance(returned, tuple) else ()
+            y, jacobian = (np.asarray(part, dtype=np.float64) for part in pair)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"a model must return a Prediction, or a tuple of y of shape (n,) and jacobian of "
+                f"shape (n, {p}); got {type(returned).__name__}"
+            ) from error
+        prediction = Prediction(y, jacobian)
     if not prediction.converged:
         return prediction
     y, jacobian = prediction.y, prediction.jacobian
@@ -150,29 +165,102 @@ def as_prediction(
     return prediction
 
 
-def _from_pair(returned: object, p: int) -> Prediction:
-    """The prediction of p parameters that a model gave as (y, jacobian)."""
-    got = _kind(returned)
-    if isinstance(returned, tuple) and len(returned) == 2:
-        try:
-            y, jacobian = (np.asarray(part, dtype=np.float64) for part in returned)
-        except (TypeError, ValueError):
-            got = " and ".join(map(_kind, returned))
-        else:
-            return Prediction(y, jacobian)
-    raise InputError(
-        f"a model must return a Prediction, or a tuple of y of shape (n,) and jacobian of shape "
-        f"(n, {p}); got {got}"
-    )
+def of_some(
+    model: ObservationModel, values: FloatArray, kept: IntArray, *, snap: float = 0.0
+) -> Callable[[FloatArray], Prediction]:
+    """A model as a function of some of its parameters, the others held.
+
+    Parameters
+    ----------
+    model : ObservationModel
+    values : (p,)
+        Of all parameters.
+    kept : (k,)
+        Which are the function's.
+    snap : float
+        A parameter whose relative distance from its value in ``values`` is no larger is taken for
+        it, so that a run that is known is met to the last bit.
+    """
+
+    def part(m: FloatArray) -> Prediction:
+        whole = np.array(values, dtype=np.float64)
+        changed = ~np.isclose(m, whole[kept], rtol=snap, atol=0.0)
+        whole[kept[changed]] = m[changed]
+        prediction = predict(model, whole, derivatives=True)
+        if not prediction.converged:
+            return prediction
+        return replace(prediction, jacobian=prediction.jacobian[:, kept])
+
+    return part
 
 
-def _kind(value: object) -> str:
-    """What a value is, in words."""
-    if isinstance(value, np.ndarray):
-        return f"an array of shape {value.shape}"
-    if isinstance(value, tuple):
-        return f"a tuple of {len(value)}"
-    return "None" if value is None else f"a value of type {type(value).__name__}"
+class Remembered:
+    """A model that runs once for each parameter vector.
+
+    Parameters
+    ----------
+    model : ObservationModel
+    runs : iterable of ((p,), Prediction)
+        What is known already.
+    rtol : float
+        Relative distance within which parameters are the same.
+
+    Attributes
+    ----------
+    runs : list of ((p,), Prediction)
+        What is known, failures included.
+    """
+
+    def __init__(
+        self,
+        model: ObservationModel,
+        runs: Iterable[tuple[FloatArray, Prediction]] = (),
+        rtol: float = 0.0,
+    ) -> None:
+        self.model, self.runs, self.rtol = model, list(runs), rtol
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an `ObservationModel` does."""
+        for at, prediction in self.runs:
+            if np.allclose(at, m, rtol=self.rtol, atol=0.0):
+                return prediction
+        prediction = predict(self.model, m)
+        self.runs.append((np.array(m, dtype=np.float64), prediction))
+        return prediction
+
+
+class SharedStart:
+    """A model for many estimations that all begin with one and the same prediction.
+
+    The prediction at the common start is computed once, and whenever it is asked for the model goes
+    on from there as if nothing else had been computed before. So an estimation gives the same
+    numbers, to the last bit, by itself and after any others.
+
+    Parameters
+    ----------
+    model : ObservationModel
+        ``model.closed`` is where its next prediction starts from, ``model.restart(closed)`` forgets
+        everything else. Nobody else may use it meanwhile.
+    start : (p,)
+        Parameters at which every estimation begins.
+    """
+
+    def __init__(self, model: Any, start: FloatArray) -> None:
+        self._model = model
+        self.start = np.array(start, dtype=np.float64)
+        self._first: tuple[Prediction, Any] | None = None
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an `ObservationModel` does."""
+        if not np.array_equal(m, self.start):
+            return predict(self._model, m)
+        if self._first is None:
+            self._model.restart(None)
+            prediction = predict(self._model, m)
+            self._first = prediction, self._model.closed
+        prediction, closed = self._first
+        self._model.restart(closed)
+        return prediction
 
 
 def read_only(values: FloatArray) -> FloatArray:
@@ -180,6 +268,13 @@ def read_only(values: FloatArray) -> FloatArray:
     view = np.asarray(values, dtype=np.float64).view()
     view.flags.writeable = False
     return view
+
+
+def require_positive(values: FloatArray, what: str) -> None:
+    """Raise InputError unless all entries of `values` are finite and positive."""
+    require_finite(np.atleast_1d(values), what)
+    if np.any(values <= 0.0):
+        raise InputError(f"{what} is {np.min(values):g}, expected > 0")
 
 
 def require_finite(values: FloatArray, what: str) -> None:

@@ -2,19 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.estimation.check import (
-    ApproximationCheck,
-    Run,
-    check_against_runs,
-    principal_points,
-    worst,
-)
+from mvest.estimation.check import ApproximationCheck, Run, check_against_runs, worst
 from mvest.estimation.estimate import Estimate, InnovationSummary, OnIterate, Reason
-from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance, observation_noise
 from mvest.estimation.prediction import (
@@ -37,15 +31,23 @@ class FilterRun:
 
     Attributes
     ----------
+    model : ObservationModel
+    physical_prior : Gaussian
+        Prior of the parameters as it was given.
+    R : NoiseCovariance
+        As it was given.
     prior : Gaussian
         Prior in filter coordinates.
+    L : (p, p)
+        Root of its covariance: x with z = m + L x are coordinates in which the prior is N(0, I),
+        also where it holds a parameter fixed.
+    unit : Gaussian
+        N(0, I) of p parameters.
     y : (n,) in units of the observation
     noise : ObservationNoise
     transform : Transform
     names : tuple of str, (p,)
     forward_solves : int
-    check_runs : int
-        Runs of the model that are made at the end to check the posterior.
     """
 
     def __init__(
@@ -57,11 +59,8 @@ class FilterRun:
         names: Sequence[str] | None,
         transform: Transform | None,
         on_iterate: OnIterate | None,
-        check_runs: int = 0,
     ) -> None:
-        if check_runs < 0:
-            raise InputError(f"check_runs must not be negative; got {check_runs}")
-        self.check_runs = check_runs
+        self.model, self.physical_prior, self.R = model, prior, R
         self.y = read_only(y)
         if self.y.ndim != 1 or self.y.size == 0:
             raise InputError(f"the observation y must have shape (n,), n > 0; got {self.y.shape}")
@@ -74,9 +73,9 @@ class FilterRun:
                 f"{prior.size} parameters need as many different names; got {self.names}"
             )
         self.prior = to_filter(self.transform, prior)
+        self.L = self.prior.factor
+        self.unit = Gaussian(np.zeros(prior.size), np.eye(prior.size))
         self.forward_solves = 0
-        self._physical_prior = prior
-        self._model = model
         self._on_iterate = on_iterate
         self._last: tuple[FloatArray, Prediction] | None = None
         self._runs: list[Run] = []
@@ -84,6 +83,10 @@ class FilterRun:
         self._covariances: list[FloatArray] = []
         self._objectives: list[float] = []
         self._log_likelihoods: list[float] = []
+
+    def z(self, x: FloatArray) -> FloatArray:
+        """Filter coordinates m + L x (p,)."""
+        return self.prior.mean + self.L @ x
 
     def predict(self, z: FloatArray, *, derivatives: bool = True) -> Prediction:
         """Run the model at filter coordinates z (p,), unless it was just run there.
@@ -101,7 +104,7 @@ class FilterRun:
         if not np.all(np.isfinite(m)):
             return Prediction.failed(f"the parameters {m} are not finite")
         self.forward_solves += 1
-        prediction = predict(self._model, m, self.y.size, derivatives=derivatives)
+        prediction = predict(self.model, m, self.y.size, derivatives=derivatives)
         self._last = (z.copy(), prediction)
         if prediction.converged:
             H = self.jacobian(z, prediction) if prediction.differentiated else None
@@ -145,21 +148,26 @@ class FilterRun:
         prediction: Prediction,
         innovation: FloatArray,
         update: Update,
-        learned: LearnedNoise | None = None,
+        *,
         prior: Gaussian | None = None,
+        **more: Any,
     ) -> Estimate:
         """The estimate at the last recorded iterate, at which `prediction` was made.
 
-        What was ``learned`` of the noise widens the covariance. ``prior`` is what was updated last,
-        if that is not the prior of the problem.
+        Parameters
+        ----------
+        prior : Gaussian, optional
+            What was updated last, if that is not the prior of the problem.
+        **more
+            Further fields of the `Estimate`. Noise that was ``learned`` widens the covariance.
         """
         summary = InnovationSummary.of(innovation, update, self.y - prediction.y)
-        # Of the posterior with the noise as it is; what widens it has no part in the model's form.
-        check = self.check(prediction, prior=prior)
-        if learned is not None:
+        if "check" not in more:
+            # Of the posterior with the noise as it is; what widens it has no part in its form.
+            more["check"] = self.check(prediction, prior=prior)
+        if learned := more.get("learned"):
             self._covariances[-1] = self._covariances[-1] + learned.covariance
-        estimate = self._estimate(reason, detail, prediction, summary, check=check)
-        return replace(estimate, learned=learned)
+        return self._estimate(reason, detail, prediction=prediction, innovation=summary, **more)
 
     def check(
         self,
@@ -170,26 +178,19 @@ class FilterRun:
     ) -> ApproximationCheck | None:
         """The worst check of the last iterate's posterior, at whose mean `prediction` was made.
 
-        All runs of the model are compared with, and `check_runs` more at ± 1 standard deviation.
-        ``others`` are what the filter itself has compared.
+        All runs of the model are compared with. ``others`` are what the filter itself has compared.
         """
         z, P = self._iterates[-1], self._covariances[-1]
         if not np.all(np.isfinite(P)) or not np.any(P):
             return worst(others)
-        posterior = Gaussian(z, P)
-        made = 0
-        for point in principal_points(posterior, self.check_runs):
-            self.predict(point, derivatives=False)
-            made += 1
         checks = check_against_runs(
             y=self.y,
             noise=self.noise,
             prior=self.prior if prior is None else prior,
-            posterior=posterior,
+            posterior=Gaussian(z, P),
             predicted=prediction.y,
             H=self.jacobian(z, prediction),
             runs=self._runs,
-            extra_runs=made,
         )
         return worst([*checks, *others])
 
@@ -228,58 +229,85 @@ class FilterRun:
         H = self.jacobian(z, prediction)
         innovation = self.y - prediction.y + H @ (z - self.prior.mean)
         update = kalman_update(self.prior, innovation, H, self.noise)
-        objective = self.misfit(prediction) + self.prior_term(z)
+        # What the prior holds fixed has no part in its term.
+        x = np.linalg.lstsq(self.L, z - self.prior.mean, rcond=None)[0]
+        objective = self.misfit(prediction) + 0.5 * float(x @ x)
         self.record(z, P, objective, update.log_likelihood)
-        summary = InnovationSummary.of(innovation, update, self.y - prediction.y)
         check = worst(checks) if samples is not None else self.check(prediction, others=checks)
-        return self._estimate(reason, detail, prediction, summary, samples, check)
-
-    def prior_term(self, z: FloatArray) -> float:
-        """½ (z − m)ᵀ P⁻¹ (z − m), of what the prior does not hold fixed."""
-        x = np.linalg.lstsq(self.prior.factor, z - self.prior.mean, rcond=None)[0]
-        return 0.5 * float(x @ x)
+        drawn = None if samples is None else read_only(samples)
+        return self.finish(
+            reason, detail, prediction, innovation, update, check=check, transformed_samples=drawn
+        )
 
     def fail(self, z: FloatArray, P: FloatArray, prediction: Prediction) -> Estimate:
         """The end of a run whose next iterate (z, P) has no prediction."""
         self.record(z, P, np.nan, np.nan)
         detail = f"at {self.transform.inverse(z)}: {prediction.reason}"
-        return self._estimate(Reason.MODEL_FAILED, detail, None, None)
+        return self._estimate(Reason.MODEL_FAILED, detail, prediction=None, innovation=None)
 
-    def _estimate(
-        self,
-        reason: Reason,
-        detail: str,
-        prediction: Prediction | None,
-        innovation: InnovationSummary | None,
-        samples: FloatArray | None = None,
-        check: ApproximationCheck | None = None,
-    ) -> Estimate:
+    def _estimate(self, reason: Reason, detail: str, **more: Any) -> Estimate:
         return Estimate(
             names=self.names,
-            prior=self._physical_prior,
+            prior=self.physical_prior,
             transform=self.transform,
             transformed_iterates=read_only(np.array(self._iterates)),
             transformed_iterate_covariances=read_only(np.array(self._covariances)),
             objective=read_only(np.array(self._objectives)),
             log_likelihood=read_only(np.array(self._log_likelihoods)),
-            prediction=prediction,
-            innovation=innovation,
             reason=reason,
             detail=detail,
             forward_solves=self.forward_solves,
-            transformed_samples=None if samples is None else read_only(samples),
-            check=check,
+            **more,
         )
+
+
+class Filter:
+    """What every filter is: settings that can be called on a model, a prior and observations.
+
+    A filter is written as a function of its `FilterRun`, with which all of them begin.
+    """
+
+    __slots__ = ()
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Estimate the parameters of a model.
+
+        Parameters
+        ----------
+        model : ObservationModel
+        prior : Gaussian
+            N(m, P) of the parameters themselves.
+        y : (n,)
+            Observation.
+        R : NoiseCovariance
+        names : sequence of str, (p,), optional
+        transform : Transform, optional
+            Coordinates to work in; default `Identity`.
+        on_iterate : callable, optional
+            Called with each iterate.
+
+        Raises
+        ------
+        InputError
+            If a setting, a shape or a covariance is not admissible; never for a failing model.
+        """
+        return self.estimate(FilterRun(model, prior, y, R, names, transform, on_iterate))
+
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Run the filter, from the prior to `FilterRun.finish` or `FilterRun.fail`."""
+        raise NotImplementedError
 
 
 def by_filter(slope: FloatArray, L: FloatArray) -> FloatArray:
     """dh/dz (n, p) from dh/dx where z = m + L x; 0 for what the prior holds fixed."""
     return np.asarray(np.linalg.lstsq(L.T, slope.T, rcond=None)[0].T, dtype=np.float64)
-
-
-def require_settings(*, tolerance: float, max_iterations: int) -> None:
-    """Raise InputError unless a filter's tolerance and iteration limit make sense."""
-    if not (np.isfinite(tolerance) and tolerance > 0.0):
-        raise InputError(f"a filter's tolerance must be positive; got {tolerance}")
-    if max_iterations < 1:
-        raise InputError(f"a filter needs at least one iteration; got {max_iterations}")

@@ -103,14 +103,9 @@ class SampledErrors:
         object.__setattr__(self, "samples", samples)
 
     @property
-    def count(self) -> int:
-        """K."""
-        return self.samples.shape[1]
-
-    @property
     def columns(self) -> FloatArray:
         """C ``(n, q)``: what the filter adds to its noise is C Cᵀ."""
-        return self.samples / np.sqrt(self.count)
+        return self.samples / np.sqrt(self.samples.shape[1])
 
     @property
     def noise(self) -> ObservationNoise:
@@ -139,15 +134,22 @@ class SampledErrors:
         P = Gaussian(np.zeros(len(prior)), prior).covariance
         S = np.zeros_like(P) if curvature is None else curvature
         U, parts = self._seen()
+        UH, count = U.T @ H, self.samples.shape[1]
 
         def gain(used: BoolArray) -> tuple[FloatArray, FloatArray]:
-            """Of some samples, and what it leaves of an error of the prior."""
-            own = parts[:, used]
-            return _gain(H, P, S, U, own @ own.T / max(int(used.sum()), 1))
+            """Gain ``(p, n)`` by some samples, and what it leaves of an error of the prior.
 
-        K, rest = gain(np.ones(self.count, dtype=np.bool_))
-        moved = np.empty((len(P), self.count))
-        source = np.arange(self.count) if self.source is None else self.source
+            For whitened observations with noise I + U B Uᵀ, U orthonormal, the gain is M P Hᵀ R⁻¹
+            with M = (I + P (Hᵀ R⁻¹ H + S))⁻¹ and R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ.
+            """
+            B = parts[:, used] @ parts[:, used].T / max(int(used.sum()), 1)
+            weighed = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
+            M = np.asarray(np.linalg.inv(np.eye(len(P)) + P @ (weighed.T @ H + S)), np.float64)
+            return M @ P @ weighed.T, M
+
+        K, rest = gain(np.ones(count, dtype=np.bool_))
+        moved = np.empty((len(P), count))
+        source = np.arange(count) if self.source is None else self.source
         sources = np.unique(source)
         for one in sources:
             own = source == one
@@ -156,7 +158,7 @@ class SampledErrors:
             scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(sources))
             / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
         ) ** 2
-        moved *= np.sqrt(widened / self.count)
+        moved *= np.sqrt(widened / count)
         part = moved @ moved.T
         covariance = rest @ P @ rest.T + part
         if self.beside is not None:
@@ -172,19 +174,5 @@ class SampledErrors:
         columns = self.base.whiten(self.columns)
         U, s, Vt = np.linalg.svd(columns, full_matrices=False)
         kept = s > SEEN
-        own = np.sqrt(self.count) * s[kept, None] * Vt[kept]
+        own = np.sqrt(self.samples.shape[1]) * s[kept, None] * Vt[kept]
         return np.ascontiguousarray(U[:, kept]), own
-
-
-def _gain(
-    H: FloatArray, P: FloatArray, S: FloatArray, U: FloatArray, B: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Gain ``(p, n)`` for whitened observations with noise R = I + U B Uᵀ, U orthonormal.
-
-    It is M P Hᵀ R⁻¹ with M = (I + P (Hᵀ R⁻¹ H + S))⁻¹ and R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ; M
-    ``(p, p)`` is what is left of an error of the prior.
-    """
-    UH = U.T @ H
-    weighed = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
-    M = np.linalg.inv(np.eye(len(P)) + P @ (weighed.T @ H + S))
-    return np.asarray(M @ P @ weighed.T, dtype=np.float64), np.asarray(M, dtype=np.float64)

@@ -92,13 +92,8 @@ def to_filter(transform: Transform, physical: Gaussian) -> Gaussian:
     For the logarithm m becomes the median, and a relative deviation becomes an absolute one.
     """
     z = transform.forward(physical.mean)
-    return Gaussian(z, covariance_to_filter(transform, z, physical.covariance))
-
-
-def covariance_to_filter(transform: Transform, z: FloatArray, P: FloatArray) -> FloatArray:
-    """D⁻¹ P D⁻¹ with D = dm/dz at z: a covariance (p, p) of parameters in filter coordinates."""
     D = transform.derivative(z)
-    return P / np.outer(D, D)
+    return Gaussian(z, physical.covariance / np.outer(D, D))
 
 
 def covariance_to_physical(transform: Transform, z: FloatArray, P: FloatArray) -> FloatArray:

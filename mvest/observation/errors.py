@@ -7,17 +7,17 @@ filter assumes of them is configured apart from them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky
 from scipy.spatial.distance import cdist
 
-from mvest.errors import GeometryError, InputError
+from mvest.errors import GeometryError, InputError, require_numbers
 from mvest.estimation.noise import ObservationNoise, kronecker_noise
-from mvest.estimation.noise_family import matern
+from mvest.estimation.spectrum import matern
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
@@ -27,24 +27,10 @@ NUGGET = 1e-10
 vertices nearly coincide."""
 
 
-class ObservationError(Protocol):
-    """One way in which what is seen differs from what is there."""
-
-    def __call__(
-        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
-    ) -> FloatArray:
-        """Positions as seen with this error added.
-
-        Parameters
-        ----------
-        seen : (f, n, 3) mm
-            Positions with the errors so far; a new array is returned. The first frame is the one
-            that the model's geometry is taken from, if more than one is observed.
-        true : (f, n, 3) mm
-            Positions without any error.
-        rng : numpy.random.Generator
-        """
-        ...
+ObservationError: TypeAlias = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
+"""One way in which what is seen differs from what is there, a function of positions ``(f, n, 3)``
+mm as seen with the errors so far, of the true ones, and of a random generator. It returns a new
+array. If more than one frame is observed, the model's geometry is taken from the first."""
 
 
 def observe(
@@ -70,11 +56,9 @@ class WhiteNoise:
     std: float
 
     def __post_init__(self) -> None:
-        _require_noise(self.std)
+        require_numbers(self, "noise", "std", least=0)
 
-    def __call__(
-        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
-    ) -> FloatArray:
+    def __call__(self, seen: FloatArray, true: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Add the noise."""
         return seen + self.std * rng.standard_normal(seen.shape)
 
@@ -105,8 +89,7 @@ class SpatialCorrelation:
         points = np.asarray(self.points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise InputError(f"correlated points: shape {points.shape}, expected finite (n, 3)")
-        if not (np.isfinite(self.length) and self.length > 0.0):
-            raise InputError(f"correlation length of {self.length} mm, expected > 0")
+        require_numbers(self, "correlation", "length")
         object.__setattr__(self, "points", points)
         try:
             factor = cholesky(self.matrix(), lower=True, overwrite_a=True, check_finite=False)
@@ -156,11 +139,9 @@ class CorrelatedNoise:
     correlation: SpatialCorrelation
 
     def __post_init__(self) -> None:
-        _require_noise(self.std)
+        require_numbers(self, "noise", "std", least=0)
 
-    def __call__(
-        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
-    ) -> FloatArray:
+    def __call__(self, seen: FloatArray, true: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Add the noise."""
         frames, n, _ = seen.shape
         if n != len(self.correlation.points):
@@ -191,15 +172,10 @@ class CoaptationDropout:
     surface: LeafletSurface
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.distance) and self.distance >= 0.0):
-            raise InputError(f"drop-out within {self.distance} mm, expected >= 0")
+        require_numbers(self, "drop-out", "distance", least=0)
 
-    def __call__(
-        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
-    ) -> FloatArray:
+    def __call__(self, seen: FloatArray, true: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Hide the vertices."""
-        if self.distance == 0.0:
-            return seen
         joined = self._near(self.surface.vertices)
         hidden = np.array([self._near(frame) & ~joined for frame in true])
         if hidden.all(axis=1).any():
@@ -245,15 +221,8 @@ class AnnulusOffset:
         if len(self.offset) != 3 or not np.isfinite(self.offset).all():
             raise InputError(f"annulus offset {self.offset}, expected three finite numbers in mm")
 
-    def __call__(
-        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
-    ) -> FloatArray:
+    def __call__(self, seen: FloatArray, true: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Displace the closed frame, which is observed last."""
         moved = seen.copy()
         moved[-1] += self.offset
         return moved
-
-
-def _require_noise(std: float) -> None:
-    if not (np.isfinite(std) and std >= 0.0):
-        raise InputError(f"noise of {std} mm, expected >= 0")

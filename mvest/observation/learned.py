@@ -3,25 +3,19 @@
 What is stated of the errors of a case, a standard deviation and over which length they are alike,
 is the median of a belief and no more: how smooth and how rough they are, each over which distance,
 and how much larger in one frame than in another follows from the observation itself, together with
-the parameters (see `mvest.estimation.noise_family` and `mvest.estimation.evidence`).
+the parameters (see `mvest.estimation.noise` and `mvest.estimation.evidence`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError, require_numbers
-from mvest.estimation.noise_family import (
-    LogNormal,
-    NoiseBlock,
-    NoiseFamily,
-    Spectrum,
-    smooth_basis,
-)
+from mvest.estimation.noise import NoiseBlock, NoiseFamily
+from mvest.estimation.spectrum import LogNormal, Spectrum, smooth_basis
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.quantities import Factor, Length, Share
@@ -107,35 +101,45 @@ def error_family(
     if isinstance(observation, Observation):
         if points is None or points.shape != observation.positions.shape[1:]:
             raise InputError("errors of corresponding vertices need all vertices at rest")
-        return _of_vertices(observation, beliefs, length, points)
-    return _of_surfaces(observation, beliefs, length)
-
-
-def _of_vertices(
-    observation: Observation, beliefs: ErrorBeliefs, length: float, points: FloatArray
-) -> NoiseFamily:
-    std = np.sqrt(observation.variance)
-    scale = np.ones(len(points)) if observation.scale is None else observation.scale
-    parts = [
-        _Part(frame, points[seen], scale[seen] * own / std[-1])
-        for frame, seen, own in zip(observation.frames, observation.seen, std, strict=True)
-    ]
-    return _family(parts, beliefs, float(std[-1]), length, 3)
-
-
-def _of_surfaces(
-    observation: SurfaceObservation, beliefs: ErrorBeliefs, length: float
-) -> NoiseFamily:
-    parts = [
-        _Part(
-            seen.frame,
-            _averaged(seen.apart(FAR * (length or beliefs.length_mm))),
-            np.ones(len(seen.points)) if seen.scale is None else seen.scale,
-            observation.size_of(seen) - len(seen.points),
-        )
-        for seen in observation.seen
-    ]
-    return _family(parts, beliefs, observation.std_mm, length, 1, observation.curve_std_mm)
+        stds = np.sqrt(observation.variance)
+        stated, coordinates, curve_std = float(stds[-1]), 3, None
+        scale = np.ones(len(points)) if observation.scale is None else observation.scale
+        parts = [
+            (frame, points[seen], scale[seen] * own / stds[-1], 0)
+            for frame, seen, own in zip(observation.frames, observation.seen, stds, strict=True)
+        ]
+    else:
+        stated, coordinates, curve_std = observation.std_mm, 1, observation.curve_std_mm
+        parts = [
+            (
+                seen.frame,
+                _averaged(seen.apart(FAR * (length or beliefs.length_mm))),
+                np.ones(len(seen.points)) if seen.scale is None else seen.scale,
+                observation.size_of(seen) - len(seen.points),
+            )
+            for seen in observation.seen
+        ]
+    smooth, far, rough = beliefs.parts(stated, length)
+    spectrum = Spectrum(smooth, far, beliefs.deviation)
+    quantities: dict[str, LogNormal] = {}
+    blocks, bands = [], None
+    for frame, at, scale, curves in parts:
+        own = []
+        if len(at):
+            basis = smooth_basis(at, spectrum.reference_length)
+            own.append(NoiseBlock(ROUGH, scale, coordinates, basis))
+            quantities[ROUGH] = rough
+            bands = bands or spectrum.prior(at)
+        if curves:
+            assert curve_std is not None
+            own.append(NoiseBlock(CURVES, np.ones(curves)))
+            quantities[CURVES] = LogNormal(curve_std, beliefs.std_factor)
+        if own and frame != parts[-1][0]:
+            name = f"frame {frame}"
+            own = [replace(block, frame=name) for block in own]
+            quantities[name] = LogNormal(1.0, beliefs.frame_factor)
+        blocks += own
+    return NoiseFamily(tuple(blocks), quantities, bands, beliefs.resolution_mm)
 
 
 def _averaged(points: FloatArray) -> FloatArray:
@@ -146,44 +150,3 @@ def _averaged(points: FloatArray) -> FloatArray:
     """
     near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))[1]
     return np.asarray(points[near].reshape(len(points), -1, 3).mean(axis=1))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """What is seen in a frame: points (k, d) with scales (k,), and numbers of curves."""
-
-    frame: str
-    points: FloatArray
-    scale: FloatArray
-    curves: int = 0
-
-
-def _family(
-    parts: Sequence[_Part],
-    beliefs: ErrorBeliefs,
-    std: float,
-    length: float,
-    coordinates: int,
-    curve_std: float | None = None,
-) -> NoiseFamily:
-    smooth, far, rough = beliefs.parts(std, length)
-    spectrum = Spectrum(smooth, far, beliefs.deviation)
-    quantities: dict[str, LogNormal] = {}
-    blocks, bands = [], None
-    for part in parts:
-        own = []
-        if len(part.points):
-            basis = smooth_basis(part.points, spectrum.reference_length)
-            own.append(NoiseBlock(ROUGH, part.scale, coordinates, basis))
-            quantities[ROUGH] = rough
-            bands = bands or spectrum.prior(part.points)
-        if part.curves:
-            assert curve_std is not None
-            own.append(NoiseBlock(CURVES, np.ones(part.curves)))
-            quantities[CURVES] = LogNormal(curve_std, beliefs.std_factor)
-        if own and part is not parts[-1]:
-            name = f"frame {part.frame}"
-            own = [replace(block, frame=name) for block in own]
-            quantities[name] = LogNormal(1.0, beliefs.frame_factor)
-        blocks += own
-    return NoiseFamily(tuple(blocks), quantities, bands, beliefs.resolution_mm)

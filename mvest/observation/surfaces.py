@@ -1,14 +1,14 @@
 """What is seen of a valve where no vertex is known again: points and curves without correspondence.
 
-A frame is seen as points somewhere on the leaflets and as curves along the free edge and the
-annulus. They are compared with a predicted surface by their distances to it:
+A frame is seen as points somewhere on the leaflets and as a curve along the free edge. They are
+compared with a predicted surface by their distances to it:
 
 * a point with the signed distance ``d = u . (x - c)`` to the closest point c of its own leaflet.
   Inside a triangle u is its unit normal. Where c lies on an edge or a vertex, u is along x - c, on
   the side of the angle-weighted normal there (Baerentzen and Aanaes, IEEE Trans. Vis. Comput.
   Graph. 11 (2005) 243-253, who show that this side is right on any surface without border);
-* a point of a curve with the two components of x - c across the curve as it was seen. A distance in
-  space has a kink at zero; these have none, and two is what a point across a curve can tell.
+* a point of the curve with the two components of x - c across the curve as it was seen. A distance
+  in space has a kink at zero; these have none, and two is what a point across a curve can tell.
 
 Sliding along the surface or the curve changes neither, so only what is seen enters the estimate.
 The derivatives are exact. c is where the distance is smallest, so its own sliding does not change
@@ -43,7 +43,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csr_array
 
-from mvest.errors import InputError
+from mvest.errors import InputError, require_numbers
 from mvest.estimation.noise import (
     NoiseCovariance,
     observation_noise,
@@ -52,7 +52,7 @@ from mvest.estimation.noise import (
 )
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.observation.errors import SpatialCorrelation
-from mvest.observation.vertices import FRAMES
+from mvest.observation.vertices import FRAMES, scales
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve, lumped_areas
 from mvest.valve.geometry.moving_distance import (
@@ -69,9 +69,6 @@ from mvest.valve.geometry.triangles import directed_edges, refined
 UNKNOWN = -1
 """Region of a point that may be of any leaflet."""
 
-MAX_CORRELATED_POINTS = 2000
-"""Largest number of points of a frame whose correlation is factorised: 32 MB and half a second."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedSurface:
@@ -87,8 +84,6 @@ class ObservedSurface:
         Leaflet of each point, ``UNKNOWN`` (-1) where it is not known.
     free_edge : (j, 3) mm or None
         Closed curve along the free edge; the last point joins the first.
-    annulus : (k, 3) mm or None
-        Closed curve along the annulus.
     scale : (q,) or None
         Standard deviation of each point as a part of that of the observation; None: all alike.
     free_edge_region : (j,) or None
@@ -105,52 +100,36 @@ class ObservedSurface:
     points: FloatArray
     region: IntArray
     free_edge: FloatArray | None = None
-    annulus: FloatArray | None = None
     scale: FloatArray | None = None
     free_edge_region: IntArray | None = None
 
     def __post_init__(self) -> None:
-        points = _points(f"points seen in frame {self.frame}", self.points)
-        region = _numbers(f"regions seen in frame {self.frame}", self.region, UNKNOWN, None)
-        if region.shape != (len(points),):
-            raise InputError(
-                f"frame {self.frame}: regions of shape {region.shape} for {len(points)} points; "
-                f"expected one each, {UNKNOWN} where it is not known"
-            )
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "region", region)
-        for name in ("free_edge", "annulus"):
-            if getattr(self, name) is not None:
-                what = f"{name} seen in frame {self.frame}"
-                object.__setattr__(self, name, _curve(what, getattr(self, name)))
-        if self.free_edge_region is not None:
-            what = f"regions of the free edge seen in frame {self.frame}"
-            own = _numbers(what, self.free_edge_region, UNKNOWN, None)
-            if self.free_edge is None or own.shape != (len(self.free_edge),):
-                raise InputError(f"{what}: shape {own.shape}, expected one for each of its points")
-            object.__setattr__(self, "free_edge_region", own)
+        where = f"seen in frame {self.frame}"
+        checked = {"points": _points(f"points {where}", self.points)}
+        q, j = len(checked["points"]), 0
+        if self.free_edge is not None:
+            checked["free_edge"] = _curve(f"free edge {where}", self.free_edge)
+            j = len(self.free_edge)
         if self.scale is not None:
-            scale = np.array(self.scale, dtype=np.float64)
-            if scale.shape != (len(points),) or not np.all(np.isfinite(scale) & (scale > 0)):
-                raise InputError(
-                    f"frame {self.frame}: scale of the errors of shape {scale.shape}, expected a "
-                    f"positive number for each of {len(points)} points"
-                )
-            scale.setflags(write=False)
-            object.__setattr__(self, "scale", scale)
+            checked["scale"] = scales(f"scale of the points {where}", self.scale, q)
+        numbers = {"region": _numbers(f"regions {where}", self.region, UNKNOWN, shape=(q,))}
+        if self.free_edge_region is not None:
+            what = f"regions of the free edge {where}"
+            own = _numbers(what, self.free_edge_region, UNKNOWN, shape=(j,))
+            numbers["free_edge_region"] = own
+        for name, values in {**checked, **numbers}.items():
+            object.__setattr__(self, name, values)
 
-    def inner(self, distance: float | FloatArray) -> ObservedSurface:
-        """The same without the points nearer than ``distance`` mm to a curve that is seen.
+    def inner(self, distance: float | FloatArray, *curves: FloatArray) -> ObservedSurface:
+        """The same without the points nearer than ``distance`` mm to one of some closed curves.
 
-        ``distance`` is one number or one for each point ``(q,)``.
-
-        They are the points that noise may put beyond the border; the curves tell where that is.
+        ``distance`` is one number or one for each point ``(q,)``. Noise may put these points beyond
+        the border, which the curves are.
         """
         keep = np.ones(len(self.points), dtype=np.bool_)
-        for curve in (self.free_edge, self.annulus):
-            if curve is not None:
-                offset = closest_on_loop(self.points, curve)[2]
-                keep &= np.linalg.norm(offset, axis=1) >= distance
+        for curve in curves:
+            offset = closest_on_loop(self.points, curve)[2]
+            keep &= np.linalg.norm(offset, axis=1) >= distance
         return self._some(keep)
 
     def beyond(
@@ -184,7 +163,7 @@ class PredictedSurface:
         Their normals point to one side throughout.
     region : (m,)
         Leaflet of each triangle.
-    free_edge, annulus : (e,), (a,) or None
+    free_edge : (e,) or None
         Vertices in loop order; None if the curve is not to be compared.
     weights : (r, n) sparse or None
         The surface's vertices, of those that are predicted; None: they are the same.
@@ -201,7 +180,6 @@ class PredictedSurface:
     triangles: IntArray
     region: IntArray
     free_edge: IntArray | None = None
-    annulus: IntArray | None = None
     weights: csr_array | None = None
     width: float = 0.0
 
@@ -216,24 +194,20 @@ class PredictedSurface:
         triangles = _numbers("triangles", self.triangles, 0, last)
         if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
             raise InputError(f"triangles: shape {triangles.shape}, expected (m, 3)")
-        region = _numbers("region", self.region, 0, None)
-        if region.shape != (len(triangles),):
-            raise InputError(f"region: shape {region.shape}, expected ({len(triangles)},)")
+        region = _numbers("region", self.region, 0, shape=(len(triangles),))
         object.__setattr__(self, "triangles", triangles)
         object.__setattr__(self, "region", region)
-        for name in ("free_edge", "annulus"):
-            if getattr(self, name) is not None:
-                loop = _numbers(name, getattr(self, name), 0, last)
-                if loop.ndim != 1 or len(loop) < 3 or len(np.unique(loop)) != len(loop):
-                    raise InputError(f"{name}: expected a loop of three or more different vertices")
-                object.__setattr__(self, name, loop)
+        if self.free_edge is not None:
+            loop = _numbers("free_edge", self.free_edge, 0, last)
+            if loop.ndim != 1 or len(loop) < 3 or len(np.unique(loop)) != len(loop):
+                raise InputError("free_edge: expected a loop of three or more different vertices")
+            object.__setattr__(self, "free_edge", loop)
 
     @classmethod
     def of_valve(cls, valve: Valve) -> PredictedSurface:
-        """The surface of a valve whose vertices a model predicts, with both curves."""
+        """The surface of a valve whose vertices a model predicts, with the free edge."""
         surface = valve.surface
-        n = len(surface.vertices)
-        return cls(n, surface.triangles, surface.region, valve.free_edge, valve.annulus)
+        return cls(len(surface.vertices), surface.triangles, surface.region, valve.free_edge)
 
     def finer(self, rest: FloatArray, edge_length: float, width: float) -> PredictedSurface:
         """The same surface drawn finer and smoothed; see `mvest.valve.geometry.triangles`.
@@ -247,18 +221,15 @@ class PredictedSurface:
         width : float
             mm, over which distances to it are smoothed.
         """
-        both = (self.free_edge, self.annulus)
-        loops = tuple(loop for loop in both if loop is not None)
+        loops = () if self.free_edge is None else (self.free_edge,)
         fine = refined(rest, self.triangles, edge_length, loops)
-        drawn = iter(fine.loops)
         return replace(
             self,
             triangles=fine.triangles,
             region=self.region[fine.parent],
             weights=fine.weights,
             width=width,
-            free_edge=None if self.free_edge is None else next(drawn),
-            annulus=None if self.annulus is None else next(drawn),
+            free_edge=fine.loops[0] if loops else None,
         )
 
     def drawn(self, predicted: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
@@ -285,7 +256,7 @@ class SurfaceObservation:
     """What was seen without correspondence, and how well.
 
     The observation of each frame is the distances of its points, then two components of each point
-    of the free edge and of the annulus. What is predicted are these distances; observed is zero.
+    of the free edge. What is predicted are these distances; observed is zero.
 
     Attributes
     ----------
@@ -295,10 +266,10 @@ class SurfaceObservation:
     std_mm : float
         Standard deviation of the seen points along the normal.
     curve_std_mm : float or None
-        Of each component of the points of the curves; None if there are none.
+        Of each component of the points of the free edge; None if there are none.
     correlation_length_mm : float
         Over which the errors of the distances are alike, see ``SpatialCorrelation``, within a frame
-        and a leaflet; 0: independent. Errors of the curves are independent.
+        and a leaflet; 0: independent. Errors of the free edge are independent.
     predicted : tuple of str
         Frames that the model predicts, in the order in which it stacks them.
     R : NoiseCovariance
@@ -308,7 +279,7 @@ class SurfaceObservation:
     ------
     InputError
         On inadmissible standard deviations, frames, or curves and leaflets that the model's surface
-        does not have; and if more than ``MAX_CORRELATED_POINTS`` points are to be correlated.
+        does not have.
     """
 
     seen: tuple[ObservedSurface, ...]
@@ -323,14 +294,12 @@ class SurfaceObservation:
         object.__setattr__(self, "seen", tuple(self.seen))
         if len(set(self.frames)) != len(self.frames):
             raise InputError(f"observed frames {list(self.frames)}, expected different ones")
-        if not any(len(seen.points) or _curves(seen, self.surface) for seen in self.seen):
+        if not any(len(seen.points) or seen.free_edge is not None for seen in self.seen):
             raise InputError("nothing is seen: no frame has a point or a curve")
-        _require_std("std_mm", self.std_mm)
+        require_numbers(self, "observation", "std_mm")
+        require_numbers(self, "observation", "correlation_length_mm", least=0)
         for seen in self.seen:
             self._require_counterpart(seen)
-        length = self.correlation_length_mm
-        if not (np.isfinite(length) and length >= 0.0):
-            raise InputError(f"correlation_length_mm = {length}, expected >= 0")
         object.__setattr__(self, "R", self._noise())
 
     @property
@@ -408,27 +377,18 @@ class SurfaceObservation:
                 f"frame {seen.frame}: points of region {min(missing)}, of which the model's "
                 f"surface has no triangle"
             )
-        for name in ("free_edge", "annulus"):
-            if getattr(seen, name) is not None:
-                if getattr(self.surface, name) is None:
-                    raise InputError(
-                        f"frame {seen.frame}: the {name} is seen, but the model's surface has none"
-                    )
-                if self.curve_std_mm is None:
-                    raise InputError(f"the {name} is seen, but curve_std_mm is not given")
-                _require_std("curve_std_mm", self.curve_std_mm)
-        q = len(seen.points)
-        if self.correlation_length_mm and q > MAX_CORRELATED_POINTS:
-            raise InputError(
-                f"frame {seen.frame}: {q} points with correlated errors, expected at most "
-                f"{MAX_CORRELATED_POINTS}; thin them: points nearer to each other than the "
-                f"correlation length of {self.correlation_length_mm:g} mm say little that is new"
-            )
+        if seen.free_edge is not None:
+            if self.surface.free_edge is None:
+                raise InputError(
+                    f"frame {seen.frame}: the free edge is seen, but the model's surface has none"
+                )
+            if self.curve_std_mm is None:
+                raise InputError("the free edge is seen, but curve_std_mm is not given")
+            require_numbers(self, "observation", "curve_std_mm")
 
     def size_of(self, seen: ObservedSurface) -> int:
         """How many numbers are observed in one of the frames."""
-        curves = _curves(seen, self.surface)
-        return len(seen.points) + sum(2 * int(kept.sum()) for _, _, kept, _ in curves)
+        return len(seen.points) + 2 * int(_compared(seen).sum())
 
     def _noise(self) -> NoiseCovariance:
         parts = []
@@ -466,14 +426,20 @@ def _of_frame(
         h[members], slopes = smooth_distances(points, drawn, triangles, surface.width)
         H[members] = sum(slope @ surface.weights @ motion[:, k] for k, slope in enumerate(slopes))
     yield h, H
-    for curve, loop, kept, own in _curves(seen, surface):
-        assert observation.curve_std_mm is not None
-        across = across_curve(curve, observation.curve_std_mm)[kept]
-        there, moved = drawn[loop], surface.drawn(motion, loop)
-        if surface.weights is None:
-            yield curve_offsets(curve[kept], across, there, moved)
-        else:
-            yield smooth_offsets(curve[kept], across, there, moved, surface.width, own)
+    kept = _compared(seen)
+    if seen.free_edge is None or surface.free_edge is None or not kept.any():
+        return
+    assert observation.curve_std_mm is not None
+    curve, loop = seen.free_edge, surface.free_edge
+    across = across_curve(curve, observation.curve_std_mm)[kept]
+    there, moved = drawn[loop], surface.drawn(motion, loop)
+    if surface.weights is None:
+        yield curve_offsets(curve[kept], across, there, moved)
+        return
+    own = None
+    if seen.free_edge_region is not None:
+        own = seen.free_edge_region[kept, None] == surface.leaflet_along(loop)
+    yield smooth_offsets(curve[kept], across, there, moved, surface.width, own)
 
 
 def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:
@@ -506,24 +472,11 @@ def _by_region(seen: ObservedSurface) -> Iterator[tuple[int, BoolArray]]:
         yield int(region), seen.region == region
 
 
-def _curves(
-    seen: ObservedSurface, surface: PredictedSurface
-) -> list[tuple[FloatArray, IntArray, BoolArray, BoolArray | None]]:
-    """The curves that are seen and the loops of vertices that they are compared with.
-
-    Beside them which points are compared ``(j,)``, and on which edges each of these may be.
-    """
-    curves: list[tuple[FloatArray, IntArray, BoolArray, BoolArray | None]] = []
-    for name, region in (("free_edge", seen.free_edge_region), ("annulus", None)):
-        curve, loop = getattr(seen, name), getattr(surface, name)
-        if curve is None or loop is None:
-            continue
-        if region is None:
-            curves.append((curve, loop, np.ones(len(curve), dtype=np.bool_), None))
-        else:
-            kept = np.asarray(region != UNKNOWN)
-            curves.append((curve, loop, kept, region[kept, None] == surface.leaflet_along(loop)))
-    return curves
+def _compared(seen: ObservedSurface) -> BoolArray:
+    """Which points of the free edge ``(j,)`` are compared."""
+    if seen.free_edge_region is not None:
+        return np.asarray(seen.free_edge_region != UNKNOWN)
+    return np.ones(0 if seen.free_edge is None else len(seen.free_edge), dtype=np.bool_)
 
 
 def _points(what: str, values: FloatArray) -> FloatArray:
@@ -550,22 +503,23 @@ def _curve(what: str, values: FloatArray) -> FloatArray:
     return curve
 
 
-def _numbers(what: str, values: IntArray, minimum: int, maximum: int | None) -> IntArray:
+def _numbers(
+    what: str,
+    values: IntArray,
+    least: int,
+    most: int | None = None,
+    shape: tuple[int, ...] | None = None,
+) -> IntArray:
     given = np.asarray(values)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"{what}: {given.dtype}, expected integers")
+    if shape is not None and given.shape != shape:
+        raise InputError(f"{what}: shape {given.shape}, expected {shape}")
     numbers = np.array(given, dtype=np.int64)
-    if numbers.size and (
-        numbers.min() < minimum or (maximum is not None and numbers.max() > maximum)
-    ):
+    if numbers.size and (numbers.min() < least or (most is not None and numbers.max() > most)):
         raise InputError(
-            f"{what}: numbers from {numbers.min()} to {numbers.max()}, expected {minimum} to "
-            f"{'any' if maximum is None else maximum}"
+            f"{what}: numbers from {numbers.min()} to {numbers.max()}, expected {least} to "
+            f"{'any' if most is None else most}"
         )
     numbers.setflags(write=False)
     return numbers
-
-
-def _require_std(name: str, std: float) -> None:
-    if not (np.isfinite(std) and std > 0.0):
-        raise InputError(f"{name} = {std}, expected > 0")

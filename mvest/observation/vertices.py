@@ -9,7 +9,14 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.noise import NoiseCovariance, scaled_noise, stacked_noise
-from mvest.estimation.prediction import ObservationModel, Prediction, predict, require_finite
+from mvest.estimation.prediction import (
+    ObservationModel,
+    Prediction,
+    predict,
+    read_only,
+    require_finite,
+    require_positive,
+)
 from mvest.observation.errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray
 
@@ -61,16 +68,14 @@ class Observation:
         require_finite(np.where(unseen[..., None], 0.0, positions), "the observed positions")
         if np.all(unseen):
             raise InputError("no observed position is finite: no vertex is seen")
-        try:
-            variance = np.broadcast_to(np.asarray(self.variance, float), (len(self.frames),)).copy()
-        except ValueError:
+        variance = np.array(self.variance, dtype=np.float64)
+        if variance.shape not in ((), (len(self.frames),)):
             raise InputError(
-                f"R has shape {np.shape(self.variance)}; expected one variance, or one for each of "
-                f"the {len(self.frames)} observed frames"
-            ) from None
-        require_finite(variance, "R")
-        if np.any(variance <= 0.0):
-            raise InputError(f"R = {variance.min():g} mm^2, expected > 0")
+                f"R has shape {variance.shape}; expected one variance, or one for each of the "
+                f"{len(self.frames)} observed frames"
+            )
+        variance = np.broadcast_to(variance, len(self.frames)).copy()
+        require_positive(variance, "R")
         correlation = self.correlation
         if correlation is not None and len(correlation.points) != positions.shape[1]:
             raise InputError(
@@ -81,16 +86,7 @@ class Observation:
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if self.scale is not None:
-            scale = np.array(self.scale, dtype=np.float64)
-            if scale.shape != positions.shape[1:2]:
-                raise InputError(
-                    f"R has a scale of shape {scale.shape}, expected one for each of "
-                    f"{positions.shape[1]} vertices"
-                )
-            require_finite(scale, "the scale of R")
-            if np.any(scale <= 0.0):
-                raise InputError(f"scale of R = {scale.min():g}, expected > 0")
-            scale.setflags(write=False)
+            scale = scales("scale of R", self.scale, positions.shape[1])
             object.__setattr__(self, "scale", scale)
 
     @property
@@ -140,6 +136,15 @@ class Observation:
                 noise = scaled_noise(noise, np.repeat(self.scale[seen], 3))
             blocks.append(noise)
         return stacked_noise(blocks)
+
+
+def scales(what: str, values: FloatArray, size: int) -> FloatArray:
+    """A read-only copy of positive factors on standard deviations; InputError if they are none."""
+    scale = np.array(values, dtype=np.float64)
+    if scale.shape != (size,):
+        raise InputError(f"{what} has shape {scale.shape}, expected ({size},)")
+    require_positive(scale, what)
+    return read_only(scale)
 
 
 def require_frames(frames: Sequence[str], predicted: Sequence[str] = FRAMES) -> None:

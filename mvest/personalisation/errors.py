@@ -21,13 +21,14 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.noise import (
+    ErrorColumns,
     NoiseCovariance,
+    NoiseFamily,
     ObservationNoise,
     low_rank_noise,
     observation_noise,
     scaled_noise,
 )
-from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
 from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.sampled import SampledErrors
 from mvest.observation.learned import error_family

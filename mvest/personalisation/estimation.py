@@ -17,14 +17,14 @@ import numpy as np
 from mvest.cases.case import ValveCase
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
-from mvest.estimation.estimate import Estimate, Filter, OnIterate
+from mvest.estimation.estimate import Estimate, OnIterate
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import Prediction, predict
+from mvest.estimation.prediction import Prediction, of_some, predict
+from mvest.estimation.run import Filter
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
-from mvest.estimation.wrappers import of_some
 from mvest.personalisation.errors import (
     FrameErrors,
     WeighedObservation,

@@ -146,7 +146,7 @@ class FittedFrames:
 
     def _surface(self, edge: float, width: float) -> PredictedSurface:
         """The predicted surface that points are compared with; see `PredictedSurface.finer`."""
-        surface = replace(PredictedSurface.of_valve(self.valve), annulus=None)
+        surface = PredictedSurface.of_valve(self.valve)
         if not self.smooth:
             return surface
         return surface.finer(self.valve.surface.vertices, edge, width)
@@ -171,8 +171,7 @@ class FittedFrames:
             return replace(points, free_edge_region=_edge_region(frame, region, border))
         if alike:
             # Beyond a border a distance changes its sign, which correlated errors do not.
-            near = replace(points, annulus=frame.annulus).inner(border * far)
-            points = replace(near, annulus=None)
+            points = points.inner(border * far, frame.free_edge, frame.annulus)
         return points
 
 

@@ -17,7 +17,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError, require_numbers
-from mvest.estimation.noise_family import smooth_basis
+from mvest.estimation.spectrum import smooth_basis
 from mvest.quantities import Angle, Count, Factor, Length, Share, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout

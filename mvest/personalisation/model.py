@@ -15,7 +15,7 @@ from mvest.closure.model import ClosedState, ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
-from mvest.estimation.wrappers import SharedStart
+from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.valve_system import HeldState, check_parameters
 from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior, Treatment
 from mvest.problem.registration import REGISTRATION, RegisteredModel
@@ -183,7 +183,7 @@ class CaseClosure:
     model: ClosureModel
     frames: FramesModel | None
     registered: RegisteredModel
-    shared: SharedStart[ClosedState]
+    shared: SharedStart
     displacement: Mapping[str, FloatArray]
 
     @classmethod

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
-from mvest.estimation.noise import ObservationNoise
-from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.noise import ErrorColumns, ObservationNoise
 from mvest.estimation.prediction import Prediction, predict
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.reference import RestVariation

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from mvest.errors import InputError
-from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel
+from mvest.estimation.run import Filter
 from mvest.estimation.transform import Transform
 from mvest.mechanics.settings import TissueSettings
 from mvest.typing import FloatArray

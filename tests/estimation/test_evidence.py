@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,17 +14,9 @@ from scipy.stats import multivariate_normal
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Prediction, kalman_update
-from mvest.estimation.evidence import Evidence, LearnedNoise, NoiseLearner
-from mvest.estimation.noise_family import (
-    BANDS,
-    ErrorColumns,
-    LogNormal,
-    NoiseBlock,
-    NoiseFamily,
-    Spectrum,
-    matern,
-    smooth_basis,
-)
+from mvest.estimation.evidence import Evidence, LearnedNoise
+from mvest.estimation.noise import ErrorColumns, NoiseBlock, NoiseFamily
+from mvest.estimation.spectrum import BANDS, LogNormal, Spectrum, matern, smooth_basis
 from mvest.typing import FloatArray
 
 BELIEVED = Spectrum(LogNormal(0.6, 2.0), LogNormal(10.0, 2.0))
@@ -32,9 +25,8 @@ ROUGH = LogNormal(0.12, 3.0)
 
 def learn_noise(family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> LearnedNoise:
     """The most probable noise of a linear model whose prior covariance is the unit matrix."""
-    learner = NoiseLearner(family)
-    learner.learn(innovation, B)
-    return learner.learned(np.eye(B.shape[1]))
+    evidence = Evidence(family, innovation, B)
+    return evidence.learned(evidence.posterior(), np.eye(B.shape[1]))
 
 
 def sheet(rows: int, columns: int, spacing: float) -> FloatArray:
@@ -85,8 +77,8 @@ def mixed_family() -> NoiseFamily:
     return family.plus(ErrorColumns("open shape", 0.3 * rng.standard_normal((family.size, 3)), 2.0))
 
 
-def dense(family: NoiseFamily, log: FloatArray) -> FloatArray:
-    """R by its definition, entry by entry."""
+def dense(family: NoiseFamily, log: FloatArray, beats: float = 1.0) -> FloatArray:
+    """R of the mean of a number of beats by its definition, entry by entry."""
     value = dict(zip(family.names, np.exp(log), strict=True))
     blocks = []
     for block in family.blocks:
@@ -100,7 +92,7 @@ def dense(family: NoiseFamily, log: FloatArray) -> FloatArray:
             np.testing.assert_allclose(basis.across, 0.0, atol=1e-6)
             if len(basis.w) < k:
                 R += np.exp(2.0 * log[BANDS - 1]) * basis.across * (np.eye(k) - U @ U.T)
-        R += (value[block.rough] ** 2 + family.resolution**2) * np.eye(k)
+        R = (R + value[block.rough] ** 2 * np.eye(k)) / beats + family.resolution**2 * np.eye(k)
         R *= np.outer(block.scale, block.scale)
         if block.frame is not None:
             R *= value[block.frame] ** 2
@@ -122,7 +114,7 @@ def test_errors_far_beyond_what_is_believed_are_learned_all_the_same() -> None:
     # A thousand times as large as believed: on its way a search tries what no number holds.
     rng = np.random.default_rng(3)
     errors = 1e3 * rng.standard_normal(3 * len(POINTS))
-    evidence = Evidence.of(FAMILY, errors, np.zeros((errors.size, 1)))
+    evidence = Evidence(FAMILY, errors, np.zeros((errors.size, 1)))
     u = np.full(evidence.prior.size, 1e3)
     assert np.isfinite(evidence.objective(u)[0])
     rough = np.exp(evidence.log(evidence.posterior().mean))[list(FAMILY.names).index("rough")]
@@ -135,21 +127,35 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution(seed: int) -> Non
     e, columns, log = some(family, seed)
     S = dense(family, log) + columns @ columns.T
     expected = multivariate_normal(np.zeros(family.size), S).logpdf(e)
-    found = Evidence.of(family, e, columns).log_likelihood(log)
+    found = Evidence(family, e, columns).log_likelihood(log)
     assert found == pytest.approx(expected, rel=1e-8)
     # The same from the noise itself, as the filter uses it.
     unit = Gaussian(np.zeros(5), np.eye(5))
     update = kalman_update(unit, e, columns, family.at(log))
     assert update.log_likelihood == pytest.approx(expected, rel=1e-8)
-    mean, covariance = Evidence.of(family, e, columns).update(log, 5)
+    mean, covariance = Evidence(family, e, columns).update(log, 5)
     np.testing.assert_allclose(mean, update.posterior.mean, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(covariance, update.posterior.covariance, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("beats", [1.0, 4.0, 1e3, np.inf])
+def test_what_differs_from_beat_to_beat_is_averaged_and_nothing_else(beats: float) -> None:
+    family = mixed_family()
+    e, B, log = some(family, 3)
+    update = kalman_update(Gaussian(np.zeros(5), np.eye(5)), e, B, family.at(log, beats))
+    S = dense(family, log, beats) + B @ B.T
+    expected = np.eye(5) - B.T @ np.linalg.solve(S, B)
+    np.testing.assert_allclose(update.posterior.covariance, expected, rtol=1e-6, atol=1e-12)
+    # The same frame seen without any error but the resolution tells no less.
+    exact = dense(family, log, np.inf) + B @ B.T
+    gained = np.eye(5) - B.T @ np.linalg.solve(exact, B)
+    assert np.linalg.eigvalsh(update.posterior.covariance - gained).min() > -1e-12
 
 
 def test_its_derivatives_are_those_of_differences() -> None:
     family = mixed_family()
     e, columns, log = some(family, 7)
-    evidence = Evidence.of(family, e, columns)
+    evidence = Evidence(family, e, columns)
     _, slope = evidence.misfit(log)
     # Fourth order: central differences at two steps, extrapolated.
     for k in range(len(log)):
@@ -210,12 +216,19 @@ def posterior_of(learned: LearnedNoise, e: FloatArray, columns: FloatArray) -> G
     return Gaussian(update.posterior.mean, update.posterior.covariance + learned.covariance)
 
 
+def alternating() -> FloatArray:
+    """Anticorrelated at 8 mm: no coarse part, (1 - d²/2a²) exp(-d²/2a²) in the plane."""
+    d = cdist(POINTS[:, :2], POINTS[:, :2]) / 4.0
+    return np.asarray((1.0 - 0.5 * d**2) * np.exp(-0.5 * d**2))
+
+
 WORLDS: dict[str, tuple[Callable[[], FloatArray], float]] = {
     "as stated": (lambda: matern(DISTANCE, 10.0), 0.0),
     "half the length": (lambda: matern(DISTANCE, 5.0), 0.0),
     "twice the length": (lambda: matern(DISTANCE, 20.0), 0.0),
     "Gaussian kernel": (lambda: np.exp(-0.5 * (DISTANCE / 10.0) ** 2), 0.0),
     "exponential kernel": (lambda: np.exp(-DISTANCE / 10.0), 0.0),
+    "anticorrelated": (alternating, 0.0),
     "0.1 mm rough": (lambda: matern(DISTANCE, 10.0), 0.1),
     "0.2 mm rough": (lambda: matern(DISTANCE, 10.0), 0.2),
     "0.3 mm rough": (lambda: matern(DISTANCE, 10.0), 0.3),
@@ -229,7 +242,7 @@ def test_intervals_hold_whatever_made_the_errors(world: str) -> None:
     F = scipy.linalg.cholesky(K + 1e-9 * np.eye(len(K)), lower=True)
     stated = scipy.linalg.cholesky(matern(DISTANCE, 10.0) + 1e-10 * np.eye(len(K)), lower=True)
     rng = np.random.default_rng(5)
-    inside, fixed, nis = [], [], []
+    inside, fixed, nis, errors = [], [], [], []
     for _ in range(40):
         x = rng.standard_normal(B.shape[1])
         noise = 0.6 * F @ rng.standard_normal((len(K), 3)) + rough * rng.standard_normal(
@@ -245,10 +258,14 @@ def test_intervals_hold_whatever_made_the_errors(world: str) -> None:
         w = scipy.linalg.solve_triangular(stated, e.reshape(len(K), -1), lower=True).ravel() / 0.6
         P = np.linalg.inv(np.eye(B.shape[1]) + A.T @ A)
         fixed.append(np.abs(P @ A.T @ w - x) < 1.96 * np.sqrt(np.diag(P)))
+        errors.append((posterior.mean - x, P @ A.T @ w - x))
     # Of 320 intervals the share has an SD of 1.2 percent.
     assert 0.90 <= np.mean(inside) <= 0.98
     if world in ("half the length", "exponential kernel") or rough > 0.1:
         assert np.mean(fixed) < 0.8
+    if world == "anticorrelated":
+        learned_error, stated_error = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+        assert learned_error < 0.9 * stated_error
     if rough:
         quantity = learned.quantities[-1]
         assert quantity.learned.median == pytest.approx(rough, rel=0.1)
@@ -374,6 +391,12 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "median": (lambda: LogNormal(0.0), "median 0.0, expected > 0"),
     "factor": (lambda: LogNormal(1.0, 0.5), "factor 0.5, expected >= 1"),
+    "less than a beat": (
+        lambda: FAMILY.at(FAMILY.prior.mean, 0.5), "mean of 0.5 beats, expected >= 1"
+    ),
+    "all averaged away": (
+        lambda: replace(FAMILY, resolution=0.0).at(FAMILY.prior.mean, np.inf), "no noise without"
+    ),
     "resolution": (
         lambda: NoiseFamily(FAMILY.blocks, {"rough": ROUGH}, FAMILY.bands, -1.0),
         "resolution of -1.0",

@@ -10,7 +10,8 @@ from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Prediction, observation_noise
-from mvest.estimation.noise_family import NoiseFamily, matern
+from mvest.estimation.noise import NoiseFamily
+from mvest.estimation.spectrum import matern
 from mvest.observation.learned import CURVES, ROUGH, ErrorBeliefs, error_family
 from mvest.observation.surfaces import ObservedSurface, PredictedSurface, SurfaceObservation
 from mvest.observation.vertices import Observation

@@ -162,7 +162,7 @@ def test_a_drop_out_of_everything_is_refused() -> None:
     surface, closed = facing(0.5)
     with pytest.raises(GeometryError, match="hides every vertex"):
         observe(closed[None], [CoaptationDropout(9.0, surface)], rng())
-    with pytest.raises(InputError, match="drop-out within -1"):
+    with pytest.raises(InputError, match="drop-out distance = -1"):
         CoaptationDropout(-1.0, surface)
 
 

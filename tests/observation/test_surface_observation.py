@@ -1,6 +1,7 @@
 """Observations without correspondence, against distances and derivatives known by hand."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from mvest.estimation import (
 )
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.surfaces import (
-    MAX_CORRELATED_POINTS,
     UNKNOWN,
     ObservedSurface,
     PredictedSurface,
@@ -78,7 +78,7 @@ def plane(columns: int = 4, rows: int = 5) -> tuple[np.ndarray, PredictedSurface
     vertices, triangles = grid(columns, rows)
     loop = rim(columns, rows)
     region = np.zeros(len(triangles), dtype=int)
-    return vertices, PredictedSurface(len(vertices), triangles, region, loop, loop)
+    return vertices, PredictedSurface(len(vertices), triangles, region, loop)
 
 
 def seen(points: np.ndarray, region: int | np.ndarray = 0, **curves) -> ObservedSurface:
@@ -207,11 +207,11 @@ def test_a_curve_is_compared_across_and_not_along() -> None:
     ring = np.column_stack([np.cos(t), np.sin(t), 0 * t])
     vertices = np.concatenate([3 * ring, np.zeros((1, 3))])
     triangles = np.array([[400, k, (k + 1) % 400] for k in range(400)])
-    surface = PredictedSurface(401, triangles, np.zeros(400, dtype=int), annulus=np.arange(400))
+    surface = PredictedSurface(401, triangles, np.zeros(400, dtype=int), free_edge=np.arange(400))
     turn = 2 * np.pi * rng().uniform()
     s = turn + np.linspace(0, 2 * np.pi, 60, endpoint=False)
     circle = np.column_stack([4 * np.cos(s), 4 * np.sin(s), np.ones(60)])
-    only = ObservedSurface("closed", np.empty((0, 3)), np.empty(0, dtype=int), annulus=circle)
+    only = ObservedSurface("closed", np.empty((0, 3)), np.empty(0, dtype=int), free_edge=circle)
     observation = SurfaceObservation((only,), surface, 1.0, 0.1)
     prediction = observation.of(model(translated(vertices)))(np.zeros(3))
     assert prediction.y.shape == observation.y.shape == (120,)
@@ -476,7 +476,6 @@ def test_a_valve_is_its_own_surface() -> None:
         vertices[valve.surface.triangles].mean(axis=1),
         valve.surface.region,
         vertices[valve.free_edge],
-        vertices[valve.annulus],
     )
     observation = SurfaceObservation((observed,), surface, 0.5, 0.5)
     prediction = observation.of(model(translated(vertices)))(np.zeros(3))
@@ -524,12 +523,12 @@ def test_errors_are_correlated_within_a_leaflet_and_a_frame_only() -> None:
         len(both),
         np.concatenate([triangles, triangles + len(vertices)]),
         np.repeat([0, 1], len(triangles)),
-        annulus=rim(4, 4),
+        free_edge=rim(4, 4),
     )
     points, region = scattered(12, 0.0), np.repeat([0, 1], 6)
     points[6:] = points[:6]
     frames = tuple(
-        ObservedSurface(name, points, region, annulus=vertices[rim(4, 4)]) for name in FRAMES
+        ObservedSurface(name, points, region, free_edge=vertices[rim(4, 4)]) for name in FRAMES
     )
     observation = SurfaceObservation(frames, surface, 0.5, 0.2, 4.0)
     n = observation.y.size
@@ -563,7 +562,7 @@ def test_correlated_errors_leave_less_information_on_a_shift() -> None:
 
 @pytest.mark.parametrize("std", [0.05, 0.1, 0.5])
 def test_curves_have_as_many_degrees_of_freedom_as_noise(std: float) -> None:
-    # An annulus of 15 mm seen at 200 points, 0.47 mm apart, with noise of each coordinate.
+    # A ring of 15 mm seen at 200 points, 0.47 mm apart, with noise of each coordinate.
     # Across it are two components each; counting three would give 2/3. Where points are nearer to
     # each other than the noise, directions between neighbours would be any, and give 2/3 again.
     # Directions are known to 1 / (6 sqrt(2)) rad, which takes 1/72 = 0.014 off.
@@ -571,11 +570,13 @@ def test_curves_have_as_many_degrees_of_freedom_as_noise(std: float) -> None:
     ring = 15 * np.column_stack([np.cos(t), np.sin(t), 0 * t])
     vertices = np.concatenate([ring, np.zeros((1, 3))])
     triangles = np.array([[200, k, (k + 1) % 200] for k in range(200)])
-    surface = PredictedSurface(201, triangles, np.zeros(200, dtype=int), annulus=np.arange(200))
+    surface = PredictedSurface(201, triangles, np.zeros(200, dtype=int), free_edge=np.arange(200))
     squares = []
     for seed in range(40):
         curve = ring + std * rng(seed).normal(size=ring.shape)
-        observation = SurfaceObservation((seen(np.empty((0, 3)), annulus=curve),), surface, 1, std)
+        observation = SurfaceObservation(
+            (seen(np.empty((0, 3)), free_edge=curve),), surface, 1, std
+        )
         prediction = observation.of(model(translated(vertices)))(np.zeros(3))
         e = observation_noise(observation.R, 400).whiten(observation.y - prediction.y)
         squares.append(e @ e / 400)
@@ -586,18 +587,16 @@ def test_curves_have_as_many_degrees_of_freedom_as_noise(std: float) -> None:
 def test_points_near_the_curves_may_be_left_out() -> None:
     vertices, _ = plane(11, 11)
     loop = vertices[rim(11, 11)]
-    frame = seen(vertices + np.array([0, 0, 0.5]), np.arange(121) % 2 - 1, annulus=loop)
-    inner = frame.inner(1.1)
+    frame = seen(vertices + np.array([0, 0, 0.5]), np.arange(121) % 2 - 1)
+    inner = frame.inner(1.1, loop)
     # Over the border are 40 of 11 x 11 points, 0.5 mm from it; the next are sqrt(1 + 0.5^2) mm
     # from it, and those after sqrt(4 + 0.5^2).
     assert len(inner.points) == 81
-    assert len(frame.inner(1.2).points) == 49
+    assert len(frame.inner(1.2, loop).points) == 49
     assert np.all((inner.points[:, :2] > 0.5) & (inner.points[:, :2] < 9.5))
     kept = np.all((vertices[:, :2] > 0.5) & (vertices[:, :2] < 9.5), axis=1)
     np.testing.assert_array_equal(inner.region, frame.region[kept])
-    np.testing.assert_array_equal(inner.annulus, loop)
-    # Without a curve nothing is known to be near it.
-    assert len(seen(vertices).inner(1.1).points) == 121
+    assert len(frame.inner(1.1).points) == 121
 
 
 def test_the_side_flips_beyond_the_border_and_inner_points_do_not_care() -> None:
@@ -607,16 +606,7 @@ def test_the_side_flips_beyond_the_border_and_inner_points_do_not_care() -> None
     observation = SurfaceObservation((seen(pair),), surface, 0.5)
     y = observation.of(model(translated(vertices)))(np.zeros(3)).y
     np.testing.assert_allclose(y, np.hypot(0.5, 0.01) * np.array([1, -1]), atol=1e-14)
-    loop = vertices[surface.annulus]
-    assert len(seen(pair, annulus=loop).inner(3 * 0.5).points) == 0
-
-
-def test_too_many_correlated_points_are_to_be_thinned() -> None:
-    _, surface = plane()
-    points = scattered(MAX_CORRELATED_POINTS + 1, 0.0)
-    with pytest.raises(InputError, match="thin them"):
-        SurfaceObservation((seen(points),), surface, 0.5, None, 3.0)
-    assert SurfaceObservation((seen(points),), surface, 0.5).y.size == MAX_CORRELATED_POINTS + 1
+    assert len(seen(pair).inner(3 * 0.5, vertices[surface.free_edge]).points) == 0
 
 
 # --- frames and failures ------------------------------------------------------------------------
@@ -676,12 +666,12 @@ SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     [
         ({"points": np.zeros((3, 2))}, "shape"),
         ({"points": np.full((3, 3), np.nan)}, "finite"),
-        ({"region": np.zeros(2, dtype=int)}, "for 3 points"),
+        ({"region": np.zeros(2, dtype=int)}, "expected \\(3,\\)"),
         ({"region": np.full(3, -2)}, "expected -1"),
         ({"region": np.zeros(3)}, "integers"),
         ({"free_edge": SQUARE[:2]}, "three or more"),
         ({"free_edge": SQUARE[[0, 1, 2, 0]]}, "not repeated"),
-        ({"annulus": np.full((4, 3), np.inf)}, "finite"),
+        ({"free_edge": np.full((4, 3), np.inf)}, "finite"),
     ],
 )
 def test_wrong_points_and_curves_are_refused(change: dict, words: str) -> None:
@@ -697,7 +687,7 @@ def test_wrong_points_and_curves_are_refused(change: dict, words: str) -> None:
         ({"triangles": np.array([[0, 1]])}, "shape"),
         ({"region": np.zeros(2, dtype=int)}, "shape"),
         ({"free_edge": np.array([0, 1, 1])}, "different vertices"),
-        ({"annulus": np.array([0, 1, 7])}, "0 to 3"),
+        ({"free_edge": np.array([0, 1, 7])}, "0 to 3"),
     ],
 )
 def test_a_wrong_surface_is_refused(change: dict, words: str) -> None:
@@ -713,18 +703,22 @@ def test_a_wrong_surface_is_refused(change: dict, words: str) -> None:
         ({}, {"correlation_length_mm": -1.0}, "correlation_length_mm"),
         ({"region": np.array([0, 0, 3])}, {}, "region 3"),
         ({"points": np.empty((0, 3)), "region": np.empty(0, dtype=int)}, {}, "nothing is seen"),
-        ({"annulus": SQUARE}, {}, "curve_std_mm"),
-        ({"annulus": SQUARE}, {"curve_std_mm": np.nan}, "curve_std_mm = nan"),
-        ({"free_edge": SQUARE}, {"curve_std_mm": 1.0}, "surface has none"),
+        ({"free_edge": SQUARE}, {}, "curve_std_mm"),
+        ({"free_edge": SQUARE}, {"curve_std_mm": np.nan}, "curve_std_mm = nan"),
     ],
 )
 def test_an_observation_that_cannot_be_is_refused(frame: dict, settings: dict, words: str) -> None:
-    surface = PredictedSurface(4, np.array([[0, 1, 2]]), np.array([0]), annulus=np.array([0, 1, 2]))
+    surface = PredictedSurface(
+        4, np.array([[0, 1, 2]]), np.array([0]), free_edge=np.array([0, 1, 2])
+    )
     of_frame = {"points": np.zeros((3, 3)), "region": np.zeros(3, dtype=int)} | frame
     with pytest.raises(InputError, match=words):
         SurfaceObservation(
             (ObservedSurface("closed", **of_frame),), surface, **({"std_mm": 1.0} | settings)
         )
+    bare = replace(surface, free_edge=None)
+    with pytest.raises(InputError, match="surface has none"):
+        SurfaceObservation((seen(np.zeros((3, 3)), free_edge=SQUARE),), bare, 1.0, 1.0)
     frames = (seen(np.zeros((3, 3))),) * 2
     with pytest.raises(InputError, match="different"):
         SurfaceObservation(frames, surface, 1.0)

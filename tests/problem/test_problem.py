@@ -8,7 +8,7 @@ import pytest
 from mvest.closure.model import ClosedState
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
-from mvest.estimation.wrappers import SharedStart
+from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.observation.vertices import Observation
@@ -206,11 +206,11 @@ def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"noise_mm": -1.0}, "noise of -1.0 mm"),
+        ({"noise_mm": -1.0}, "noise std = -1.0"),
         ({"frames": ("shut",)}, "shut"),
         ({"frames": ()}, "expected some of"),
         ({"frames": ("closed", "closed")}, "expected some of"),
-        ({"variance": 0.0}, "R = 0"),
+        ({"variance": 0.0}, "R is 0"),
         ({"variance": [0.1, 0.1, 0.1]}, "R has shape"),
         ({"variance": np.nan}, "R must be finite"),
     ],

@@ -9,9 +9,9 @@ import numpy as np
 
 from experiments.common.schema import Values
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
+from mvest.estimation.run import Filter
 from mvest.estimation.transform import Identity, Log, Transform
 from mvest.mechanics.parameters import is_positive
 from mvest.reading.text import one_line

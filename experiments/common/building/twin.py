@@ -29,8 +29,7 @@ from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
 from mvest.elements import ELEMENTS
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.wrappers import SharedStart
+from mvest.estimation.prediction import ObservationModel, Prediction, SharedStart
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver

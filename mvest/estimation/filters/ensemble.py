@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.check import STEP_LIMIT, ApproximationCheck
-from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.run import FilterRun
-from mvest.estimation.transform import Transform
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.run import Filter, FilterRun
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
@@ -22,7 +19,7 @@ KINDS = ("square_root", "perturbed")
 
 
 @dataclass(frozen=True, slots=True)
-class EnsembleFilter:
+class EnsembleFilter(Filter):
     """Conditions an ensemble on the observation, at once or in several smaller steps.
 
     N members xⱼ are drawn from the prior, which is N(0, I) in these coordinates. One step with the
@@ -64,21 +61,12 @@ class EnsembleFilter:
         ``square_root`` or ``perturbed``.
     seed : int
         Of all random numbers.
-    check_runs : int
-        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
-        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     members: int = 30
     steps: int = 1
     kind: str = "square_root"
     seed: int = 1
-    check_runs: int = 0
 
     def __post_init__(self) -> None:
         if self.members < 3 or self.steps < 1:
@@ -89,60 +77,50 @@ class EnsembleFilter:
         if self.kind not in KINDS:
             raise InputError(f"kind of ensemble = {self.kind!r}, expected {' or '.join(KINDS)}")
 
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Condition an ensemble; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
-        if self.members < prior.size + 2:
-            raise InputError(
-                f"{prior.size} parameters need at least {prior.size + 2} members; got "
-                f"{self.members}"
-            )
-        L, rng = run.prior.factor, np.random.default_rng(self.seed)
-        X = exact_ensemble(self.members, prior.size, rng)
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Condition an ensemble."""
+        p = run.prior.size
+        if self.members < p + 2:
+            raise InputError(f"{p} parameters need at least {p + 2} members; got {self.members}")
+        rng = np.random.default_rng(self.seed)
+        X = exact_ensemble(self.members, p, rng)
         for _ in range(self.steps):
-            X, predicted, failure = _run_members(run, L, X)
-            z, P = _moments(run, L, X)
-            if failure is not None and len(X) < prior.size + 2:
+            X, predicted, failure = _run_members(run, X)
+            z, P = _moments(run, X)
+            if failure is not None and len(X) < p + 2:
                 return run.fail(z, P, failure)
             D = run.noise.whiten((run.y - predicted).T)
             x, d = X.mean(axis=0), D.mean(axis=1)
             run.record(z, P, 0.5 * float(d @ d + x @ x), np.nan)
             members = X
-            X = self._condition(X, D, float(self.steps), rng)
-        z, P = _moments(run, L, X)
+            noise = rng.standard_normal(D.shape) if self.kind == "perturbed" else None
+            X = _conditioned(X, D, float(self.steps), noise)
+        z, P = _moments(run, X)
         detail = f"{len(X)} of {self.members} members, {self.steps} steps"
-        slope = _slope(run, L, members, predicted)
-        checks = _halves(run, L, members, predicted, Gaussian(z, P))
+        slope = _slope(run, members, predicted)
+        checks = _halves(run, members, predicted, Gaussian(z, P))
         return run.finish_with_slope(z, P, slope, Reason.COMPLETED, detail, checks=checks)
 
-    def _condition(
-        self, X: FloatArray, D: FloatArray, alpha: float, rng: np.random.Generator
-    ) -> FloatArray:
-        """Members (N, p) after one step from members ``X`` and their innovations ``D (n, N)``."""
-        N = len(X)
-        root = np.sqrt(N - 1.0)
-        x, d = X.mean(axis=0), D.mean(axis=1)
-        A, S = (X - x).T / root, (d[:, None] - D) / root
-        values, V = np.linalg.eigh(S.T @ S)
-        values = np.maximum(values, 0.0)
-        if self.kind == "perturbed":
-            noise = rng.standard_normal(D.shape)
-            noise = (noise - noise.mean(axis=1, keepdims=True)) * np.sqrt(N / (N - 1.0))
-            moved = (V / (values + alpha)) @ (V.T @ (S.T @ (D + np.sqrt(alpha) * noise)))
-            return X + (A @ moved).T
-        weights = (V / (values + alpha)) @ (V.T @ (S.T @ d))
-        square_root = (V / np.sqrt(1.0 + values / alpha)) @ V.T
-        return x + (A @ weights) + root * (A @ square_root).T
+
+def _conditioned(
+    X: FloatArray, D: FloatArray, alpha: float, noise: FloatArray | None
+) -> FloatArray:
+    """Members (N, p) after one step from members ``X`` and their innovations ``D (n, N)``.
+
+    Observations are perturbed by ``noise (n, N)`` where it is given.
+    """
+    root = np.sqrt(len(X) - 1.0)
+    x, d = X.mean(axis=0), D.mean(axis=1)
+    A, S = (X - x).T / root, (d[:, None] - D) / root
+    values, V = np.linalg.eigh(S.T @ S)
+    values = np.maximum(values, 0.0)
+    if noise is not None:
+        noise = (noise - noise.mean(axis=1, keepdims=True)) * np.sqrt(len(X) / (len(X) - 1.0))
+        moved = (V / (values + alpha)) @ (V.T @ (S.T @ (D + np.sqrt(alpha) * noise)))
+        return np.asarray(X + (A @ moved).T)
+    weights = (V / (values + alpha)) @ (V.T @ (S.T @ d))
+    square_root = (V / np.sqrt(1.0 + values / alpha)) @ V.T
+    return np.asarray(x + (A @ weights) + root * (A @ square_root).T)
 
 
 def exact_ensemble(members: int, size: int, rng: np.random.Generator) -> FloatArray:
@@ -153,15 +131,13 @@ def exact_ensemble(members: int, size: int, rng: np.random.Generator) -> FloatAr
     return np.asarray(np.sqrt(members - 1.0) * Q)
 
 
-def _run_members(
-    run: FilterRun, L: FloatArray, X: FloatArray
-) -> tuple[FloatArray, FloatArray, Prediction | None]:
+def _run_members(run: FilterRun, X: FloatArray) -> tuple[FloatArray, FloatArray, Prediction | None]:
     """Members with a prediction, their predictions (N, n), and the last failure if any failed."""
     kept: list[FloatArray] = []
     predicted: list[FloatArray] = []
     failure: Prediction | None = None
     for x in X:
-        prediction = run.predict(run.prior.mean + L @ x, derivatives=False)
+        prediction = run.predict(run.z(x), derivatives=False)
         if prediction.converged:
             kept.append(x)
             predicted.append(prediction.y)
@@ -172,21 +148,21 @@ def _run_members(
     return np.array(kept), np.array(predicted), failure
 
 
-def _moments(run: FilterRun, L: FloatArray, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _moments(run: FilterRun, X: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (p, p) of members in filter coordinates."""
     x = X.mean(axis=0)
-    A = L @ (X - x).T / np.sqrt(max(len(X) - 1.0, 1.0))
-    return run.prior.mean + L @ x, A @ A.T
+    A = run.L @ (X - x).T / np.sqrt(max(len(X) - 1.0, 1.0))
+    return run.z(x), A @ A.T
 
 
-def _slope(run: FilterRun, L: FloatArray, X: FloatArray, predicted: FloatArray) -> FloatArray:
+def _slope(run: FilterRun, X: FloatArray, predicted: FloatArray) -> FloatArray:
     """Regression dh/dz (n, p) of predictions (N, n) on their members (N, p)."""
-    Z = (X - X.mean(axis=0)) @ L.T
+    Z = (X - X.mean(axis=0)) @ run.L.T
     return np.asarray(np.linalg.lstsq(Z, predicted - predicted.mean(axis=0), rcond=None)[0].T)
 
 
 def _halves(
-    run: FilterRun, L: FloatArray, X: FloatArray, predicted: FloatArray, posterior: Gaussian
+    run: FilterRun, X: FloatArray, predicted: FloatArray, posterior: Gaussian
 ) -> list[ApproximationCheck]:
     """What either half of the members makes of the prior, against each other.
 
@@ -198,8 +174,8 @@ def _halves(
         return []
     means = []
     for part in (slice(None, half), slice(half, 2 * half)):
-        H = _slope(run, L, X[part], predicted[part])
-        e = run.y - predicted[part].mean(axis=0) + H @ L @ X[part].mean(axis=0)
+        H = _slope(run, X[part], predicted[part])
+        e = run.y - predicted[part].mean(axis=0) + H @ run.L @ X[part].mean(axis=0)
         means.append(kalman_update(run.prior, e, H, run.noise).posterior.mean)
     apart = np.linalg.lstsq(posterior.factor, means[1] - means[0], rcond=None)[0]
     # The whole ensemble is off by about half of what its halves are apart.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,13 +9,11 @@ from scipy.special import logsumexp
 
 from mvest.errors import InputError
 from mvest.estimation.check import ApproximationCheck
-from mvest.estimation.estimate import Estimate, Filter, OnIterate, Reason
+from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian, standard
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.run import FilterRun, by_filter
-from mvest.estimation.transform import Transform
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.run import Filter, FilterRun, by_filter
 from mvest.typing import FloatArray, IntArray
 
 K_HAT_LIMIT = 0.7
@@ -45,7 +42,7 @@ DRAWS = 4000
 
 
 @dataclass(frozen=True, slots=True)
-class ImportanceFilter:
+class ImportanceFilter(Filter):
     """Weighted draws from the posterior, from proposals that learn from the model's derivatives.
 
     In coordinates x in which the prior is N(0, I), with π(x) = exp(−J(x)):
@@ -79,11 +76,6 @@ class ImportanceFilter:
         Finds x₀ and P₀.
     seed : int
         Of all random numbers.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     runs: int = 320
@@ -99,55 +91,38 @@ class ImportanceFilter:
                 f"one effective draw; got {self.batch}, {self.runs} and {self.effective:g}"
             )
 
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Draw from the posterior; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
-        first = self.start(model, prior, y, R, names=names, transform=transform)
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Draw from the posterior."""
+        first = self.start(
+            run.model, run.physical_prior, run.y, run.R, names=run.names, transform=run.transform
+        )
         run.forward_solves += first.forward_solves
         if first.prediction is None:
             z = first.transformed
             return run.fail(z.mean, z.covariance, Prediction.failed(first.detail))
-        run.record(
-            first.transformed.mean,
-            first.transformed.covariance,
-            float(first.objective[-1]),
-            float(first.log_likelihood[-1]),
-        )
-        rng, L = np.random.default_rng(self.seed), run.prior.factor
-        draws = _Draws(run, standard(run.prior, first.transformed))
+        at, last = first.transformed, (first.objective[-1], first.log_likelihood[-1])
+        run.record(at.mean, at.covariance, *map(float, last))
+        rng, L = np.random.default_rng(self.seed), run.L
+        draws = _Draws(run, standard(run.prior, at))
         while True:
             draws.more(min(self.batch, self.runs - len(draws.points)), rng)
             weights, k_hat, effective = draws.weights()
             good = effective >= self.effective and k_hat <= K_HAT_LIMIT
-            good = good and draws.rounds > EXPLORING
+            good = good and len(draws.rounds) > EXPLORING
             if good or len(draws.points) >= self.runs:
                 break
         x = weights @ draws.points
         spread = draws.points - x
         chosen = draws.points[rng.choice(len(weights), DRAWS, p=weights)]
         checks = [
-            ApproximationCheck(
-                "effective draws, how many times too few",
-                self.effective / effective,
-                1.0,
-                len(weights),
-            ),
-            ApproximationCheck(
-                "tail of the weights, Pareto k", max(k_hat, 0.0), K_HAT_LIMIT, len(weights)
-            ),
+            ApproximationCheck(compared, value, limit, len(weights))
+            for compared, value, limit in (
+                ("effective draws, how many times too few", self.effective / effective, 1.0),
+                ("tail of the weights, Pareto k", max(k_hat, 0.0), K_HAT_LIMIT),
+            )
         ]
         return run.finish_with_slope(
-            run.prior.mean + L @ x,
+            run.z(x),
             L @ (spread.T * weights) @ spread @ L.T,
             by_filter(draws.slope, L),
             Reason.COMPLETED if good else Reason.NOT_SAMPLED,
@@ -163,46 +138,38 @@ class _Draws:
     Attributes
     ----------
     points : (s, p)
+    rounds : list of (int, list)
+        How many were drawn in each from which mixture: shares, means and covariances.
     slope : (n, p)
         dh/dx at the last run with derivatives; 0 without any.
     """
 
     def __init__(self, run: FilterRun, laplace: Gaussian) -> None:
         self._run, self._laplace = run, laplace
-        p = laplace.mean.size
-        self.points = np.empty((0, p))
-        self.slope = np.zeros((run.y.size, p))
+        self.points = np.empty((0, laplace.size))
+        self.slope = np.zeros((run.y.size, laplace.size))
         self._log_target = np.empty(0)
         self._moved: list[tuple[FloatArray, FloatArray]] = []
         self._covariances: list[FloatArray] = []
-        self._rounds: list[tuple[int, list[tuple[float, FloatArray, FloatArray]]]] = []
+        self.rounds: list[tuple[int, list[tuple[float, FloatArray, FloatArray]]]] = []
 
     def more(self, count: int, rng: np.random.Generator) -> None:
         """Draw from the next mixture, and run the model there."""
-        mixture = self._mixture(rng)
+        mixture, p = self._mixture(), self._laplace.size
         shares = np.array([share for share, _, _ in mixture])
         # Stratified: each part as often as its share says, but for the rounding.
         edges = (np.arange(count) + rng.random()) / count
         which = np.searchsorted(np.cumsum(shares / shares.sum()), edges)
         drawn = np.array(
             [
-                mixture[k][1] + np.linalg.cholesky(mixture[k][2]) @ rng.standard_normal(len(self))
+                mixture[k][1] + np.linalg.cholesky(mixture[k][2]) @ rng.standard_normal(p)
                 for k in np.minimum(which, len(mixture) - 1)
             ]
         )
-        self._rounds.append((count, mixture))
+        self.rounds.append((count, mixture))
         values = [self._evaluate(x) for x in drawn]
         self.points = np.vstack([self.points, drawn])
         self._log_target = np.append(self._log_target, values)
-
-    @property
-    def rounds(self) -> int:
-        """How many there were."""
-        return len(self._rounds)
-
-    def __len__(self) -> int:
-        """Number p of unknowns."""
-        return self._laplace.mean.size
 
     def weights(self) -> tuple[FloatArray, float, float]:
         """Smoothed weights (s,) that sum to 1, their k̂, and how many draws are effective."""
@@ -210,7 +177,7 @@ class _Draws:
 
         count = len(self.points)
         parts = [
-            np.log(drawn / count) + self._log_mixture(mixture) for drawn, mixture in self._rounds
+            np.log(drawn / count) + self._log_mixture(mixture) for drawn, mixture in self.rounds
         ]
         raw = self._log_target - logsumexp(parts, axis=0)
         possible = raw > max(float(np.max(raw)), -1e300) - NOTHING
@@ -226,14 +193,14 @@ class _Draws:
 
     def _evaluate(self, x: FloatArray) -> float:
         """Logarithm of π(x); −∞ where the model gives no prediction."""
-        z = self._run.prior.mean + self._run.prior.factor @ x
+        z = self._run.z(x)
         prediction = self._run.predict(z, derivatives=False)
         covariance = self._laplace.covariance
         value = -np.inf
         if prediction.converged:
             value = -self._run.misfit(prediction) - 0.5 * float(x @ x)
             if prediction.differentiated:
-                self.slope = self._run.jacobian(z, prediction) @ self._run.prior.factor
+                self.slope = self._run.jacobian(z, prediction) @ self._run.L
                 A = self._run.noise.whiten(self.slope)
                 covariance = np.asarray(np.linalg.inv(np.eye(len(x)) + A.T @ A), np.float64)
                 e = self._run.noise.whiten(self._run.y - prediction.y)
@@ -241,14 +208,14 @@ class _Draws:
         self._covariances.append(0.5 * (covariance + covariance.T))
         return value
 
-    def _mixture(self, rng: np.random.Generator) -> list[tuple[float, FloatArray, FloatArray]]:
+    def _mixture(self) -> list[tuple[float, FloatArray, FloatArray]]:
         """Shares, means and covariances of the next proposal."""
-        p = len(self)
+        p = self._laplace.size
         wide = self._laplace.covariance * 1.3**2
         prior = (PRIOR_SHARE, np.zeros(p), np.eye(p))
-        if not self._rounds:
+        if not self.rounds:
             return [(0.5, self._laplace.mean, wide), (0.5, *prior[1:])]
-        if len(self._rounds) < EXPLORING and self._moved:
+        if len(self.rounds) < EXPLORING and self._moved:
             share = (0.9 - PRIOR_SHARE) / len(self._moved)
             moved = [(share, mean, 0.25 * P) for mean, P in self._moved]
             self._moved = []

@@ -1,19 +1,16 @@
 """The iterated extended Kalman filter: Gauss-Newton on one maximum-a-posteriori problem."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvest.errors import InputError
-from mvest.estimation.estimate import Estimate, OnIterate, Reason
-from mvest.estimation.evidence import NoiseLearner
+from mvest.errors import InputError, require_numbers
+from mvest.estimation.estimate import Estimate, Reason
+from mvest.estimation.evidence import Evidence
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.noise_family import NoiseFamily
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.run import FilterRun, require_settings
-from mvest.estimation.transform import Transform
+from mvest.estimation.noise import NoiseFamily
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.run import Filter, FilterRun
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
@@ -48,11 +45,14 @@ NEGLIGIBLE_DECREASE = 1e-3
 LEAST_CURVATURE = 0.1
 """Of J in units of the linearised one: intervals are at most three times as long."""
 
+MAX_REJECTIONS = 8
+"""Largest number of rejected steps in a row."""
+
 MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 2, 6, 5
 
 
 @dataclass(frozen=True, slots=True)
-class IteratedFilter:
+class IteratedFilter(Filter):
     """Posterior mode and its covariance, each observation counted once.
 
     Minimises, in filter coordinates z with the prior N(m, P), the objective::
@@ -92,8 +92,6 @@ class IteratedFilter:
         probability, so that its absolute value has a meaning. What rounding hides counts as less.
     max_iterations : int
         Largest number of accepted steps.
-    max_rejections : int
-        Largest number of rejected steps in a row.
     start : (p,) parameters or None
         First iterate; None starts at the prior's mean.
     max_learned : int
@@ -102,70 +100,44 @@ class IteratedFilter:
         Where Gauss-Newton does not come to its end, or its posterior is not that of the model's
         runs, find the second derivatives that it neglects from 2p further runs, and with them the
         mode and its covariance; see `_with_second_derivatives`.
-    check_runs : int
-        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
-        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     tolerance: float = 1e-4
     objective_tolerance: float = 1e-9
     max_iterations: int = 20
-    max_rejections: int = 8
     start: tuple[float, ...] | None = None
     max_learned: int = 12
     second_order: bool = False
-    check_runs: int = 0
 
     def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
-        if not (np.isfinite(self.objective_tolerance) and self.objective_tolerance > 0.0):
-            raise InputError(
-                f"the objective's tolerance must be positive; got {self.objective_tolerance}"
-            )
-        if self.max_rejections < 0:
-            raise InputError(f"max_rejections must not be negative; got {self.max_rejections}")
+        require_numbers(self, "filter", "tolerance", "objective_tolerance")
+        require_numbers(self, "filter", "max_iterations", least=1)
 
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Find the posterior mode; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
-        # With P = L Lᵀ and z = m + L x the prior of x is N(0, I): P may be singular, and the
-        # damping of the steps does not depend on the units of the parameters.
-        L = run.prior.factor
-        unit = Gaussian(np.zeros(prior.size), np.eye(prior.size))
-        x = self._first(run, L)
-        point = _evaluate(run, L, x)
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Find the posterior mode."""
+        # In coordinates x the damping of the steps does not depend on the parameters' units.
+        L, x = run.L, self._first(run)
+        point = _evaluate(run, x)
         if isinstance(point, Prediction):
-            return run.fail(run.prior.mean + L @ x, run.prior.covariance, point)
+            return run.fail(run.z(x), run.prior.covariance, point)
 
-        learner = NoiseLearner(R) if isinstance(R, NoiseFamily) else None
+        evidence: Evidence | None = None
+        mode: FloatArray | None = None
         damping, iterations = 0.0, 0
         while True:
             innovation = run.y - point.prediction.y + point.H @ point.x
-            if learner is not None and iterations < self.max_learned:
-                run.noise = learner.learn(innovation, point.H)
+            if isinstance(run.R, NoiseFamily) and iterations < self.max_learned:
+                evidence = Evidence(run.R, innovation, point.H)
+                noise = evidence.posterior(mode)
+                mode, run.noise = noise.mode, run.R.at(evidence.log(noise.mean))
                 point = replace(point, objective=_objective(run, point.x, point.prediction))
-            update = kalman_update(unit, innovation, point.H, run.noise)
+            update = kalman_update(run.unit, innovation, point.H, run.noise)
             P = L @ update.posterior.covariance @ L.T
             run.record(point.z, P, point.objective, update.log_likelihood)
 
             step = update.posterior.mean - point.x
             A = run.noise.whiten(point.H)
-            B = np.eye(prior.size) + A.T @ A
+            B = np.eye(run.prior.size) + A.T @ A
             decrease = 0.5 * float(step @ B @ step)
             reason: Reason | None = None
             detail = f"{iterations} iterations, the next full step would lower J by {decrease:.2e}"
@@ -176,7 +148,7 @@ class IteratedFilter:
             elif iterations == self.max_iterations:
                 reason = Reason.MAX_ITERATIONS
             else:
-                accepted, damping, rejected = self._search(run, L, point, B, step, damping)
+                accepted, damping, rejected = _search(run, point, B, step, damping)
                 if accepted is not None:
                     point = accepted
                     iterations += 1
@@ -186,26 +158,31 @@ class IteratedFilter:
                     reason = Reason.NO_DECREASE
             if reason is not None:
                 curvature: FloatArray | None = None
-                learned = None if learner is None else learner.learned(L)
+                learned = None if evidence is None else evidence.learned(noise, L)
                 if self.second_order and reason is not Reason.MODEL_FAILED:
                     check = run.check(point.prediction)
                     if reason is not Reason.CONVERGED or not (check is None or check.holds):
-                        better = _with_second_derivatives(run, L, point, update.posterior)
+                        better = _with_second_derivatives(run, point, update.posterior)
                         if better is not None:
                             point, covariance = better
                             innovation = run.y - point.prediction.y + point.H @ point.x
-                            update = kalman_update(unit, innovation, point.H, run.noise)
+                            update = kalman_update(run.unit, innovation, point.H, run.noise)
                             P = L @ covariance @ L.T
                             run.record(point.z, P, point.objective, update.log_likelihood)
-                            curvature = _left_out(run, L, point, covariance)
+                            curvature = _left_out(run, point, covariance)
                             reason = Reason.CONVERGED
                             detail = f"{iterations} iterations, then with second derivatives"
-                estimate = run.finish(
-                    reason, detail, point.prediction, innovation, update, learned=learned
+                return run.finish(
+                    reason,
+                    detail,
+                    point.prediction,
+                    innovation,
+                    update,
+                    learned=learned,
+                    curvature=curvature,
                 )
-                return replace(estimate, curvature=curvature)
 
-    def _first(self, run: FilterRun, L: FloatArray) -> FloatArray:
+    def _first(self, run: FilterRun) -> FloatArray:
         """Coordinates x of the first iterate."""
         if self.start is None:
             return np.zeros(run.prior.size)
@@ -213,51 +190,46 @@ class IteratedFilter:
         if start.shape != run.prior.mean.shape or not np.all(np.isfinite(start)):
             raise InputError(f"start must be {run.prior.size} finite numbers; got {self.start}")
         offset = run.transform.forward(start) - run.prior.mean
-        x = np.asarray(np.linalg.lstsq(L, offset, rcond=None)[0], dtype=np.float64)
-        if not np.allclose(L @ x, offset, rtol=1e-9, atol=1e-12):
+        x = np.asarray(np.linalg.lstsq(run.L, offset, rcond=None)[0], dtype=np.float64)
+        if not np.allclose(run.L @ x, offset, rtol=1e-9, atol=1e-12):
             raise InputError(
                 f"start {self.start} differs from the prior's mean in a parameter (or combination) "
                 f"that the prior holds fixed"
             )
         return x
 
-    def _search(
-        self,
-        run: FilterRun,
-        L: FloatArray,
-        point: "_Point",
-        B: FloatArray,
-        step: FloatArray,
-        damping: float,
-    ) -> "tuple[_Point | None, float, str | None]":
-        """The next iterate and its damping, or None and the model's words if it failed to the end.
 
-        Accepts a step only if it lowers the objective.
-        """
-        failure: str | None = None
-        scale = np.diag(np.diagonal(B))
-        for _ in range(self.max_rejections + 1):
-            trial_step = np.linalg.solve(B + damping * scale, B @ step) if damping else step
-            predicted = 0.5 * float(trial_step @ (B + 2.0 * damping * scale) @ trial_step)
-            trial = _evaluate(run, L, point.x + trial_step)
-            if isinstance(trial, Prediction):
-                failure = trial.reason
-            else:
-                failure = None
-                gain = (point.objective - trial.objective) / predicted
-                if gain >= GOOD_DECREASE:
-                    relaxed = damping / DAMPING_FACTOR
-                    return trial, relaxed if relaxed >= NO_DAMPING else 0.0, None
-                if gain >= POOR_DECREASE:
-                    return trial, damping, None
-                if gain >= SUFFICIENT_DECREASE:
-                    return trial, _more(damping), None
-            damping = _more(damping)
-        return None, damping, failure
+def _search(
+    run: FilterRun, point: "_Point", B: FloatArray, step: FloatArray, damping: float
+) -> "tuple[_Point | None, float, str | None]":
+    """The next iterate and its damping, or None and the model's words if it failed to the end.
+
+    Accepts a step only if it lowers the objective.
+    """
+    failure: str | None = None
+    scale = np.diag(np.diagonal(B))
+    for _ in range(MAX_REJECTIONS + 1):
+        trial_step = np.linalg.solve(B + damping * scale, B @ step) if damping else step
+        predicted = 0.5 * float(trial_step @ (B + 2.0 * damping * scale) @ trial_step)
+        trial = _evaluate(run, point.x + trial_step)
+        if isinstance(trial, Prediction):
+            failure = trial.reason
+        else:
+            failure = None
+            gain = (point.objective - trial.objective) / predicted
+            if gain >= GOOD_DECREASE:
+                relaxed = damping / DAMPING_FACTOR
+                return trial, relaxed if relaxed >= NO_DAMPING else 0.0, None
+            if gain >= POOR_DECREASE:
+                return trial, damping, None
+            if gain >= SUFFICIENT_DECREASE:
+                return trial, _more(damping), None
+        damping = _more(damping)
+    return None, damping, failure
 
 
 def _with_second_derivatives(
-    run: FilterRun, L: FloatArray, point: "_Point", gaussian: Gaussian
+    run: FilterRun, point: "_Point", gaussian: Gaussian
 ) -> "tuple[_Point, FloatArray] | None":
     """The minimum of J and the covariance that its own curvature gives, in coordinates x.
 
@@ -276,7 +248,7 @@ def _with_second_derivatives(
         C = axes * np.sqrt(values)
         rows = []
         for axis in C.T:
-            ends = [_evaluate(run, L, point.x + sign * axis) for sign in (1.0, -1.0)]
+            ends = [_evaluate(run, point.x + sign * axis) for sign in (1.0, -1.0)]
             up, down = (None if isinstance(end, Prediction) else end.slope(run) for end in ends)
             if up is None or down is None:
                 return None
@@ -291,7 +263,7 @@ def _with_second_derivatives(
             step = -inverse @ slope
             if -0.5 * float(step @ slope) <= NEGLIGIBLE_DECREASE:
                 break
-            lower = _lower(run, L, point, step, slope)
+            lower = _lower(run, point, step, slope)
             if lower is None:
                 return None
             point = lower
@@ -304,19 +276,17 @@ def _with_second_derivatives(
     return None
 
 
-def _left_out(run: FilterRun, L: FloatArray, point: "_Point", covariance: FloatArray) -> FloatArray:
+def _left_out(run: FilterRun, point: "_Point", covariance: FloatArray) -> FloatArray:
     """What Gauss-Newton leaves out of the Hessian, in filter coordinates (p, p)."""
-    A, back = run.noise.whiten(point.H), np.linalg.pinv(L)
+    A, back = run.noise.whiten(point.H), np.linalg.pinv(run.L)
     left = np.linalg.inv(covariance) - np.eye(len(point.x)) - A.T @ A
     return np.asarray(back.T @ left @ back)
 
 
-def _lower(
-    run: FilterRun, L: FloatArray, point: "_Point", step: FloatArray, slope: FloatArray
-) -> "_Point | None":
+def _lower(run: FilterRun, point: "_Point", step: FloatArray, slope: FloatArray) -> "_Point | None":
     """The first point along halved steps at which J is sufficiently lower."""
     for _ in range(MAX_HALVINGS):
-        trial = _evaluate(run, L, point.x + step)
+        trial = _evaluate(run, point.x + step)
         if not isinstance(trial, Prediction):
             decrease = point.objective - trial.objective
             if decrease >= -SUFFICIENT_DECREASE * float(step @ slope):
@@ -350,13 +320,13 @@ class _Point:
         return np.asarray(self.x - run.noise.whiten(self.H).T @ e)
 
 
-def _evaluate(run: FilterRun, L: FloatArray, x: FloatArray) -> _Point | Prediction:
+def _evaluate(run: FilterRun, x: FloatArray) -> _Point | Prediction:
     """The iterate at x, or the failed prediction there."""
-    z = run.prior.mean + L @ x
+    z = run.z(x)
     prediction = run.predict(z)
     if not prediction.converged:
         return prediction
-    H = run.jacobian(z, prediction) @ L
+    H = run.jacobian(z, prediction) @ run.L
     return _Point(x, z, prediction, H, _objective(run, x, prediction))
 
 

@@ -1,22 +1,21 @@
 """The extended Kalman filter as the method paper runs it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.errors import require_numbers
+from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian, as_covariance
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.run import FilterRun, require_settings
-from mvest.estimation.transform import Transform, covariance_to_filter
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.run import Filter, FilterRun
+from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperFilter:
+class PaperFilter(Filter):
     """Extended Kalman filter that cycles the same frames as new observations.
 
     Estimation of patient-specific material properties of the mitral valve using 4D transesophageal
@@ -43,40 +42,20 @@ class PaperFilter:
         deviation if that is larger).
     max_iterations : int
         Largest number of rounds.
-    check_runs : int
-        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
-        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     Q: float | FloatArray = 0.01
     tolerance: float = 1e-4
     max_iterations: int = 50
-    check_runs: int = 0
 
     def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
+        require_numbers(self, "filter", "tolerance")
+        require_numbers(self, "filter", "max_iterations", least=1)
 
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Run rounds until they agree; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
-        Q = covariance_to_filter(
-            run.transform, run.prior.mean, as_covariance(self.Q, prior.size, "Q")
-        )
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Run rounds until they agree."""
+        step = Gaussian(run.physical_prior.mean, as_covariance(self.Q, run.prior.size, "Q"))
+        Q = to_filter(run.transform, step).covariance
         m, P = run.prior.mean, run.prior.covariance
         converged, rounds = False, 0
         while True:

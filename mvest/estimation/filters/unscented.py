@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from mvest.errors import InputError
-from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.errors import require_numbers
+from mvest.estimation.estimate import Estimate, Reason
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.run import FilterRun, by_filter, require_settings
-from mvest.estimation.transform import Transform
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.run import Filter, FilterRun, by_filter
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
+MAX_REJECTIONS = 6
+"""How often the points are drawn together in one round."""
+
 
 @dataclass(frozen=True, slots=True)
-class UnscentedFilter:
+class UnscentedFilter(Filter):
     """Statistical linearisation with the corners of a simplex, iterated about the posterior.
 
     In coordinates x in which the prior is N(0, I), and with the p + 1 corners σⱼ of a regular
@@ -54,56 +54,28 @@ class UnscentedFilter:
         Rounds. 1 is the filter of Moireau and Chapelle.
     spread : float
         Distance of the points from their mean, in parts of the simplex whose covariance is P.
-    max_rejections : int
-        How often the points are drawn together in one round.
-    check_runs : int
-        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
-        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
-
-    Raises
-    ------
-    InputError
-        If a setting, a shape or a covariance is not admissible; never for a failing model.
     """
 
     tolerance: float = 1e-3
     max_iterations: int = 15
     spread: float = 1.0
-    max_rejections: int = 6
-    check_runs: int = 0
 
     def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
-        if not (np.isfinite(self.spread) and self.spread > 0.0):
-            raise InputError(f"the spread of sigma points must be positive; got {self.spread}")
-        if self.max_rejections < 0:
-            raise InputError(f"max_rejections must not be negative; got {self.max_rejections}")
+        require_numbers(self, "filter", "tolerance", "spread")
+        require_numbers(self, "filter", "max_iterations", least=1)
 
-    def __call__(
-        self,
-        model: ObservationModel,
-        prior: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        names: Sequence[str] | None = None,
-        transform: Transform | None = None,
-        on_iterate: OnIterate | None = None,
-    ) -> Estimate:
-        """Estimate without derivatives; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
-        L = run.prior.factor
-        unit = Gaussian(np.zeros(prior.size), np.eye(prior.size))
-        at, before = unit, unit
+    def estimate(self, run: FilterRun) -> Estimate:
+        """Estimate without derivatives."""
+        L = run.L
+        at, before = run.unit, run.unit
         share, change = 1.0, np.inf
         for rounds in range(1, self.max_iterations + 1):
-            linearised = self._linearise(run, L, at, before.mean)
+            linearised = self._linearise(run, at, before.mean)
             if isinstance(linearised, Prediction):
-                z = run.prior.mean + L @ at.mean
-                return run.fail(z, L @ at.covariance @ L.T, linearised)
+                return run.fail(run.z(at.mean), L @ at.covariance @ L.T, linearised)
             at, mean, H = linearised
-            z, e = run.prior.mean + L @ at.mean, run.y - mean
-            update = kalman_update(unit, e + H @ at.mean, H, run.noise)
+            z, e = run.z(at.mean), run.y - mean
+            update = kalman_update(run.unit, e + H @ at.mean, H, run.noise)
             white = run.noise.whiten(e)
             objective = 0.5 * float(white @ white + at.mean @ at.mean)
             run.record(z, L @ at.covariance @ L.T, objective, update.log_likelihood)
@@ -121,20 +93,19 @@ class UnscentedFilter:
         reason = Reason.CONVERGED if converged else Reason.MAX_ITERATIONS
         if self.max_iterations == 1:
             reason = Reason.COMPLETED
-        detail = f"{rounds} rounds of {prior.size + 1} points, tolerance {self.tolerance:g}"
-        z = run.prior.mean + L @ posterior.mean
-        return run.finish_with_slope(z, P, by_filter(H, L), reason, detail)
+        detail = f"{rounds} rounds of {run.prior.size + 1} points, tolerance {self.tolerance:g}"
+        return run.finish_with_slope(run.z(posterior.mean), P, by_filter(H, L), reason, detail)
 
     def _linearise(
-        self, run: FilterRun, L: FloatArray, at: Gaussian, before: FloatArray
+        self, run: FilterRun, at: Gaussian, before: FloatArray
     ) -> tuple[Gaussian, FloatArray, FloatArray] | Prediction:
         """Where the points could be placed, their mean prediction and the slope dh/dx (n, p)."""
         C, x, spread = at.factor, at.mean, self.spread
-        for _ in range(self.max_rejections + 1):
+        for _ in range(MAX_REJECTIONS + 1):
             points = simplex_points(at.mean.size)
             predicted: list[FloatArray] = []
             for point in x + spread * points @ C.T:
-                prediction = run.predict(run.prior.mean + L @ point, derivatives=False)
+                prediction = run.predict(run.z(point), derivatives=False)
                 if not prediction.converged:
                     break
                 predicted.append(prediction.y)

@@ -5,13 +5,13 @@ Navigation (2001), section 5.4. Each takes plain arrays.
 """
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import scipy
 
 from mvest.errors import InputError
-from mvest.estimation.gaussian import checked_covariance
-from mvest.estimation.noise import SparseMatrix, csc
+from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import require_finite
 from mvest.typing import FloatArray
 
@@ -49,16 +49,13 @@ def nees(error: FloatArray, covariance: FloatArray) -> float:
     float
         Chi-square with p degrees of freedom if the estimate is unbiased and P is its covariance.
     """
-    error = np.asarray(error, dtype=np.float64)
-    if error.ndim != 1:
-        raise InputError(f"an error must have shape (p,); got {error.shape}")
-    require_finite(error, "the error")
-    P = checked_covariance(covariance, error.size, "the covariance")
+    of = Gaussian(error, covariance)
     try:
-        root = np.linalg.cholesky(P)
+        whitened = np.linalg.solve(np.linalg.cholesky(of.covariance), of.mean)
     except np.linalg.LinAlgError as problem:
-        raise InputError(f"NEES needs a positive definite covariance; got\n{P}") from problem
-    whitened = np.linalg.solve(root, error)
+        raise InputError(
+            f"NEES needs a positive definite covariance; got\n{covariance}"
+        ) from problem
     return float(whitened @ whitened)
 
 
@@ -97,7 +94,7 @@ def zero_mean(innovation: FloatArray) -> ZTest:
     return ZTest(float(w.mean()), 0.0, float(w.std(ddof=1) / np.sqrt(w.size)))
 
 
-def moran(innovation: FloatArray, neighbours: SparseMatrix) -> ZTest:
+def moran(innovation: FloatArray, neighbours: "scipy.sparse.sparray[Any, Any]") -> ZTest:
     """Moran's I: test that innovations at neighbouring points are uncorrelated.
 
     Parameters
@@ -116,7 +113,7 @@ def moran(innovation: FloatArray, neighbours: SparseMatrix) -> ZTest:
     """
     w = _series(innovation)
     n = w.size
-    A = csc(neighbours)
+    A = scipy.sparse.csc_array(cast(Any, neighbours), dtype=np.float64)
     if A.shape != (n, n):
         raise InputError(f"neighbours must have shape ({n}, {n}); got {A.shape}")
     if A.nnz == 0 or np.any(A.data < 0.0) or np.any(A.diagonal() != 0.0):

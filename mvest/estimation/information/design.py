@@ -9,7 +9,7 @@ deviations are relative: those of the logarithm of a positive parameter, to firs
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ import scipy
 from mvest.errors import InputError
 from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance, observation_noise
-from mvest.estimation.prediction import require_finite
+from mvest.estimation.prediction import require_finite, require_positive
 from mvest.typing import FloatArray
 
 NOISE_RANGE = (1e-6, 1e6)
@@ -63,8 +63,7 @@ class Design:
                 f"of shape {values.shape}"
             )
         require_finite(H, "the Jacobian")
-        if not np.all(np.isfinite(values) & (values > 0.0)):
-            raise InputError(f"values of a design {values}, expected positive ones")
+        require_positive(values, "a value of a design")
         return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))
 
     def at(self, noise: float, knowledge: Mapping[str, float] | None = None) -> Identifiability:
@@ -114,17 +113,7 @@ class Design:
         """
         if not target > 0.0:
             raise InputError(f"target = {target}, expected > 0")
-
-        def excess(log_noise: float) -> float:
-            # The logarithm, which goes in straight lines; infinite deviations stay comparable.
-            return min(float(np.log(self.std(name, np.exp(log_noise), knowledge) / target)), 1e3)
-
-        low, high = np.log(NOISE_RANGE)
-        if excess(low) > 0.0:
-            return 0.0
-        if excess(high) < 0.0:
-            return np.inf
-        return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-12)))
+        return _needed(lambda noise: self.std(name, noise, knowledge) / target, NOISE_RANGE)
 
     def needed_repeats(
         self, name: str, target: float, noise: float, knowledge: Mapping[str, float] | None = None
@@ -149,16 +138,25 @@ class Design:
         Zero if knowing it exactly is not enough, infinite if nothing need be known of it.
         """
 
-        def excess(log_std: float) -> float:
-            known = {**(knowledge or {}), about: float(np.exp(log_std))}
-            return float(np.log(self.std(name, noise, known) / target))
+        def relative(std: float) -> float:
+            return self.std(name, noise, {**(knowledge or {}), about: std}) / target
 
-        low, high = np.log(KNOWLEDGE_RANGE)
-        if excess(low) > 0.0:
-            return 0.0
-        if excess(high) < 0.0:
-            return np.inf
-        return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-12)))
+        return _needed(relative, KNOWLEDGE_RANGE)
+
+
+def _needed(relative: Callable[[float], float], within: tuple[float, float]) -> float:
+    """Where an increasing function is 1; 0 if it is more all over the range, infinite if less."""
+
+    def excess(log: float) -> float:
+        # The logarithm, which goes in straight lines; infinite values stay comparable.
+        return min(float(np.log(relative(float(np.exp(log))))), 1e3)
+
+    low, high = np.log(within)
+    if excess(low) > 0.0:
+        return 0.0
+    if excess(high) < 0.0:
+        return np.inf
+    return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-12)))
 
 
 def together(*designs: Design) -> Design:

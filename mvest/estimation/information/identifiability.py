@@ -14,6 +14,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance, observation_noise
 from mvest.estimation.prediction import require_finite
 from mvest.estimation.transform import to_filter
+from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 RELEVANT_SHARE = 0.1
@@ -299,10 +300,7 @@ def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray
     require_finite(offset, "the error of the model")
     noise, prior = observation_noise(R, len(offset)), to_filter(found.transform, found.prior)
     H = found.prediction.jacobian * found.transform.derivative(found.transformed.mean)
-    # In coordinates in which the prior is N(0, I), so that it may be singular.
-    A = noise.whiten(H @ prior.factor)
-    B = np.eye(prior.size) + A.T @ A
-    return np.asarray(prior.factor @ np.linalg.solve(B, A.T @ noise.whiten(offset)))
+    return kalman_update(prior, offset, H, noise).posterior.mean - prior.mean
 
 
 def with_shift(found: Estimate, shift: FloatArray) -> Estimate:

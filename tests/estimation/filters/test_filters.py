@@ -392,15 +392,15 @@ def test_a_failing_step_is_shortened():
 
 def test_a_model_that_fails_to_the_end_is_a_value():
     # Every step from 2 leads up, and there is nothing above 2.
-    estimate = IteratedFilter(max_rejections=5)(failing_above(2.0), HAND_PRIOR, HAND_Y, HAND_R)
+    estimate = IteratedFilter()(failing_above(2.0), HAND_PRIOR, HAND_Y, HAND_R)
     assert estimate.reason is Reason.MODEL_FAILED
     assert not estimate.converged
     assert "the solver gave up" in estimate.detail
     # The estimate stays where the model last gave an answer, and the answer is that one.
     assert estimate.mean[0] == 2.0
     assert estimate.prediction.y[0] == 4.0
-    # One run at the start, the full step and five shortened ones.
-    assert estimate.forward_solves == 7
+    # One run at the start, the full step and eight shortened ones.
+    assert estimate.forward_solves == 10
 
 
 @pytest.mark.parametrize("method", [PaperFilter(), IteratedFilter()])

@@ -39,7 +39,7 @@ def test_on_a_linear_model_all_filters_are_filterpys_kalman_filter() -> None:
     innovation = np.ravel(other.y)
     np.testing.assert_allclose(found.innovation.rms, np.sqrt(np.mean(innovation**2)), rtol=1e-9)
     left = problem.y - problem.H @ np.ravel(other.x)
-    np.testing.assert_allclose(found.residual_rms(problem.y), np.sqrt(np.mean(left**2)), rtol=1e-9)
+    np.testing.assert_allclose(found.innovation.residual_rms, np.sqrt(np.mean(left**2)), rtol=1e-9)
 
 
 def test_one_update_of_a_nonlinear_model_is_filterpys_extended_filter() -> None:

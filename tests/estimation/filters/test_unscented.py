@@ -107,7 +107,7 @@ def test_a_model_that_always_fails_ends_with_its_words() -> None:
     assert found.reason is Reason.MODEL_FAILED
     assert "no valve" in found.detail
     assert found.prediction is None
-    assert found.forward_solves == 7  # 1 + max_rejections, each ends at its first point
+    assert found.forward_solves == 7  # 1 + MAX_REJECTIONS, each ends at its first point
 
 
 def test_a_parameter_that_the_prior_holds_fixed_stays() -> None:
@@ -133,7 +133,7 @@ def test_it_works_in_logarithms() -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}, {"max_rejections": -1}],
+    [{"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}],
 )
 def test_inadmissible_settings_are_refused(settings) -> None:
     with pytest.raises(InputError):
