@@ -46,7 +46,7 @@ class Poses:
         return np.asarray(self.centre[:, None] + points @ np.swapaxes(self.axes, 1, 2))
 
     def local(self, points: FloatArray) -> FloatArray:
-        """What :meth:`world` took: ``(P, m, 3)`` in the valve's axes, scale taken off."""
+        """Inverse of :meth:`world`: ``(P, m, 3)`` in the valve's axes, scale taken off."""
         scale = np.exp(-self.log_scale)[:, None, None]
         return np.asarray((points - self.centre[:, None]) @ self.rotation * scale)
 
