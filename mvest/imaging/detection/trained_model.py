@@ -213,9 +213,8 @@ def default_model() -> DetectionModel:
     """
     if not MODEL_FILE.is_file():
         raise InputError(
-            f"{MODEL_FILE}: no trained detectors come with this installation; expected what "
-            "python -m experiments.run experiment=imaging imaging.model=null "
-            "imaging.publish_model=true makes"
+            f"{MODEL_FILE}: no trained detectors come with this installation; expected the tee.npz "
+            "that python -m experiments.run experiment=imaging imaging.model=null makes"
         )
     return load_model(MODEL_FILE)
 
