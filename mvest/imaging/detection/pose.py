@@ -90,11 +90,8 @@ class Poses:
     @staticmethod
     def joined(parts: list[Poses]) -> Poses:
         """All poses of several."""
-        return Poses(
-            np.concatenate([p.centre for p in parts]),
-            np.concatenate([p.rotation for p in parts]),
-            np.concatenate([p.log_scale for p in parts]),
-        )
+        names = ("centre", "rotation", "log_scale")
+        return Poses(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 def pose_of(
