@@ -87,9 +87,6 @@ class ImagingSettings:
     held_out: HeldOutSettings
     processes: Annotated[Processes, NOT_HASHED] = 1
     model: str | None = None  # file or "package": detectors to be tested; null trains them
-    publish_model: Annotated[bool, NOT_HASHED] = (
-        False  # make the detectors those that come with the package
-    )
 
 
 SAMPLED_BY = (volume_samples, train_stage, fit_shape_model)

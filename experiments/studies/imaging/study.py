@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common.records.record import Number, Record
+from experiments.common.records.record import Number
 from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore, Seen
 from mvest.cases.from_images.detector_errors import coverage
 from mvest.errors import ConfigurationError, InputError
-from mvest.files import sha256_of, write_atomically
+from mvest.files import sha256_of
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
     DetectionModel,
@@ -357,7 +357,7 @@ def figure(results: Results) -> Figure | None:
     return drawn
 
 
-# -- settings and the package's model -------------------------------------------------------------
+# -- settings -------------------------------------------------------------------------------------
 def require_imaging(config: Values) -> None:
     """Refuse settings that the study could not run with.
 
@@ -382,22 +382,6 @@ def require_imaging(config: Values) -> None:
     landmark_vertices(ValveLayout(motion.columns, motion.rows))
 
 
-def publish_model(job: Job[Settings], _record: Record) -> None:
-    """Make a finished run's detectors those that come with the package, if that is asked for.
-
-    Raises
-    ------
-    InputError
-        If they are not there any more, or cannot be written.
-    """
-    if not job.settings.imaging.publish_model:
-        return
-    source = job.folder / MODEL
-    load_model(source)  # what is missing or cannot be read is not handed on
-    write_atomically(MODEL_FILE, source.read_bytes())
-    print(f"Detectors in {MODEL_FILE}")
-
-
 STUDY = Study(
     settings=Settings,
     run=run_imaging,
@@ -406,6 +390,5 @@ STUDY = Study(
         "": "Confidence, and distance of detected leaflets from the true ones, in volumes with and "
         "without a valve. Simulated."
     },
-    finish=publish_model,
     require=require_imaging,
 )

@@ -10,12 +10,7 @@ from mvest.errors import InputError
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.leaflets import find_boundary, find_landmarks, find_rim
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import (
-    MODES,
-    refined,
-    search_poses,
-    starting_shape,
-)
+from mvest.imaging.detection.pose_search import MODES, refined, search_poses, starting_shape
 from mvest.imaging.detection.shape_model import Pulls, fit_shape, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.layout import ValveLayout
@@ -24,20 +19,19 @@ from mvest.typing import FloatArray, IntArray
 
 LANDMARK_STD_MM = 1.2
 RIM_STD_MM = 0.8
-"""mm, least standard deviation of a landmark's and a rim's pull: what the spread of votes does not
-tell."""
+"""mm, least standard deviation of a landmark's and a rim's pull; the spread of votes adds to it."""
 
 HAND_STD_MM = (0.2, 0.03)
-"""mm, of landmarks placed by hand: while the shape is fitted, and for the free displacement, which
-is to end there."""
+"""mm, standard deviation of landmarks placed by hand: while the shape is fitted, and in the free
+displacement at the end."""
 
 ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
 """Modes of the shape model in each round of the fit, as far as the model has them, and how far
 along normals (mm) the leaflets are looked for."""
 
 ALIKE = 8.0
-"""Neighbouring vertices see much the same: what is seen counts as if there were this many times
-fewer of them."""
+"""Errors of neighbouring vertices are correlated: the boundary counts as if there were this many
+times fewer vertices."""
 
 STIFFNESS, HOLD = 4.0, 0.3
 """Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`."""
@@ -49,7 +43,7 @@ SURE = 0.6
 """Rating above which the best pose is taken without trying others."""
 
 TRIED = 14
-"""Poses that are tried otherwise: among fewer the right one is often missing."""
+"""Poses that are tried otherwise. Among fewer the right one is often missing."""
 
 RATING_SHARE = 0.3
 """Weight of a pose's rating beside what is seen of the leaflets, in the confidence. Of simulated

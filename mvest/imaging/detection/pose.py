@@ -46,7 +46,7 @@ class Poses:
         return np.asarray(self.centre[:, None] + points @ np.swapaxes(self.axes, 1, 2))
 
     def local(self, points: FloatArray) -> FloatArray:
-        """What :meth:`world` took: ``(P, m, 3)`` in the valve's axes, scale taken off."""
+        """Inverse of :meth:`world`: ``(P, m, 3)`` in the valve's axes, scale taken off."""
         scale = np.exp(-self.log_scale)[:, None, None]
         return np.asarray((points - self.centre[:, None]) @ self.rotation * scale)
 
@@ -90,11 +90,8 @@ class Poses:
     @staticmethod
     def joined(parts: list[Poses]) -> Poses:
         """All poses of several."""
-        return Poses(
-            np.concatenate([p.centre for p in parts]),
-            np.concatenate([p.rotation for p in parts]),
-            np.concatenate([p.log_scale for p in parts]),
-        )
+        names = ("centre", "rotation", "log_scale")
+        return Poses(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 def pose_of(

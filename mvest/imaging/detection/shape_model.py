@@ -118,8 +118,7 @@ POSE_STD = np.array([4.0, 4.0, 4.0, 0.25, 0.25, 0.25, 0.12])
 """mm, radians and log scale: how far one fit may move the pose; wide."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pulls:
+class Pulls(NamedTuple):
     """What was seen of some vertices.
 
     Attributes
@@ -140,12 +139,7 @@ class Pulls:
     @classmethod
     def joined(cls, parts: Sequence[Pulls]) -> Pulls:
         """All pulls of several."""
-        return cls(
-            np.concatenate([p.vertex for p in parts]),
-            np.concatenate([p.direction for p in parts]),
-            np.concatenate([p.offset for p in parts]),
-            np.concatenate([p.std for p in parts]),
-        )
+        return cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     @classmethod
     def to_points(

@@ -76,10 +76,10 @@ POSE_LANDMARKS = 4
 """Landmarks by hand that give the pose of a frame."""
 
 LINE_MM = 2.0
-"""mm, root sum of squares across the best line: below it a pose does not follow from points."""
+"""mm, root sum of squares about the best line. Below it landmarks determine no pose."""
 
 HYPOTHESES, SHARED = 3, 3
-"""Poses of each frame's own search, and best ones of all frames, which are tried in every frame."""
+"""Poses from each frame's own search, and best poses of all frames, which every frame tries."""
 
 SPEED_MM_S, STILL_MM = 60.0, 2.0
 """Standard deviations of the speed at which a hypothesis moves (its annulus), and of its change

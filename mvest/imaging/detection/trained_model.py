@@ -48,21 +48,21 @@ MAX_FILE_SIZE = 2**28
 """Bytes; the model that comes with the package has a few millions."""
 
 MAX_REASON = 120
-"""Characters of another library's message that are passed on; some quote the file."""
+"""Characters of another library's message that an error quotes."""
 
 
 UNLIKE_SHARE = 0.02
-"""Of volumes drawn as those of training: so many are expected to count as unlike them."""
+"""Share of volumes drawn as in training that are expected to count as unlike them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionAccuracy:
-    """How the detectors err on simulated volumes that they have not seen.
+    """Errors of the detectors on simulated volumes that they have not seen.
 
     Attributes
     ----------
     std_mm : (n,)
-        Of each coordinate of each vertex.
+        Standard deviation of each coordinate of each vertex.
     correlation_length_mm : float
     samples : (S, F, n, 3)
         Errors in the valve's axes, mm: of S sequences, in the open and in the closed frame.
@@ -75,7 +75,7 @@ class DetectionAccuracy:
         expected there.
     shapes : (S, F, n, 3) mm or None
         Where the valves of these sequences were found, each frame in its own axes (`pose_of`).
-        None: this was not kept.
+        None in a model that was saved without them.
     tip_shapes : (S, F, 2, 3) mm or None
     """
 
@@ -213,9 +213,8 @@ def default_model() -> DetectionModel:
     """
     if not MODEL_FILE.is_file():
         raise InputError(
-            f"{MODEL_FILE}: no trained detectors come with this installation; expected what "
-            "python -m experiments.run experiment=imaging imaging.model=null "
-            "imaging.publish_model=true makes"
+            f"{MODEL_FILE}: no trained detectors come with this installation; expected the tee.npz "
+            "that python -m experiments.run experiment=imaging imaging.model=null makes"
         )
     return load_model(MODEL_FILE)
 
