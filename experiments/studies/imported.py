@@ -70,7 +70,7 @@ from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import measure_annulus
-from mvest.valve.measure.measurements import leaflet_length
+from mvest.valve.measure.clinical import leaflet_length
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 from mvest.valve.mesh.structured import layered_wedges
 
