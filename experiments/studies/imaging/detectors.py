@@ -40,7 +40,6 @@ from mvest.quantities import Count, Length, Processes, Seed, within
 from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
 from mvest.simulation.population import (
-    Population,
     PopulationSettings,
     draw_population,
     load_population,
@@ -148,7 +147,7 @@ class ImagingStore:
             self.given = MODEL_FILE if settings.model == PACKAGED else Path(settings.model)
         self.model_file = self.given or self._model_file()
 
-    def _valves(self, which: str) -> Entry[Population]:
+    def _valves(self, which: str) -> Entry[tuple[MovingValve, ...]]:
         described = {
             "drawn": asdict(getattr(self.settings, which)),
             "bases": [[name, asdict(values)] for name, values in self.settings.bases.items()],
@@ -162,7 +161,7 @@ class ImagingStore:
         """A population of simulated valves: ``train``, ``calibration`` or ``test``."""
         drawn = getattr(self.settings, which)
 
-        def draw() -> Population:
+        def draw() -> tuple[MovingValve, ...]:
             with PartBar(f"valves: {which}", drawn.count, "valve") as bar:
                 return draw_population(
                     drawn.count,
@@ -174,7 +173,7 @@ class ImagingStore:
                     progress=lambda _number, _valve: bar.step(),
                 )
 
-        return self._valves(which).get_or_make(draw, save_population).valves
+        return self._valves(which).get_or_make(draw, save_population)
 
     def samples_folder(self) -> Path:
         """Folder of the samples of all training volumes, however many there are."""

@@ -31,7 +31,7 @@ from mvest.valve.measure.coaptation import (
     project_leaflets,
 )
 
-Numbers: TypeAlias = dict[str, float | None]
+Numbers: TypeAlias = dict[str, float]
 """Name with its unit -> number."""
 
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "ratio": ""}
