@@ -294,7 +294,7 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     places, coarse = recording.remeshed(donor.vertices)
     _, contact = recording.remeshed(donor.contact_vertices)
     layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
-    mesh = layered_wedges(coarse.surface, onto=recording.valve.surface, **layers).solid
+    mesh = layered_wedges(coarse.surface, recording.valve.surface, **layers)
     seen = recording.positions(places.triangle, places.weights, -1)
     return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
 
