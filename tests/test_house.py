@@ -290,7 +290,7 @@ def test_conf_is_data() -> None:
         ("mvest.estimation.ekf", "import importlib\nimportlib.import_module('mvest.mechanics')"),
         # Of the valve, mechanics and imaging know the value objects only.
         ("mvest.mechanics.law.biot", "from mvest.valve.anatomy.template import make_template"),
-        ("mvest.imaging.tracking", "from mvest.valve.measure.measurements import orifice_area"),
+        ("mvest.imaging.tracking", "from mvest.valve.measure.coaptation import orifice_area"),
         # Leaves import nothing but each other.
         ("mvest.errors", "from mvest.provenance import git_state"),
         ("mvest.elements", "from mvest.mechanics import assembly"),

@@ -32,9 +32,7 @@ figure, panels = plt.subplots(2, 3, figsize=(9, 6.2), layout="constrained")
 for (title, parameters), (above, beside) in zip(anatomies.items(), panels.T, strict=True):
     valve = mvest.Template(parameters).valve(56, 15)
     x, ring = valve.surface.vertices, valve.surface.vertices[valve.annulus]
-    found = clinical_measurements(
-        x, valve.surface, ring, valve.papillary_tips, 1.9, passing_ball=False
-    )
+    found = clinical_measurements(x, valve.surface, ring, valve.papillary_tips, 1.9)
     drawn += [x, valve.papillary_tips]
     draw(above, valve, view=ATRIUM)
     draw(beside, valve, view=SIDE, chords=True)

@@ -25,7 +25,6 @@ from mvest.reporting.tables import Column, Table, joined, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.valve.measure.coaptation import find_gap
-from mvest.valve.measure.passing_ball import largest_passing_ball
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,11 +59,9 @@ def _gate(job: Job[Settings]) -> Result:
     )
     model = closure_model(values)
     closures = len(report.rows) + sum(path.closures for path in report.paths)
-    gap, ball = (None, None) if report.closed is None else _open(model, report.closed)
     verdict = {
         "passed": report.passed,
-        "gap": gap,
-        "passing ball": ball,
+        "gap": None if report.closed is None else _gap(model, report.closed),
         "closures": closures,
         "fails by": "; ".join(_failures(report)),
     }
@@ -81,7 +78,7 @@ def _gate(job: Job[Settings]) -> Result:
 
 
 def _verdicts(rows: list[dict[str, Any]]) -> Table:
-    return table(rows, **{"passed": "", "gap": "mm²:.2g", "passing ball": "mm:.2g"})
+    return table(rows, passed="", gap="mm²:.2g")
 
 
 def _failures(report: GateReport) -> list[str]:
@@ -93,13 +90,11 @@ def _failures(report: GateReport) -> list[str]:
     return [*rows, *(f"{p.name}: {p.reason}" for p in report.paths if not p.passed)]
 
 
-def _open(model: ClosureModel, vertices: FloatArray) -> tuple[float, float]:
-    """Gap (mm²) of a closed valve, and diameter (mm) of the largest ball that passes it."""
-    surface = model.valve.surface
-    annulus = vertices[model.valve.annulus]
-    seen = vertices, surface.triangles, annulus, plane_of(model.valve, annulus)
-    gap = find_gap(*seen, model.contact_reach_mm)
-    return gap.area, largest_passing_ball(*seen, thickness=surface.thickness).diameter
+def _gap(model: ClosureModel, vertices: FloatArray) -> float:
+    """Gap (mm²) of a closed valve."""
+    valve, annulus = model.valve, vertices[model.valve.annulus]
+    seen = vertices, valve.surface.triangles, annulus, plane_of(valve, annulus)
+    return find_gap(*seen, model.contact_reach_mm).area
 
 
 def _say(text: str) -> None:
@@ -144,7 +139,6 @@ MOMENTS = (0.75, 0.1)
 
 CURVES = {
     "orifice": "orifice (mm²)",
-    "passing ball": "largest ball that passes (mm)",
     "coaptation": "coaptation in the middle (mm)",
     "chord strain": "largest strain of a chord (%)",
 }

@@ -69,7 +69,7 @@ from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import measure_annulus
-from mvest.valve.measure.measurements import leaflet_length
+from mvest.valve.measure.clinical import leaflet_length
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 from mvest.valve.mesh.structured import layered_wedges
 
@@ -293,7 +293,7 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     places, coarse = recording.remeshed(donor.vertices)
     _, contact = recording.remeshed(donor.contact_vertices)
     layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
-    mesh = layered_wedges(coarse.surface, onto=recording.valve.surface, **layers).solid
+    mesh = layered_wedges(coarse.surface, recording.valve.surface, **layers)
     seen = recording.positions(places.triangle, places.weights, -1)
     return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
 

@@ -28,7 +28,7 @@ from mvest.problem.registration import unit_of
 from mvest.problem.stored import Extrapolated
 from mvest.reporting.tables import Column, Table, table
 from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
+from mvest.valve.measure.clinical import Numbers, closure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +61,7 @@ def run_twin(job: Job[Settings]) -> Result:
         for seed, one in zip(seeds, results, strict=True)
     )
     solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
-    closed = (_measured(twin, result) or {} if values["measure"] else {}).get("closed")
+    closed = _measured(twin, result) if values["measure"] else {}
     band = _truth_band(twin, result)
     row = _row(values, estimates[0], closed, band)
     row |= {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}
@@ -148,31 +148,27 @@ def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:
     return list(100 * np.abs(shift / twin.truth_values))
 
 
-def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements | str] | None:
-    """Measurements of each fitted frame, or why they could not be taken."""
+def _measured(twin: Twin, result: StudyResult) -> Numbers:
+    """Measurements of the fitted closed frame; none where there is none, or its shape defies them.
+
+    An estimate is not lost because of that.
+    """
     if result.observation is None or result.fitted is None:
-        return None
+        return {}
+    points = dict(zip(result.observation.frames, result.fitted, strict=True)).get("closed")
+    if points is None:
+        return {}
     valve, surface = twin.valve, twin.valve.surface
     reach = twin.model.settings.contact.activation_distance * float(surface.thickness.mean())
     first = np.unique(surface.triangles[surface.region == 0])
-    measured: dict[str, ClosureMeasurements | str] = {}
-    for frame, points in zip(result.observation.frames, result.fitted, strict=True):
-        annulus = points[valve.annulus]
-        anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
-        try:
-            measured[frame] = measure_closure(
-                points,
-                surface.triangles,
-                surface.region,
-                surface.thickness,
-                annulus,
-                annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior),
-                reach,
-            )
-        except MvestError as error:
-            # An estimate is not lost because the valve's shape defies a measurement.
-            measured[frame] = str(error)
-    return measured
+    annulus = points[valve.annulus]
+    anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
+    pair = [surface.triangles[surface.region == k] for k in (0, 1)]
+    try:
+        plane = annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior)
+        return closure(points, surface.triangles, annulus, plane, pair, reach)
+    except MvestError:
+        return {}
 
 
 def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
@@ -210,7 +206,7 @@ def require_twin(values: Mapping[str, Any]) -> None:
 def _row(
     values: Mapping[str, Any],
     record: EstimateRecord,
-    closed: ClosureMeasurements | str | None,
+    closed: Numbers,
     band: Sequence[float] | None,
 ) -> dict[str, Any]:
     """What tables say of one run: plain numbers, errors without sign."""
@@ -229,16 +225,14 @@ def _row(
     moduli = [one for one in record.unknowns if one.kind != "nuisance"]
     errors = [abs(one.relative_error) for one in moduli if one.relative_error is not None]
     distance, model = record.distance_mm, model_of_values(values)
-    measured = closed if isinstance(closed, ClosureMeasurements) else None
     return row | {
         "moduli error mean": 100 * float(np.mean(errors)) if errors else None,
         "moduli error SD": 100 * float(np.std(errors)) if errors else None,
         "distance mean": distance and distance.mean,
         "distance SD": distance and distance.std,
         "distance max": distance and distance.max,
-        "orifice, closed": measured and measured.orifice_area,
-        "passing ball, closed": measured and measured.passing_ball_diameter,
-        "coaptation": measured and measured.coaptation_length,
+        "orifice, closed": closed.get("orifice_mm2"),
+        "coaptation": closed.get("coaptation_length_mm"),
         "element": model.element,
         "cells": " x ".join(str(n) for n in model.cells),
         "filter": model.filter,
@@ -278,7 +272,6 @@ def _at(values: Sequence[float] | None, k: int) -> float | None:
 UNITS = {
     "distance max": "mm",
     "orifice, closed": "mm²",
-    "passing ball, closed": "mm",
     "coaptation": "mm",
     "noise": "mm",
 }

@@ -18,9 +18,10 @@ from mvest.cases.rims import loop_vector_area
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface, lumped_areas
+from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
+from mvest.valve.measure.clinical import leaflet_length
 from mvest.valve.measure.coaptation import orifice_area
-from mvest.valve.measure.measurements import leaflet_length, surface_area
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +295,7 @@ def _of_order(case: ValveCase, closed: Frame, other: Frame, planes: Planes) -> I
     rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
     doubt = case.uncertainty
     alike = 2.0 * np.pi * doubt.correlation_length_mm**2
-    whole = surface_area(closed.vertices, closed.triangles)
+    whole = areas(closed.vertices, closed.triangles).sum()
     independent = len(closed.vertices) if alike == 0.0 else max(whole / alike, 1.0)
     if rise < -ORDER_STDS * doubt.typical_mm * np.sqrt(2.0 / independent):
         high, low = sorted((closed, other), key=lambda f: f.pressure_mmHg, reverse=True)
@@ -310,8 +311,8 @@ def _of_order(case: ValveCase, closed: Frame, other: Frame, planes: Planes) -> I
 def _of_stretch(surface: LeafletSurface, closed: Frame, number: int, name: str) -> Iterator[Doubt]:
     """Whether a leaflet keeps its size from the open to the closed frame."""
     field, own = f"frames.{closed.name}.surface", surface.triangles[surface.region == number]
-    before = surface_area(surface.vertices, own)
-    after = surface_area(closed.vertices, closed.triangles[closed.region == number])
+    before = areas(surface.vertices, own).sum()
+    after = areas(closed.vertices, closed.triangles[closed.region == number]).sum()
     if before <= 0 or after <= 0:
         return
     what = f"area of the {name} leaflet, closed over open,"

@@ -27,14 +27,13 @@ from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
+from mvest.valve.measure.clinical import tenting
 from mvest.valve.measure.coaptation import (
     coaptation_area,
     coaptation_length,
     find_gap,
     orifice_area,
 )
-from mvest.valve.measure.measurements import measure_tenting
-from mvest.valve.measure.passing_ball import largest_passing_ball
 from mvest.valve.mesh.solid_mesh import embed, jacobian_determinants
 
 
@@ -60,9 +59,9 @@ def measure_steps(
     -------
     list of dict
         Of each step ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening seen along
-        the best annulus normal, and ``passing ball`` (mm), the diameter of the largest ball that
-        passes, both between the thick leaflets; ``coaptation`` (mm), the height in the middle of
-        the valve over which the midsurfaces of opposing leaflets are within the contact distance;
+        the best annulus normal between the thick leaflets; ``coaptation`` (mm), the height in the
+        middle of the valve over which the midsurfaces of opposing leaflets are within the contact
+        distance;
         ``intersections``, pairs of intersecting triangles of the leaflets' faces (both sides and
         rims); the largest ``chord strain`` and ``chord force`` (N); ``smallest det F``, the
         determinant of the deformation gradient at the quadrature points; ``Newton iterations``.
@@ -83,14 +82,12 @@ def measure_steps(
         loads = loading(time)
         strain, force = _chordae(system, x, loads.tips)
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
-        length = coaptation_length(middle, one, other, plane, contact_distance).length
-        ball = largest_passing_ball(outer, closed_surface.triangles, annulus, plane).diameter
+        length = coaptation_length(middle, one, other, plane, contact_distance)
         measures.append(
             {
                 "time": float(time),
                 "pressure": float(mpa_to_mmhg(loads.pressure)),
                 "orifice": orifice_area(outer, closed_surface.triangles, annulus, plane),
-                "passing ball": ball,
                 "coaptation": length,
                 "intersections": len(intersecting_triangles(outer, closed_surface.triangles)),
                 "chord strain": strain,
@@ -276,11 +273,10 @@ def measure_closed(
     pair = surface.triangles[surface.region == 0], surface.triangles[surface.region == 1]
     measures = {
         "gap_mm2": find_gap(vertices, np.concatenate(pair), annulus, plane, reach).area,
-        "coaptation_length_mm": coaptation_length(vertices, *pair, plane, reach).length,
+        "coaptation_length_mm": coaptation_length(vertices, *pair, plane, reach),
         "coaptation_area_mm2": coaptation_area(vertices, *pair, reach),
     }
-    tenting = measure_tenting(vertices, surface.triangles, annulus, plane)
-    measures |= {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
+    measures |= tenting(vertices, surface.triangles, annulus, plane)
     size = measure_annulus(annulus, plane)
     measures["coaptation_height_mm"] = measures["coaptation_area_mm2"] / size.commissural_diameter
     measures["ap_diameter_mm"] = size.anteroposterior_diameter

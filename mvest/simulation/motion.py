@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -46,24 +45,11 @@ from mvest.valve.measure.coaptation import orifice_area
 from mvest.valve.mesh.structured import structured_mesh
 
 
-class Refusal(Enum):
-    """Why a motion is refused."""
-
-    NOT_CLOSED = "the closure does not converge"
-    NOT_HELD = "the closed valve is not held at a lower pressure"
-    LEAKS = "the closed valve leaves too much of its orifice open"
-    APART = "the free edges of the closed valve do not lie at each other"
-    FLAILS = "the free edge of the closed valve lies above its annulus"
-    STRETCHED = "a leaflet is stretched too far"
-    CROSSED = "leaflets pass through each other"
-
-
 class RefusedError(GeometryError):
-    """A motion that is refused."""
+    """A motion that is refused, and why."""
 
-    def __init__(self, name: str, reason: Refusal, detail: str) -> None:
-        super().__init__(f"simulated valve {name}: {reason.value} ({detail})")
-        self.reason = reason
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(f"simulated valve {name}: {reason}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,12 +112,12 @@ def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
     )
     stretch = float(np.quantile(lengths[1:] / lengths[0], 0.99, axis=1).max())
     if stretch > limits.stretch:
-        raise RefusedError(name, Refusal.STRETCHED, f"{stretch:.2f} times its length")
+        raise RefusedError(name, f"a leaflet is stretched to {stretch:.2f} times its length")
     for k, vertices in enumerate(valve.vertices):
         crossings = len(intersecting_triangles(vertices, layout.triangles))
         if crossings > limits.crossings:
             raise RefusedError(
-                name, Refusal.CROSSED, f"{crossings} pairs of triangles in frame {k}"
+                name, f"{crossings} pairs of triangles pass through each other in frame {k}"
             )
     areas, plane = [], None
     for frame in (0, closed):
@@ -141,17 +127,17 @@ def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
         areas.append(orifice_area(vertices, layout.triangles, annulus, plane, 0.3))
     if areas[1] > limits.orifice * areas[0]:
         raise RefusedError(
-            name, Refusal.LEAKS, f"{areas[1]:.0f} of {areas[0]:.0f} mm2 are left open"
+            name, f"closed it leaves {areas[1]:.0f} of {areas[0]:.0f} mm2 of its orifice open"
         )
     edge = valve.vertices[closed][layout.free_edge]
     middle = np.arange(layout.columns // 8, 3 * layout.columns // 8 + 1)
     gap = float(np.median(np.linalg.norm(edge[middle] - edge[-middle], axis=1)))
     if gap > limits.edge_gap:
-        raise RefusedError(name, Refusal.APART, f"{gap:.1f} mm apart")
+        raise RefusedError(name, f"the free edges of the closed valve lie {gap:.1f} mm apart")
     assert plane is not None
     height = -float(plane.coordinates(edge)[:, 2].min())
     if height > limits.edge_height:
-        raise RefusedError(name, Refusal.FLAILS, f"by {height:.1f} mm")
+        raise RefusedError(name, f"its closed free edge lies {height:.1f} mm above the annulus")
 
 
 GIVE_UP: dict[str, Any] = {"max_iterations": 40, "max_halvings": 3, "largest_move": 2.0}
@@ -276,7 +262,7 @@ def close_in_motion(
     for state, vertices in zip(states, model.held(closing.at, states), strict=True):
         if vertices is None:
             raise RefusedError(
-                name, Refusal.NOT_HELD, f"no equilibrium under {state.pressure_mmHg:.0f} mmHg"
+                name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
             )
         held.append(vertices)
     valve = moving_valve(
@@ -322,7 +308,7 @@ def closing_frames(
     at = np.array([values[parameter] for parameter in model.names])
     simulation = model.close(at, sensitivities=False, every_frame=True).simulation
     if not simulation.converged:
-        raise RefusedError(name, Refusal.NOT_CLOSED, simulation.reason.value)
+        raise RefusedError(name, f"the closure does not converge ({simulation.reason.value})")
     positions = np.stack([model.observed(frame) for frame in simulation.frames])
     chosen = frames_along(positions[:, seen.free_edge], settings.frames)
     phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])

@@ -8,9 +8,8 @@ A population is kept in one ``.npz`` file without pickled objects.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.processes import side_by_side
-from mvest.provenance import config_hash
 from mvest.quantities import Factor, Length, Logarithm, Modulus
 from mvest.reading.npz import check_array, read_npz
 from mvest.simulation.motion import MotionSettings, RefusedError, close_in_motion
@@ -76,24 +74,6 @@ class PopulationSettings:
         require_numbers(self, "population", *spreads, least=0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Population:
-    """Simulated valves.
-
-    Attributes
-    ----------
-    valves : tuple of MovingValve
-    refused : mapping
-        Reason -> how many valves were drawn again for it.
-    settings_hash : str
-        Of everything that they were made from (:func:`population_hash`).
-    """
-
-    valves: tuple[MovingValve, ...]
-    refused: Mapping[str, int]
-    settings_hash: str
-
-
 def draw_population(
     count: int,
     seed: int,
@@ -103,7 +83,7 @@ def draw_population(
     *,
     processes: int = 1,
     progress: Callable[[int, MovingValve], None] | None = None,
-) -> Population:
+) -> tuple[MovingValve, ...]:
     """Draw and close valves.
 
     Parameters
@@ -128,7 +108,6 @@ def draw_population(
             f"a population of {count} valves in {processes} processes from {len(bases)} anatomies, "
             "expected at least one of each"
         )
-    known = population_hash(count, seed, bases, settings, mechanics)
     root = np.random.SeedSequence(seed)
     names = list(bases)
     order = np.random.default_rng(root.spawn(1)[0]).permuted(
@@ -138,32 +117,12 @@ def draw_population(
         (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence)
         for k, (which, sequence) in enumerate(zip(order, root.spawn(count), strict=True))
     ]
-    made = side_by_side(_draw, ((*job, settings, mechanics) for job in jobs), processes)
-    valves, refused = [], Counter[str]()
-    for k, (valve, reasons) in enumerate(made):
-        valves.append(valve)
-        refused.update(reasons)
+    valves: list[MovingValve] = []
+    for valve in side_by_side(_draw, ((*job, settings, mechanics) for job in jobs), processes):
         if progress is not None:
-            progress(k, valve)
-    return Population(tuple(valves), dict(refused), known)
-
-
-def population_hash(
-    count: int,
-    seed: int,
-    bases: Mapping[str, TemplateParameters],
-    settings: PopulationSettings,
-    mechanics: MechanicsSettings,
-) -> str:
-    """SHA-256 of what a population is drawn from; the code is not part of it."""
-    described: dict[str, Any] = {
-        "count": count,
-        "seed": seed,
-        "bases": [[name, asdict(parameters)] for name, parameters in bases.items()],
-        "settings": asdict(settings),
-        "mechanics": asdict(mechanics),
-    }
-    return config_hash(described)
+            progress(len(valves), valve)
+        valves.append(valve)
+    return tuple(valves)
 
 
 def _draw(
@@ -172,8 +131,8 @@ def _draw(
     sequence: np.random.SeedSequence,
     settings: PopulationSettings,
     mechanics: MechanicsSettings,
-) -> tuple[MovingValve, list[str]]:
-    """A valve, and why others were refused before it."""
+) -> MovingValve:
+    """The first valve that is not refused."""
     rng = np.random.default_rng(sequence)
     reasons: list[str] = []
     while len(reasons) < MAX_DRAWS:
@@ -188,9 +147,9 @@ def _draw(
         tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
         motion = replace(settings.motion, duration=duration)
         try:
-            return close_in_motion(name, template, values, motion, mechanics, tip_motion), reasons
+            return close_in_motion(name, template, values, motion, mechanics, tip_motion)
         except RefusedError as error:
-            reasons.append(error.reason.value)
+            reasons.append(str(error))
     raise GeometryError(f"simulated valve {name}: refused {MAX_DRAWS} times: {'; '.join(reasons)}")
 
 
@@ -221,106 +180,51 @@ def draw_tip_motion(
     return np.asarray(direction * rng.uniform(*reach, size=(2, 1)))
 
 
-VERSION = 1
-"""Of the format."""
-
-ARRAYS = {
-    "version": ("i", ()), "settings_hash": ("U", ()), "refused_reasons": ("U", (None,)),
-    "refused_counts": ("i", (None,)), "names": ("U", (None,)), "layout": ("i", (2,)),
-    "frames": ("i", (None,)), "chordae": ("i", (None,)), "times": ("f", (None,)),
-    "vertices": ("f", (None, None, 3)), "tips": ("f", (None, 2, 3)), "thickness": ("f", (None,)),
-    "chord_phi": ("f", (None,)), "chord_s": ("f", (None,)), "chord_tip": ("i", (None,)),
+SHAPES: dict[str, tuple[int | None, ...]] = {
+    "times": (None,), "vertices": (None, None, 3), "tips": (None, 2, 3), "thickness": (None,),
+    "chord_phi": (None,), "chord_s": (None,),
 }  # fmt: skip
-"""Array -> kind and shape. What differs in length from valve to valve is in one piece, with the
-number of ``frames`` or ``chordae`` of each."""
+"""Array of a valve -> its shape."""
 
 
-def save_population(path: Path, population: Population) -> None:
+def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
     """Write a population, whole or not at all, positions and times in single precision.
 
     Raises
     ------
     InputError
-        If there is no valve, the valves' layouts differ, or the file cannot be written.
+        If the file cannot be written.
     """
-    valves = population.valves
-    layouts = {v.layout for v in valves}
-    if len(layouts) != 1:
-        raise InputError(f"{path}: valves of {len(layouts)} layouts, expected one layout")
-    layout = valves[0].layout
-
-    def joined(name: str, kind: type = np.float32) -> Any:
-        return np.concatenate([np.asarray(getattr(v, name), dtype=kind) for v in valves])
-
-    arrays: dict[str, Any] = {
-        "version": np.array(VERSION),
-        "settings_hash": np.array(population.settings_hash),
-        "refused_reasons": np.array(list(population.refused), dtype=np.str_),
-        "refused_counts": np.array(list(population.refused.values()), dtype=np.int32),
-        "names": np.array([v.name for v in valves]),
-        "layout": np.array([layout.columns, layout.rows], dtype=np.int32),
-        "frames": np.array([len(v.times) for v in valves], dtype=np.int32),
-        "chordae": np.array([len(v.chord_phi) for v in valves], dtype=np.int32),
-        "chord_tip": joined("chord_tip", np.int32),
-        **{
-            name: joined(name)
-            for name in ("times", "vertices", "tips", "thickness", "chord_phi", "chord_s")
-        },
-    }
+    arrays: dict[str, Any] = {"names": np.array([valve.name for valve in valves])}
+    for k, valve in enumerate(valves):
+        arrays[f"{k}.layout"] = np.array([valve.layout.columns, valve.layout.rows])
+        arrays[f"{k}.chord_tip"] = np.asarray(valve.chord_tip, dtype=np.int32)
+        for name in SHAPES:
+            arrays[f"{k}.{name}"] = np.asarray(getattr(valve, name), dtype=np.float32)
     write_atomically(path, partial(np.savez_compressed, **arrays))
 
 
-def load_population(path: Path) -> Population:
+def load_population(path: Path) -> tuple[MovingValve, ...]:
     """Read what :func:`save_population` wrote.
 
     Raises
     ------
     InputError
-        If the file is missing, is of another version, or anything in it is not as it must be.
+        If the file is missing, or anything in it is not as it must be.
     """
-    stored = read_npz(path, list(ARRAYS), exact=True)
-    arrays: dict[str, Any] = {
-        name: check_array(stored[name], f"{path}, {name}", kind, shape)
-        for name, (kind, shape) in ARRAYS.items()
-    }
-    if arrays["version"] != VERSION:
-        raise InputError(f"{path}, version: {arrays['version']}, expected {VERSION}")
-    names, layout_size = arrays["names"], arrays["layout"]
-    count = len(names)
-    if count == 0 or len(set(names.tolist())) != count:
-        raise InputError(f"{path}, names: {count} names, expected different ones, at least one")
-    layout = ValveLayout(int(layout_size[0]), int(layout_size[1]))
-    for name in ("frames", "chordae"):
-        if arrays[name].shape != (count,) or np.any(arrays[name] < 0):
-            raise InputError(f"{path}, {name}: expected a number for each of {count} valves")
-    frames, chordae = int(arrays["frames"].sum()), int(arrays["chordae"].sum())
-    reasons, refused = arrays["refused_reasons"], arrays["refused_counts"]
-    for name, shape in (
-        ("refused_counts", reasons.shape),
-        ("times", (frames,)),
-        ("vertices", (frames, layout.size, 3)),
-        ("tips", (frames, 2, 3)),
-        ("thickness", (count * layout.size,)),
-        ("chord_phi", (chordae,)),
-        ("chord_s", (chordae,)),
-        ("chord_tip", (chordae,)),
-    ):
-        if arrays[name].shape != shape:
-            raise InputError(f"{path}, {name}: shape {arrays[name].shape}, expected {shape}")
-    if not np.isin(arrays["chord_tip"], (0, 1)).all():
-        raise InputError(f"{path}, chord_tip: expected 0 and 1 only")
-    at_frame = np.cumsum(arrays["frames"])[:-1]
-    at_chord = np.cumsum(arrays["chordae"])[:-1]
-    pieces = zip(
-        names.tolist(),
-        *(np.split(arrays[name], at_frame) for name in ("times", "vertices", "tips")),
-        arrays["thickness"].reshape(count, -1),
-        *(np.split(arrays[name], at_chord) for name in ("chord_phi", "chord_s", "chord_tip")),
-        strict=True,
-    )
+    stored = read_npz(path)
+    valves: list[MovingValve] = []
     try:
-        valves = tuple(MovingValve(name, layout, *parts) for name, *parts in pieces)
+        for k, name in enumerate(stored["names"].tolist()):
+            layout = check_array(stored[f"{k}.layout"], f"{k}.layout", "i", (2,))
+            tip = check_array(stored[f"{k}.chord_tip"], f"{k}.chord_tip", "i", (None,))
+            own: dict[str, Any] = {
+                part: check_array(stored[f"{k}.{part}"], f"{k}.{part}", "f", shape)
+                for part, shape in SHAPES.items()
+            }
+            valves.append(MovingValve(name, ValveLayout(*layout.tolist()), chord_tip=tip, **own))
+    except KeyError as error:
+        raise InputError(f"{path}: {error} is missing") from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    counted = dict(zip(reasons.tolist(), refused.tolist(), strict=True))
-    return Population(valves, counted, str(arrays["settings_hash"]))
+    return tuple(valves)

@@ -27,7 +27,6 @@ COLUMNS = {
     "time": "s:.2f",
     "pressure": "mmHg:.0f",
     "orifice": "mm²:.1f",
-    "passing ball": "mm:.2f",
     "coaptation": "mm:.1f",
     "intersections": "",
     "chord strain": ":.3f",

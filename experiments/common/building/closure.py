@@ -177,13 +177,11 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
         )
     if not isinstance(anatomy, Template):
         return anatomy.tetrahedra(mesh["edge_length"], element, store)
-    from mvest.valve.mesh.given import ENVELOPE_SHARE, tetrahedral_leaflets
-    from mvest.valve.mesh.tetwild import TetwildSettings
+    from mvest.valve.mesh.given import tetrahedral_leaflets
 
-    settings = TetwildSettings(mesh["edge_length"], ENVELOPE_SHARE * mesh["edge_length"])
     surface = anatomy.valve(*UNSTRUCTURED_SURFACE).surface
     normals = anatomy.normals(*UNSTRUCTURED_SURFACE)
-    return tetrahedral_leaflets(surface, settings, element, store, normals)
+    return tetrahedral_leaflets(surface, mesh["edge_length"], element, store, normals)
 
 
 def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureModel:

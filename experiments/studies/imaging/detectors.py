@@ -34,7 +34,6 @@ from mvest.quantities import Count, Length, Processes, Seed, Share, within
 from mvest.reading.documents import parse_json
 from mvest.reading.npz import read_npz
 from mvest.simulation.population import (
-    Population,
     PopulationSettings,
     draw_population,
     load_population,
@@ -115,7 +114,7 @@ class ImagingStore:
         self.settings, self.seed = settings, int(config["seed"])
         self._mechanics = mechanics_of(config)
 
-    def _valves(self, which: str) -> Entry[Population]:
+    def _valves(self, which: str) -> Entry[tuple[MovingValve, ...]]:
         described = {
             "drawn": asdict(getattr(self.settings, which)),
             "bases": [[name, asdict(values)] for name, values in self.settings.bases.items()],
@@ -129,14 +128,14 @@ class ImagingStore:
         """A population of simulated valves: ``train``, ``calibration`` or ``test``."""
         drawn, own = getattr(self.settings, which), self.settings
 
-        def draw() -> Population:
+        def draw() -> tuple[MovingValve, ...]:
             with PartBar(f"valves: {which}", drawn.count, "valve") as bar:
                 return draw_population(
                     drawn.count, drawn.seed, own.bases, own.population, self._mechanics,
                     processes=own.processes, progress=lambda _number, _valve: bar.step(),
                 )  # fmt: skip
 
-        return self._valves(which).get_or_make(draw, save_population).valves
+        return self._valves(which).get_or_make(draw, save_population)
 
     def model_entry(self) -> Entry[DetectionModel]:
         """Where the trained detectors are cached."""

@@ -22,7 +22,7 @@ from scipy.stats import t as student_t
 
 from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.build import CaseFrames
-from mvest.cases.from_images.measures import BOUNDS, Row, is_open, leaflets_of
+from mvest.cases.from_images.measures import BOUNDS, Row, is_open
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -185,7 +185,6 @@ def with_bands(
     """
     errors, annulus = _errors_of(sequence.layout, accuracy), sequence.layout.annulus
     count = len(errors)
-    surface = leaflets_of(sequence.layout, 1.0)  # whose thickness these measures do not ask for
     reach = float(student_t.ppf(0.975, count - 1)) * np.sqrt(1.0 + 1.0 / count)
     banded = []
     for t, row in enumerate(rows):
@@ -193,7 +192,7 @@ def with_bands(
         if row[BANDED[0]] is not None:
             which, axes = (0 if is_open(row) else 1), valve_axes(sequence, t)
             moved = _points(sequence, t) - errors[:, which] @ axes.T
-            again = [annulus_and_tips(x[:-2], surface, x[annulus], x[-2:]) for x in moved]
+            again = [annulus_and_tips(x[:-2], sequence.layout, x[annulus], x[-2:]) for x in moved]
             for name in BANDED:
                 values = np.array([one.get(name, np.nan) for one in again], dtype=np.float64)
                 middle, half = values.mean(), reach * values.std(ddof=1)

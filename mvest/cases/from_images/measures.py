@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,12 +11,9 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import TIPS, ValveSequence
 from mvest.reading.text import write_columns
-from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.clinical import (
-    MeasuredLeaflets,
     clinical_meaning,
     clinical_measurements,
     clinical_names,
@@ -45,14 +41,6 @@ _OWN = {
     "vertex_confidence_mean": ("", "mean over the leaflets' points of their confidence, 0 to 1"),
     "contact_distance_mm": ("mm", "distance of midsurfaces up to which leaflets count as touching"),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class _Leaflets:
-    triangles: IntArray
-    region: IntArray
-    region_names: tuple[str, ...]
-    thickness: FloatArray
 
 
 def contact_distance(sequence: ValveSequence, thickness_mm: float) -> float:
@@ -90,7 +78,7 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
     """
     reach = contact_distance(sequence, thickness_mm)
     layout = sequence.layout
-    names = clinical_names(layout.region_names, TIPS, passing_ball=False)
+    names = clinical_names(layout.region_names, TIPS)
     rows = []
     for t, time in enumerate(sequence.times):
         row: Row = {
@@ -100,27 +88,17 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
             "vertex_confidence_mean": _finite(sequence.vertex_confidence[t].mean()),
             "contact_distance_mm": reach,
         }
-        measured = _measured(sequence, t, thickness_mm, reach)
+        measured = _measured(sequence, t, reach)
         rows.append(row | {name: _finite(measured.get(name)) for name in names})
     return rows
 
 
-def _measured(
-    sequence: ValveSequence, t: int, thickness_mm: float, reach: float
-) -> Mapping[str, float | None]:
+def _measured(sequence: ValveSequence, t: int, reach: float) -> Mapping[str, float | None]:
     x, tips = sequence.vertices[t], sequence.tips[t]
     if not (np.isfinite(x).all() and np.isfinite(tips).all() and sequence.frame_confidence[t] > 0):
         return {}
     layout = sequence.layout
-    measures = clinical_measurements(
-        x,
-        leaflets_of(layout, thickness_mm),
-        x[layout.annulus],
-        tips,
-        reach,
-        tip_names=TIPS,
-        passing_ball=False,
-    )
+    measures = clinical_measurements(x, layout, x[layout.annulus], tips, reach, tip_names=TIPS)
     if is_open(measures):
         return {name: v for name, v in measures.items() if not name.startswith(CLOSED_ONLY)}
     return measures
@@ -130,12 +108,6 @@ def is_open(measures: Mapping[str, float | None]) -> bool:
     """Whether a valve of these measures is open, as it is called where they tell nothing."""
     orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
     return orifice is None or area is None or orifice >= OPEN_SHARE * area
-
-
-def leaflets_of(layout: ValveLayout, thickness_mm: float) -> MeasuredLeaflets:
-    """The leaflets of a layout as they are measured."""
-    thickness = np.full(layout.size, thickness_mm)
-    return _Leaflets(layout.triangles, layout.region, layout.region_names, thickness)
 
 
 def _finite(value: Any) -> float | None:

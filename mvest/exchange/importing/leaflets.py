@@ -27,10 +27,13 @@ from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
-from mvest.valve.geometry.papillary import HEAD_MM, TALLER, check_tips_of, papillary_tip
 from mvest.valve.geometry.segmented import (
     BEND_MM,
+    HEAD_MM,
+    TALLER,
+    check_tips_of,
     masks_midsurface,
+    papillary_tip,
     segmentation_std,
     without_crossings,
 )

@@ -18,7 +18,6 @@ scale of 1; tips lie 13 to 19 mm aside. The other spreads are choices.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
@@ -47,32 +46,10 @@ SAMPLING = (112, 29)
 """Vertices at which a shape is tried."""
 
 
-@dataclass(frozen=True, slots=True)
-class VariedAnatomy:
-    """A random anatomy.
-
-    Attributes
-    ----------
-    parameters : TemplateParameters
-    refused : int
-        Shapes drawn before it that are no valve.
-    """
-
-    parameters: TemplateParameters
-    refused: int
-
-
 def vary(
     parameters: TemplateParameters, rng: np.random.Generator, scale: float = 1.0
 ) -> TemplateParameters:
-    """A random anatomy around a given one; see :func:`draw_variation`."""
-    return draw_variation(parameters, rng, scale).parameters
-
-
-def draw_variation(
-    parameters: TemplateParameters, rng: np.random.Generator, scale: float = 1.0
-) -> VariedAnatomy:
-    """Draw until the template takes the shape.
+    """A random anatomy around a given one, drawn until the template takes the shape.
 
     Parameters
     ----------
@@ -89,14 +66,14 @@ def draw_variation(
     """
     if not (np.isfinite(scale) and scale >= 0):
         raise InputError(f"scale of a variation = {scale}, expected a number >= 0")
-    for refused in range(MAX_REFUSED):
+    for _ in range(MAX_REFUSED):
         z = scale * scipy.stats.truncnorm.rvs(-LIMIT, LIMIT, size=13, random_state=rng)
         try:
             varied = _changed(parameters, z)
             Template(varied).valve(*SAMPLING)
         except GeometryError:
             continue
-        return VariedAnatomy(varied, refused)
+        return varied
     raise InputError(
         f"scale of a variation = {scale}: {MAX_REFUSED} shapes in a row are no valve; take a "
         "smaller one"

@@ -20,7 +20,11 @@ from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
+from mvest.valve.geometry.surface_coordinates import (
+    SurfaceCoordinates,
+    surface_coordinates,
+    wrapped,
+)
 from mvest.valve.geometry.triangles import area_vectors
 from mvest.valve.geometry.walls import Wall, closed_band, walls
 
@@ -209,7 +213,7 @@ class _PairedWalls:
         beginning = 0.0
         for end in (annulus, 1 - annulus):
             own = [
-                _rising(coordinates.theta[wall.loops[end]])
+                np.unwrap(coordinates.theta[wall.loops[end]])
                 for wall, coordinates in zip(self._walls, self._coordinates, strict=True)
             ]
             if end == annulus:
@@ -230,21 +234,12 @@ class _PairedWalls:
         ):
             ends = [_periodic(angle, *table) for table in tables]
             # Of the second end that turn which is nearer to the first.
-            ends[1] = ends[0] + _wrap(ends[1] - ends[0])
+            ends[1] = ends[0] + wrapped(ends[1] - ends[0])
             theta = (1 - s) * ends[0] + s * ends[1]
             triangle, weights = coordinates.locate(np.mod(theta.ravel(), 2 * np.pi), s.ravel())
             corners = wall.vertices[wall.triangles[triangle]]
             points.append(np.einsum("kc,kci->ki", weights, corners).reshape(*angle.shape, 3))
         return np.asarray(0.5 * (points[0] + points[1]))
-
-
-def _wrap(angle: FloatArray) -> FloatArray:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _rising(theta: FloatArray) -> FloatArray:
-    """Angles ``(k,)`` once round a loop, unwrapped."""
-    return np.asarray(np.unwrap(theta))
 
 
 def _periodic(angle: FloatArray, common: FloatArray, own: FloatArray) -> FloatArray:
@@ -330,7 +325,7 @@ def _shortest(
 ) -> IntArray:
     """Two columns where the leaflets are shortest, each on the side of a tip."""
     n = len(angle)
-    apart = np.abs(_wrap(angle[:, None] - angle))
+    apart = np.abs(wrapped(angle[:, None] - angle))
     if tips is not None and len(tips) == 2:
         derived.append("commissures: where the leaflets are shortest on the side of each tip")
         centre = annulus.mean(axis=0)

@@ -17,13 +17,12 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 SAMPLED_EDGES = 100
 """Whose boxes are compared with all others, to know how many overlap."""
-EDGES_AT_A_TIME = 50
 MAX_LOOKED_AT = 100_000
-"""Edges in turn, and pairs in all, when only some intersections are looked for."""
+"""Pairs of edges and triangles, when only some intersections are looked for."""
 Vector = tuple[float, float, float]
 """A point or a vector in compiled code, where an array of three takes longer than its sums."""
 
@@ -255,34 +254,6 @@ def intersecting_triangles(
     if not has_intersections(vertices, triangles):
         return np.zeros((0, 2), dtype=np.int64)
     edges = surface_edges(triangles)
-    step = len(edges) if enough is None else EDGES_AT_A_TIME
-    hits: list[tuple[int, int]] = []
-    looked_at = 0
-    for start in range(0, len(edges), step):
-        found, count = _edges_through(vertices, triangles, edges[start : start + step], start)
-        hits += found
-        looked_at += count
-        if enough is not None and (len(hits) >= enough or looked_at > MAX_LOOKED_AT):
-            break
-    if not hits:
-        return np.zeros((0, 2), dtype=np.int64)
-    owners: dict[tuple[int, int], list[int]] = {}
-    for number, triangle in enumerate(triangles):
-        for i in range(3):
-            edge = sorted((int(triangle[i]), int(triangle[(i + 1) % 3])))
-            owners.setdefault((edge[0], edge[1]), []).append(number)
-    pairs = {
-        (min(owner, int(face)), max(owner, int(face)))
-        for edge, face in hits
-        for owner in owners[int(edges[edge][0]), int(edges[edge][1])]
-    }
-    return np.array(sorted(pairs), dtype=np.int64)
-
-
-def _edges_through(
-    vertices: FloatArray, triangles: IntArray, edges: IntArray, first: int
-) -> tuple[list[tuple[int, int]], int]:
-    """Edges, numbered from `first`, with triangles that they pass through; pairs looked at."""
     phase = ipctk.LBVH()
     phase.build(
         np.asfortranarray(vertices, dtype=np.float64),
@@ -290,16 +261,20 @@ def _edges_through(
         np.asfortranarray(triangles, dtype=np.int32),
         1e-9,
     )
-    candidates = phase.detect_edge_face_candidates()
-    hits = [
-        (first + candidate.edge_id, candidate.face_id)
-        for candidate in candidates
-        if not np.isin(edges[candidate.edge_id], triangles[candidate.face_id]).any()
-        and ipctk.is_edge_intersecting_triangle(
-            *vertices[edges[candidate.edge_id]], *vertices[triangles[candidate.face_id]]
-        )
-    ]
-    return hits, len(candidates)
+    sides = np.sort(directed_edges(triangles), axis=1) @ [len(vertices), 1]
+    pairs: set[tuple[int, int]] = set()
+    found = 0
+    for looked_at, candidate in enumerate(phase.detect_edge_face_candidates()):
+        if enough is not None and (found >= enough or looked_at > MAX_LOOKED_AT):
+            break
+        edge, face = edges[candidate.edge_id], int(candidate.face_id)
+        if not np.isin(edge, triangles[face]).any() and ipctk.is_edge_intersecting_triangle(
+            *vertices[edge], *vertices[triangles[face]]
+        ):
+            found += 1
+            for owner in np.flatnonzero(sides == edge @ [len(vertices), 1]) % len(triangles):
+                pairs.add((min(int(owner), face), max(int(owner), face)))
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
 def plane_section(

@@ -71,7 +71,7 @@ class SurfaceCoordinates:
         """Corners ``(m, 3, 2)`` of all triangles in the strip, unwrapped about the first corner."""
         theta = self.theta[self.triangles]
         first = theta[:, :1]
-        theta = first + _wrap(theta - first)
+        theta = first + wrapped(theta - first)
         return np.stack([theta, self.modulus * self.s[self.triangles]], axis=-1)
 
     def folded(self) -> IntArray:
@@ -386,5 +386,6 @@ def _signed_area(corner: FloatArray) -> FloatArray:
     return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _wrap(angle: FloatArray) -> FloatArray:
+def wrapped(angle: FloatArray) -> FloatArray:
+    """Angles (rad) in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

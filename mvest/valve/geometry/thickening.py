@@ -10,12 +10,7 @@ import scipy.sparse as sp
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
-from mvest.valve.geometry.surface_checks import (
-    check_surface,
-    edge_table,
-    enclosed_volume,
-    listed,
-)
+from mvest.valve.geometry.surface_checks import check_surface, edge_table, listed
 from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, surface_edges
 
 FACE_KINDS = ("ventricular", "atrial", "rim")
@@ -106,48 +101,23 @@ class ClosedSurface:
     triangles
         ``(m, 3)``.
     region
-        ``(m,)`` index into `region_names`.
-    region_names
-        Names of the leaflets.
+        ``(m,)`` leaflet of each triangle.
     kind
         ``(m,)`` index into `FACE_KINDS`.
 
     Raises
     ------
     GeometryError
-        The surface is not closed, manifold, outward and free of self-intersections, or labels are
-        missing or unknown.
+        The surface is not closed, manifold, outward and free of self-intersections.
     """
 
     vertices: FloatArray
     triangles: IntArray
     region: IntArray
-    region_names: tuple[str, ...]
     kind: IntArray
 
     def __post_init__(self) -> None:
         check_surface(self.vertices, self.triangles, closed=True, name="closed surface")
-        for what, labels, known in (
-            ("region", self.region, self.region_names),
-            ("kind", self.kind, FACE_KINDS),
-        ):
-            labels = np.asarray(labels)
-            if labels.shape != (len(self.triangles),):
-                raise GeometryError(
-                    f"closed surface: {what} has shape {labels.shape}, expected "
-                    f"({len(self.triangles)},)"
-                )
-            bad = np.flatnonzero((labels < 0) | (labels >= len(known)))
-            if len(bad):
-                raise GeometryError(
-                    f"closed surface: unknown {what} at triangles {listed(bad)}; known are "
-                    f"0 to {len(known) - 1} ({', '.join(known)})"
-                )
-
-    @property
-    def volume(self) -> float:
-        """Enclosed volume, mm³."""
-        return enclosed_volume(self.vertices, self.triangles)
 
 
 def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> ClosedSurface:
@@ -186,6 +156,5 @@ def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> Close
         region=np.concatenate(
             [surface.region, surface.region, np.tile(surface.region[boundary // 3], 2)]
         ),
-        region_names=surface.region_names,
         kind=np.repeat(np.arange(3), [m, m, len(rim)]),
     )

@@ -115,18 +115,16 @@ class AnnulusMeasurements:
         Extent along the lateral direction of the chord through the centre, mm.
     height
         Extent along the normal (saddle height), mm.
-    circumference, projected_circumference
-        Length of the curve in space and of its projection on the plane, mm.
-    area, projected_area
-        Area of the cone of triangles from the centroid to the curve, and of the projection, mm².
+    circumference
+        Length of the curve in space, mm.
+    projected_area
+        Area within its projection on the plane, mm².
     """
 
     anteroposterior_diameter: float
     commissural_diameter: float
     height: float
     circumference: float
-    projected_circumference: float
-    area: float
     projected_area: float
 
 
@@ -145,20 +143,13 @@ def measure_annulus(annulus: FloatArray, plane: AnnulusPlane) -> AnnulusMeasurem
     """Measure an annulus curve ``(k, 3)`` mm in the directions of its `plane`."""
     loop = checked_loop(annulus)
     x, y, z = plane.coordinates(loop).T
-    following = np.roll(loop, -1, axis=0)
-    spokes = np.cross(loop - plane.origin, following - plane.origin)
-    flat = np.column_stack([x, y])
-    flat_following = np.roll(flat, -1, axis=0)
+    step = np.roll(loop, -1, axis=0) - loop
     return AnnulusMeasurements(
         anteroposterior_diameter=_chord(x, y),
         commissural_diameter=_chord(y, x),
         height=float(np.ptp(z)),
-        circumference=float(np.linalg.norm(following - loop, axis=1).sum()),
-        projected_circumference=float(np.linalg.norm(flat_following - flat, axis=1).sum()),
-        area=float(0.5 * np.linalg.norm(spokes, axis=1).sum()),
-        projected_area=float(
-            0.5 * abs((x * flat_following[:, 1] - flat_following[:, 0] * y).sum())
-        ),
+        circumference=float(np.linalg.norm(step, axis=1).sum()),
+        projected_area=float(0.5 * abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())),
     )
 
 

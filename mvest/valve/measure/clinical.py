@@ -1,4 +1,8 @@
-"""The numbers that users of valve software expect of a frame, in one table."""
+"""Clinical measurements of a valve in one frame: plain arrays in, numbers with their units out.
+
+Lengths follow the usual echocardiographic definitions; `clinical_meaning` says which. Annulus,
+contact and orifice have modules of their own beside this one.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +13,26 @@ import numpy as np
 
 from mvest.errors import MvestError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.moving_distance import closest_on_loop
+from mvest.valve.geometry.proximity import plane_section
+from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import (
     AnnulusPlane,
     annulus_plane,
+    checked_loop,
     measure_annulus,
     spanning_surface,
+    unit_vector,
 )
-from mvest.valve.measure.coaptation import coaptation_area, coaptation_length, orifice_area
-from mvest.valve.measure.measurements import (
-    leaflet_length,
-    measure_papillary_tips,
-    measure_prolapse,
-    measure_tenting,
-    surface_area,
+from mvest.valve.measure.coaptation import (
+    coaptation_area,
+    coaptation_length,
+    orifice_area,
+    project_leaflets,
 )
-from mvest.valve.measure.passing_ball import largest_passing_ball
 
-Numbers: TypeAlias = dict[str, float | None]
+Numbers: TypeAlias = dict[str, float]
+"""Name with its unit -> number."""
 
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "ratio": ""}
 """By the last part of a measurement's name."""
@@ -53,7 +60,6 @@ _MEANING = {
     "billow_volume_mm3": "volume between the leaflets and the minimal surface that spans the "
     "annulus, above it",
     "orifice_mm2": "area within the annulus that no leaflet covers seen along the normal",
-    "passing_ball_mm": "diameter of the largest ball that passes between the leaflets",
     "coaptation_length_mm": "length over which the leaflets touch in the middle anteroposterior "
     "section, the smaller of both",
     "coaptation_area_mm2": "area over which the leaflets touch, mean of both",
@@ -72,7 +78,7 @@ _MEANING_OF_PART = {
 
 
 class MeasuredLeaflets(Protocol):
-    """What is asked of leaflets besides their shape, as `LeafletSurface` has it."""
+    """What is measured of leaflets besides their shape, as `LeafletSurface` has it."""
 
     @property
     def triangles(self) -> IntArray:
@@ -85,10 +91,6 @@ class MeasuredLeaflets(Protocol):
     @property
     def region_names(self) -> tuple[str, ...]:
         """Of the leaflets, the anterior one first."""
-
-    @property
-    def thickness(self) -> FloatArray:
-        """``(n,)`` mm."""
 
 
 def clinical_meaning(name: str) -> tuple[str, str]:
@@ -104,14 +106,11 @@ def clinical_meaning(name: str) -> tuple[str, str]:
     raise KeyError(name)
 
 
-def clinical_names(
-    region_names: Sequence[str], tip_names: Sequence[str] = (), passing_ball: bool = True
-) -> list[str]:
+def clinical_names(region_names: Sequence[str], tip_names: Sequence[str] = ()) -> list[str]:
     """Every name that `clinical_measurements` can give two leaflets and two tips, in order."""
-    named = [name for name in _MEANING if passing_ball or name != "passing_ball_mm"]
     leaflet, tip = list(_MEANING_OF_PART)[:2], list(_MEANING_OF_PART)[2:]
-    named += [f"{name}_{ending}" for name in region_names for ending in leaflet]
-    return named + [f"{name}_{ending}" for name in tip_names for ending in tip]
+    named = [f"{name}_{ending}" for name in region_names for ending in leaflet]
+    return [*_MEANING, *named, *(f"{name}_{ending}" for name in tip_names for ending in tip)]
 
 
 def clinical_measurements(
@@ -122,8 +121,7 @@ def clinical_measurements(
     contact_distance: float,
     *,
     tip_names: Sequence[str] = (),
-    passing_ball: bool = True,
-) -> dict[str, float | None]:
+) -> Numbers:
     """Measure a valve in one frame.
 
     Diameters, areas, height and circumference of the annulus are those of three-dimensional
@@ -135,7 +133,7 @@ def clinical_measurements(
     vertices : (n, 3) mm
         Where the vertices of ``surface`` are in this frame.
     surface : LeafletSurface or the like
-        Triangles, regions and thickness.
+        Triangles and regions.
     annulus : (k, 3) mm
         In loop order.
     tips : (t, 3) mm
@@ -144,8 +142,6 @@ def clinical_measurements(
         mm between midsurfaces that count as touching.
     tip_names : sequence of str
         For each tip, if every one is to be measured besides their mean: ``tip_0``.
-    passing_ball : bool
-        Whether the largest ball that passes is looked for, which takes about a second.
 
     Returns
     -------
@@ -161,14 +157,12 @@ def clinical_measurements(
     pair = [triangles[region == number] for number in range(len(surface.region_names))]
     seen = vertices, triangles, annulus, plane
     numbers = _tried(_annulus, annulus, plane)
-    numbers |= _tried(_annulus_in_space, annulus, plane)
-    numbers |= _tried(_tenting, *seen)
+    numbers |= _tried(tenting, *seen)
     numbers |= _tried(_prolapse, *seen)
     if len(pair) == 2:
-        numbers |= _tried(_closure, *seen, pair, contact_distance)
-        numbers |= _tried(_ball, *seen, surface.thickness) if passing_ball else {}
+        numbers |= _tried(closure, *seen, pair, contact_distance)
     for name, own in zip(surface.region_names, pair, strict=True):
-        numbers[f"{name}_area_mm2"] = surface_area(vertices, own)
+        numbers[f"{name}_area_mm2"] = float(areas(vertices, own).sum())
         if len(pair) == 2:
             numbers[f"{name}_length_mm"] = leaflet_length(vertices, own, plane)
     return numbers | _tips(tips, annulus, plane, tip_names)
@@ -176,7 +170,7 @@ def clinical_measurements(
 
 def annulus_and_tips(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, tips: FloatArray
-) -> dict[str, float | None]:
+) -> Numbers:
     """Those of `clinical_measurements` that take no leaflets, in a hundredth of the time.
 
     Parameters
@@ -222,31 +216,67 @@ def _annulus(annulus: FloatArray, plane: AnnulusPlane) -> Numbers:
     }
 
 
-def _annulus_in_space(annulus: FloatArray, plane: AnnulusPlane) -> Numbers:
-    return {"annulus_area_3d_mm2": spanning_surface(annulus, plane).area}
-
-
-def _tenting(
-    vertices: FloatArray, triangles: IntArray, annulus: FloatArray, plane: AnnulusPlane
+def tenting(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    resolution: float = 0.2,
 ) -> Numbers:
-    tenting = measure_tenting(vertices, triangles, annulus, plane)
-    return {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
+    """Tenting as seen from the atrium: depth of the first leaflet surface below the annulus plane.
+
+    Height is the largest depth on the middle line, volume the sum over the whole annulus. Points
+    where nothing is met (an open orifice) have no depth. On a closed valve this is the usual
+    definition.
+
+    Parameters
+    ----------
+    vertices, triangles
+        Midsurface of all leaflets, ``(n, 3)`` mm and ``(m, 3)``.
+    annulus
+        ``(k, 3)`` mm in loop order.
+    plane
+        Of that annulus.
+    resolution
+        Pixel size, mm.
+    """
+    image = project_leaflets(vertices, triangles, annulus, plane, resolution)
+    seen = image.inside & np.isfinite(image.depth)
+    depth = np.where(seen, image.depth, 0.0)
+    middle = int(np.argmin(np.abs(image.lateral)))
+    return {
+        "tenting_height_mm": float(depth[:, middle].max()),
+        "tenting_volume_mm3": float(depth.sum() * resolution**2),
+    }
 
 
 def _prolapse(
     vertices: FloatArray, triangles: IntArray, annulus: FloatArray, plane: AnnulusPlane
 ) -> Numbers:
-    film = spanning_surface(annulus, plane)
-    above = measure_prolapse(vertices, triangles, annulus, plane, film)
+    """What of the first leaflet surface seen from the atrium lies above the annulus.
+
+    An annulus is a saddle, and the leaflets near its two high points lie above its plane in every
+    valve (Levine et al. 1987, Circulation 75:756); above the surface that spans it only a leaflet
+    that bulges into the atrium does.
+    """
+    spanning, step = spanning_surface(annulus, plane), 0.2
+    image = project_leaflets(vertices, triangles, annulus, plane, step)
+    film = project_leaflets(spanning.vertices, spanning.triangles, annulus, plane, step)
+    seen = image.inside & np.isfinite(image.depth)
+    over_plane = np.where(seen, np.maximum(-image.depth, 0.0), 0.0)
+    both = seen & np.isfinite(film.depth)
+    over_film = np.zeros_like(over_plane)
+    over_film[both] = np.maximum(film.depth[both] - image.depth[both], 0.0)
     return {
-        "prolapse_height_mm": above.height,
-        "prolapse_volume_mm3": above.volume,
-        "billow_height_mm": above.billow_height,
-        "billow_volume_mm3": above.billow_volume,
+        "annulus_area_3d_mm2": spanning.area,
+        "prolapse_height_mm": float(over_plane.max()),
+        "prolapse_volume_mm3": float(over_plane.sum() * step**2),
+        "billow_height_mm": float(over_film.max()),
+        "billow_volume_mm3": float(over_film.sum() * step**2),
     }
 
 
-def _closure(
+def closure(
     vertices: FloatArray,
     triangles: IntArray,
     annulus: FloatArray,
@@ -254,36 +284,54 @@ def _closure(
     pair: Sequence[IntArray],
     reach: float,
 ) -> Numbers:
+    """Orifice and coaptation of two leaflets.
+
+    Parameters
+    ----------
+    vertices, triangles, annulus, plane
+        As in `tenting`.
+    pair : two (m, 3) arrays
+        Triangles of the anterior and of the posterior leaflet.
+    reach : float
+        mm between midsurfaces that count as touching.
+    """
     first, second = pair
     return {
         "orifice_mm2": orifice_area(vertices, triangles, annulus, plane),
-        "coaptation_length_mm": coaptation_length(vertices, first, second, plane, reach).length,
+        "coaptation_length_mm": coaptation_length(vertices, first, second, plane, reach),
         "coaptation_area_mm2": coaptation_area(vertices, first, second, reach),
     }
 
 
-def _ball(
-    vertices: FloatArray,
-    triangles: IntArray,
-    annulus: FloatArray,
-    plane: AnnulusPlane,
-    thickness: FloatArray,
-) -> Numbers:
-    ball = largest_passing_ball(vertices, triangles, annulus, plane, thickness=thickness)
-    return {"passing_ball_mm": ball.diameter}
+def leaflet_length(vertices: FloatArray, triangles: IntArray, plane: AnnulusPlane) -> float:
+    """Length (mm) of a leaflet from annulus to free edge, in the middle of A2 or P2.
+
+    The section is the plane through the annulus centre spanned by its normal and the anterior
+    direction; its length is the sum of the segments in which it cuts the leaflet's triangles.
+
+    Parameters
+    ----------
+    vertices, triangles
+        The triangles of one leaflet.
+    plane : AnnulusPlane
+    """
+    across = unit_vector(np.cross(plane.normal, plane.anterior), "anterior direction")
+    segments, _ = plane_section(vertices, triangles, plane.origin, across)
+    return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
 
 
 def _tips(
     tips: FloatArray, annulus: FloatArray, plane: AnnulusPlane, names: Sequence[str]
 ) -> Numbers:
-    place = measure_papillary_tips(tips, annulus, plane)
+    depth = plane.coordinates(tips)[:, 2]
+    away = np.linalg.norm(closest_on_loop(tips, checked_loop(annulus))[2], axis=1)
     numbers: Numbers = {
-        "tip_depth_mm": float(place.depth.mean()),
-        "tip_annulus_distance_mm": float(place.annulus_distance.mean()),
+        "tip_depth_mm": float(depth.mean()),
+        "tip_annulus_distance_mm": float(away.mean()),
     }
     if len(tips) == 2:
-        numbers["tip_separation_mm"] = float(place.separation[0, 1])
+        numbers["tip_separation_mm"] = float(np.linalg.norm(tips[0] - tips[1]))
     for k, name in enumerate(names):
-        numbers[f"{name}_depth_mm"] = float(place.depth[k])
-        numbers[f"{name}_annulus_distance_mm"] = float(place.annulus_distance[k])
+        numbers[f"{name}_depth_mm"] = float(depth[k])
+        numbers[f"{name}_annulus_distance_mm"] = float(away[k])
     return numbers

@@ -150,7 +150,7 @@ def orifice_area(
 
     The part of the projected annulus that no leaflet triangle covers, counted in pixels of
     `resolution` (mm) looking along the annulus normal. An oblique gap between overlapping leaflets
-    is not seen; `mvest.valve.measure.passing_ball` finds that one.
+    is not seen.
     """
     image = project_leaflets(vertices, triangles, annulus, plane, resolution)
     return float((image.inside & np.isinf(image.depth)).sum() * resolution**2)
@@ -178,34 +178,20 @@ def _contact_fraction(
     return near
 
 
-@dataclass(frozen=True, slots=True)
-class CoaptationLength:
-    """Coaptation in one plane section, mm, measured on either leaflet's own profile."""
-
-    first: float
-    second: float
-
-    @property
-    def length(self) -> float:
-        """The smaller of the two, mm: an excess of one leaflet does not count."""
-        return min(self.first, self.second)
-
-
 def coaptation_length(
     vertices: FloatArray,
     first: IntArray,
     second: IntArray,
     plane: AnnulusPlane,
     contact_distance: float,
-    offset: float = 0.0,
     sampling: float = 0.02,
-) -> CoaptationLength:
-    """Length over which two leaflets lie against each other in a plane along the AP direction.
+) -> float:
+    """Length (mm) over which two leaflets lie against each other in the middle AP plane.
 
-    Each leaflet is cut by the plane through the annulus centre (shifted by `offset` along the
-    commissures) spanned by annulus normal and anterior direction. Counted is the arc length of its
-    section whose points lie within `contact_distance` of the other leaflet (anywhere, not only in
-    the plane) where the two face each other (surface normals more than 90° apart).
+    Each leaflet is cut by the plane through the annulus centre spanned by annulus normal and
+    anterior direction. Counted is the arc length of its section whose points lie within
+    `contact_distance` of the other leaflet (anywhere, not only in the plane) where the two face
+    each other (surface normals more than 90° apart); of the two leaflets' lengths the smaller one.
 
     Parameters
     ----------
@@ -216,17 +202,14 @@ def coaptation_length(
         the ventricle).
     contact_distance
         mm between midsurfaces: about the thickness plus the contact model's gap.
-    offset
-        mm along the commissural direction; 0 is the middle.
     sampling
         mm between the points tested along a section; the answer is that fine.
     """
     if not (np.isfinite(contact_distance) and contact_distance > 0):
         raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
-    origin = plane.origin + offset * plane.lateral
     lengths = []
     for own, other in ((first, second), (second, first)):
-        segments, triangle = plane_section(vertices, own, origin, plane.lateral)
+        segments, triangle = plane_section(vertices, own, plane.origin, plane.lateral)
         if len(segments) == 0 or len(other) == 0:
             lengths.append(0.0)
             continue
@@ -244,7 +227,7 @@ def coaptation_length(
             contact_distance,
         )
         lengths.append(float((size / pieces)[owner][near].sum()))
-    return CoaptationLength(lengths[0], lengths[1])
+    return min(lengths)
 
 
 def coaptation_area(

@@ -19,13 +19,9 @@ from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
 from mvest.valve.geometry.triangles import area_vectors, areas
-from mvest.valve.mesh.cells import outer_faces, promote_to_tet10, tri6_faces
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetwild import TetrahedralMesh, TetwildSettings, tetrahedralize
-
-ENVELOPE_SHARE = 0.05
-"""Envelope of an unstructured mesh over its edge length."""
+from mvest.valve.mesh.tetwild import outer_faces, promote_to_tet10, tetrahedralize, tri6_faces
 
 
 class GivenValve:
@@ -94,8 +90,7 @@ class GivenValve:
         element
             ``tet10`` or ``tet4``.
         """
-        settings = TetwildSettings(edge_length, ENVELOPE_SHARE * edge_length)
-        return tetrahedral_leaflets(self.given.surface, settings, element, store)
+        return tetrahedral_leaflets(self.given.surface, edge_length, element, store)
 
 
 PRESSURE_AREA_TOLERANCE = 0.1
@@ -104,52 +99,40 @@ PRESSURE_AREA_TOLERANCE = 0.1
 
 def tetrahedral_leaflets(
     surface: LeafletSurface,
-    settings: TetwildSettings,
+    edge_length: float,
     element_type: str = "tet10",
     store: Path | None = None,
     normals: FloatArray | None = None,
 ) -> SolidMesh:
     """Thicken leaflets, mesh them with pytetwild, and transfer labels, fibres and faces.
 
+    Elements take the region of the midsurface triangle nearest to their centroid. Fibres are those
+    of the nearest midsurface point, projected on the tangent plane there. Pressure faces are the
+    outer faces nearest to the closed surface's ventricular triangles, among those that face the
+    same way.
+
     Parameters
     ----------
     surface
         Midsurface with thickness.
-    settings, store
+    edge_length, store
         See `mvest.valve.mesh.tetwild.tetrahedralize`.
     element_type
         ``"tet10"`` or ``"tet4"``.
     normals
         Offset directions of `mvest.valve.geometry.thickening.thicken`.
-    """
-    closed = thicken(surface, normals)
-    mesh = tetrahedralize(closed.vertices, closed.triangles, settings, store)
-    return label_tetrahedra(mesh, closed, surface, element_type)
-
-
-def label_tetrahedra(
-    mesh: TetrahedralMesh,
-    closed: ClosedSurface,
-    surface: LeafletSurface,
-    element_type: str = "tet10",
-) -> SolidMesh:
-    """Give a tetrahedral mesh the labels of the surface it was made from.
-
-    Elements take the region of the midsurface triangle nearest to their centroid. Fibres are those
-    of the nearest midsurface point, projected on the tangent plane there. Pressure faces are the
-    outer faces nearest to the closed surface's ventricular triangles, among those that face the
-    same way.
 
     Raises
     ------
     InputError
         The element type is neither ``tet4`` nor ``tet10``.
     MeshingError
-        The pressure faces' area is not that of the ventricular side.
+        See there, or the pressure faces' area is not that of the ventricular side.
     """
     if element_type not in ("tet4", "tet10"):
         raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")
-    nodes, elements = mesh.nodes, mesh.tetrahedra
+    closed = thicken(surface, normals)
+    nodes, elements = tetrahedralize(closed.vertices, closed.triangles, edge_length, store)
     faces, owner = outer_faces(elements)
     pressure = _ventricular(nodes, faces, closed)
     faces, owner = faces[pressure], owner[pressure]

@@ -19,7 +19,11 @@ from scipy.spatial import Delaunay, cKDTree
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
+from mvest.valve.geometry.surface_coordinates import (
+    SurfaceCoordinates,
+    boundary_loops,
+    surface_coordinates,
+)
 from mvest.valve.geometry.triangles import areas, directed_edges
 
 LLOYD_ITERATIONS = 40
@@ -363,15 +367,8 @@ def _labels(
 
 def _check_band(triangles: IntArray, rings: list[IntArray]) -> None:
     """Raise unless the boundary is exactly the two rings."""
-    edges, count = np.unique(np.sort(directed_edges(triangles), axis=1), axis=0, return_counts=True)
-    boundary = {tuple(e) for e in edges[count == 1].tolist()}
-    wanted = {
-        (min(e), max(e))
-        for ring in rings
-        for e in zip(ring.tolist(), np.roll(ring, -1).tolist(), strict=True)
-    }
-    if count.max() > 2 or boundary != wanted:
+    found = {frozenset(loop.tolist()) for loop in boundary_loops(triangles)}
+    if found != {frozenset(ring.tolist()) for ring in rings}:
         raise GeometryError(
-            f"remeshing lost {len(wanted - boundary)} edges of the annulus or free edge; ask for "
-            "more vertices"
+            "remeshing lost edges of the annulus or free edge; ask for more vertices"
         )

@@ -4,18 +4,16 @@ The template is meshed in bricks, or prisms split into tetrahedra. Every node is
 surface in material coordinates, so that refined meshes converge to one and the same body.
 
 A triangulated midsurface is thickened into layers of quadratic wedges. Each triangle gets nodes in
-the middle of its edges, laid on a finer surface where one is given, so that the six-node triangle
-follows the curvature. Where that would distort a triangle (a free edge with scallops shorter than
-its edges), the middles are pulled back towards the straight edge, and the mesh says how many. Every
-point of this sheet becomes a column of nodes along a smoothed normal, from the atrial side (``zeta
-= -1``) to the ventricular side (``zeta = +1``). Raw normals and a jumping thickness can invert
-wedges where a surface bends sharply, at commissures above all; both are smoothed, and an element
-that is still inverted is an error.
+the middle of its edges, laid on a finer surface, so that the six-node triangle follows the
+curvature. Where that would distort a triangle (a free edge with scallops shorter than its edges),
+the middles are pulled back towards the straight edge. Every point of this sheet becomes a column of
+nodes along a smoothed normal, from the atrial side (``zeta = -1``) to the ventricular side (``zeta
+= +1``). Raw normals and a jumping thickness can invert wedges where a surface bends sharply, at
+commissures above all; both are smoothed, and an element that is still inverted is an error.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +22,7 @@ import scipy.sparse as sp
 from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
+from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import directed_edges, unit_rows
@@ -214,60 +212,28 @@ SMOOTHING = 3
 """Rounds of averaging normals and thickness with their neighbours in the sheet."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LayeredMesh:
-    """A solid mesh that remembers the sheet it was thickened from.
-
-    Node ``level * n_points + point`` lies on level ``level`` (0 is the atrial face) of sheet point
-    ``point``; element ``layer * n_triangles + triangle`` likewise.
-
-    Attributes
-    ----------
-    solid : SolidMesh
-    points : ndarray
-        ``(p, 3)`` mm, the midsurface: first the vertices of the surface, then the edge middles.
-    sheet : ndarray
-        ``(m, 6)`` six-node triangles, normals to the ventricle.
-    normals : ndarray
-        ``(p, 3)`` directions of the node columns.
-    levels : int
-        Number of nodes through the thickness.
-    straightened : int
-        Edges whose middle was pulled back from the finer surface.
-    """
-
-    solid: SolidMesh
-    points: FloatArray
-    sheet: IntArray
-    normals: FloatArray
-    levels: int
-    straightened: int
-
-    def columns(self, points: IntArray) -> IntArray:
-        """Node numbers ``(k, levels)`` above sheet points ``(k,)``, from atrial to ventricular."""
-        return np.asarray(points)[:, None] + len(self.points) * np.arange(self.levels)
-
-
 def layered_wedges(
     surface: LeafletSurface,
-    *,
+    onto: LeafletSurface,
     element_type: str = "wedge12",
     layers: int = 1,
-    onto: LeafletSurface | None = None,
-) -> LayeredMesh:
+) -> SolidMesh:
     """Thicken a midsurface into layers of six-node-triangle wedges.
+
+    Node ``level * n_points + point`` lies on level ``level`` (0 is the atrial face) above a point
+    of the sheet: first the vertices of the surface, then the middles of its edges.
 
     Parameters
     ----------
     surface : LeafletSurface
         Its vertices become the corners; the surface lies halfway through the thickness.
+    onto : LeafletSurface
+        Finer surface that the edge middles are laid on (its boundary loops for boundary edges), and
+        from which normals, fibre and thickness are taken.
     element_type : {"wedge12", "wedge18"}
         Linear or quadratic through each layer.
     layers : int
         Number of layers.
-    onto : LeafletSurface, optional
-        Finer surface that the edge middles are laid on (its boundary loops for boundary edges), and
-        from which normals, fibre and thickness are taken; without it edges are straight.
 
     Raises
     ------
@@ -284,21 +250,15 @@ def layered_wedges(
         raise InputError(f"{layers} layers, expected at least 1")
     sheet, edges, on_boundary = _quadratic_sheet(surface.triangles)
     middles = surface.vertices[edges].mean(axis=1)
-    thickness = np.concatenate([surface.thickness, surface.thickness[edges].mean(axis=1)])
-    fibre = np.vstack([surface.fibre, surface.fibre[edges].sum(axis=1)])
-    straightened = 0
-    if onto is not None:
-        curved = _lay_on(onto, middles, on_boundary)
-        middles, straightened = _pull_back(surface.vertices, middles, curved, sheet)
+    curved = _lay_on(onto, middles, on_boundary)
+    middles = _pull_back(surface.vertices, middles, curved, sheet)
     points = np.vstack([surface.vertices, middles])
     small = sheet[:, FACES["tri6"].corners].reshape(-1, 3)
-    normals = vertex_normals(points, small)
-    if onto is not None:
-        at = closest_points(points, onto.vertices, onto.triangles)
-        thickness = at.interpolate(onto.thickness, onto.triangles)
-        fibre = at.interpolate(onto.fibre, onto.triangles)
-        normals = at.interpolate(onto.normals, onto.triangles)
-
+    at = closest_points(points, onto.vertices, onto.triangles)
+    thickness, fibre, normals = (
+        at.interpolate(values, onto.triangles)
+        for values in (onto.thickness, onto.fibre, onto.normals)
+    )
     average = _neighbour_average(small, len(points))
     for _ in range(SMOOTHING):
         normals = unit_rows(average @ normals)
@@ -318,21 +278,14 @@ def layered_wedges(
         ]
     )
     _reject_inverted(nodes, elements, element_type)
-    return LayeredMesh(
-        solid=SolidMesh(
-            nodes=nodes,
-            elements=elements,
-            element_type=element_type,
-            region=np.tile(surface.region, layers),
-            region_names=surface.region_names,
-            fibre=np.tile(fibre, (levels, 1)),
-            pressure_faces=sheet + (levels - 1) * len(points),
-        ),
-        points=points,
-        sheet=sheet,
-        normals=normals,
-        levels=levels,
-        straightened=straightened,
+    return SolidMesh(
+        nodes=nodes,
+        elements=elements,
+        element_type=element_type,
+        region=np.tile(surface.region, layers),
+        region_names=surface.region_names,
+        fibre=np.tile(fibre, (levels, 1)),
+        pressure_faces=sheet + (levels - 1) * len(points),
     )
 
 
@@ -364,7 +317,7 @@ def _lay_on(fine: LeafletSurface, middles: FloatArray, on_boundary: IntArray) ->
 
 def _pull_back(
     vertices: FloatArray, straight: FloatArray, curved: FloatArray, sheet: IntArray
-) -> tuple[FloatArray, int]:
+) -> FloatArray:
     """Edge middles between ``straight`` and ``curved`` that distort no six-node triangle."""
     reference = element("wedge12")
     places = np.vstack([reference.points[:6], reference.node_coordinates[:6]])
@@ -383,7 +336,7 @@ def _pull_back(
         if not edges.size:
             break
         share[edges] *= 0.5
-    return middles, int(np.sum(share < 1))
+    return middles
 
 
 def _neighbour_average(triangles: IntArray, n: int) -> sp.csr_matrix:

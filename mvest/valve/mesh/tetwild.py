@@ -13,8 +13,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -25,184 +25,99 @@ from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
-from mvest.valve.mesh.cells import (
-    QualityReport,
-    content_sha256,
-    drop_unused_nodes,
-    mesh_quality,
-    orient,
-    outer_faces,
-    volumes,
-)
 
 WORKER = Path(__file__).with_name("_tetwild_worker.py")
 
+Tetrahedra: TypeAlias = tuple[FloatArray, IntArray]
+"""Nodes ``(n, 3)`` mm and tetrahedra ``(m, 4)`` of positive volume."""
 
-@dataclass(frozen=True, slots=True)
-class TetwildSettings:
-    """Settings of the mesher and limits on its answer.
+ENVELOPE_SHARE = 0.05
+"""Largest distance of the mesh's surface from the given one, over the edge length."""
+SHAPING: dict[str, Any] = {"stop_energy": 10.0, "iterations": 80, "coarsen": False}
+"""fTetWild's own: shape energy at which it stops (lower is better), rounds, few tetrahedra."""
+TIME_LIMIT = 300.0
+"""s after which the mesher is stopped."""
+VOLUME_TOLERANCE = 0.05
+"""Largest relative difference between the volumes of mesh and surface."""
+DISTANCE_TOLERANCE = 0.5
+"""mm, largest distance from the given surface's vertices to the mesh's surface."""
 
-    Attributes
-    ----------
-    edge_length
-        Target edge length, mm. (pytetwild takes it relative to the bounding-box diagonal.)
-    envelope
-        Largest distance of the mesh's surface from the given one, mm. (Likewise.)
-    stop_energy
-        Shape energy at which optimisation stops; 10 is fTetWild's default, lower is better.
-    iterations
-        Largest number of optimisation rounds.
-    coarsen
-        Use as few tetrahedra as the quality allows.
-    time_limit
-        s after which the mesher is stopped.
-    volume_tolerance
-        Largest relative difference between the volumes of mesh and surface.
-    distance_tolerance
-        Largest distance, mm, from the given surface's vertices to the mesh's surface.
-    """
+_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+"""Corners of the face opposite to each corner, normals outwards when the volume is positive."""
 
-    edge_length: float
-    envelope: float
-    stop_energy: float = 10.0
-    iterations: int = 80
-    coarsen: bool = False
-    time_limit: float = 300.0
-    volume_tolerance: float = 0.05
-    distance_tolerance: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if name != "coarsen" and not (np.isfinite(value) and value > 0):
-                raise ConfigurationError(f"tetrahedralize: {name} = {value}; expected positive")
-        if self.envelope > self.edge_length:
-            raise ConfigurationError(
-                f"tetrahedralize: envelope = {self.envelope} mm exceeds edge_length = "
-                f"{self.edge_length} mm; about a twentieth of it is usual"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class TetwildReport:
-    """How well a mesh fills its surface.
-
-    Attributes
-    ----------
-    quality
-        Shape of the tetrahedra.
-    surface_volume
-        mm³ inside the given surface.
-    to_surface, from_surface
-        Largest distance, mm, from the mesh's outer nodes to the given surface, and from the given
-        vertices to the mesh's surface.
-    """
-
-    quality: QualityReport
-    surface_volume: float
-    to_surface: float
-    from_surface: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.quality}; surface volume {self.surface_volume:.1f} mm^3, distance to the "
-            f"surface {self.to_surface:.3f} mm, from it {self.from_surface:.3f} mm"
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TetrahedralMesh:
-    """A mesh of linear tetrahedra of positive volume.
-
-    Attributes
-    ----------
-    nodes
-        ``(n, 3)`` mm.
-    tetrahedra
-        ``(m, 4)``.
-    report
-        What the checks found.
-    """
-
-    nodes: FloatArray
-    tetrahedra: IntArray
-    report: TetwildReport
-
-    @property
-    def sha256(self) -> str:
-        """Hash of the content (not of the file that stores it)."""
-        return content_sha256(self.nodes, self.tetrahedra)
+_MIDDLES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+"""Corners whose middle is node 4, 5, ... of a ``tet10`` (order of `mvest.elements`)."""
 
 
 def tetrahedralize(
-    vertices: FloatArray,
-    triangles: IntArray,
-    settings: TetwildSettings,
-    store: Path | None = None,
-) -> TetrahedralMesh:
+    vertices: FloatArray, triangles: IntArray, edge_length: float, store: Path | None = None
+) -> Tetrahedra:
     """Mesh the inside of a closed surface, or read the mesh made of it before.
 
     Parameters
     ----------
     vertices, triangles
         Closed, outward, without self-intersections; ``(n, 3)`` mm and ``(m, 3)``.
-    settings
-        See `TetwildSettings`.
+    edge_length
+        Target, mm.
     store
         Folder in which the mesh is kept as ``tetwild-KEY.npz``, KEY being the hash of surface and
         settings. Not given, the mesh is made anew, and never the same twice.
 
     Raises
     ------
+    ConfigurationError
+        The edge length is not positive.
     GeometryError
         The surface has a fault; its name and the triangles are in the message.
     MeshingError
         The mesher failed, crashed or took too long, its mesh does not fit the surface, or a stored
         mesh is damaged.
     """
+    if not (np.isfinite(edge_length) and edge_length > 0):
+        raise ConfigurationError(f"tetrahedralize: edge_length = {edge_length}; expected positive")
     vertices = np.ascontiguousarray(vertices, dtype=np.float64)
     check_surface(vertices, triangles, closed=True, name="surface to mesh")
     triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+    envelope = ENVELOPE_SHARE * edge_length
 
-    def make() -> TetrahedralMesh:
-        return _checked(*_mesh(vertices, triangles, settings), vertices, triangles, settings)
+    def make() -> Tetrahedra:
+        return _checked(*_mesh(vertices, triangles, edge_length), vertices, triangles, envelope)
 
     if store is None:
         return make()
 
-    def read(path: Path) -> TetrahedralMesh:
-        return _checked(*_load(path), vertices, triangles, settings)
+    def read(path: Path) -> Tetrahedra:
+        return _checked(*_load(path), vertices, triangles, envelope)
 
-    path = Path(store) / f"tetwild-{_key(vertices, triangles, settings)}.npz"
+    path = Path(store) / f"tetwild-{_key(vertices, triangles, edge_length)}.npz"
     # Another mesh would not be the same again.
     return Entry(path, read, remake=False).get_or_make(make, _save)
 
 
-def _key(vertices: FloatArray, triangles: IntArray, settings: TetwildSettings) -> str:
+def _key(vertices: FloatArray, triangles: IntArray, edge_length: float) -> str:
     """Hash of everything that shapes the mesh; limits that only accept or refuse it are not in."""
     digest = hashlib.sha256()
     digest.update(np.ascontiguousarray(vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(triangles, dtype="<i8").tobytes())
-    shaping = ("edge_length", "envelope", "stop_energy", "iterations", "coarsen")
-    digest.update(repr([(name, getattr(settings, name)) for name in shaping]).encode())
+    own = {"edge_length": edge_length, "envelope": ENVELOPE_SHARE * edge_length}
+    digest.update(repr(list((own | SHAPING).items())).encode())
     return digest.hexdigest()[:24]
 
 
-def _mesh(
-    vertices: FloatArray, triangles: IntArray, settings: TetwildSettings
-) -> tuple[FloatArray, IntArray]:
+def _mesh(vertices: FloatArray, triangles: IntArray, edge_length: float) -> Tetrahedra:
     """Run the mesher in its own process and return its raw answer."""
-    diagonal = float(np.linalg.norm(np.ptp(vertices[np.unique(triangles)], axis=0)))
+    # Its lengths are relative to the diagonal of the bounding box.
+    share = edge_length / float(np.linalg.norm(np.ptp(vertices[np.unique(triangles)], axis=0)))
     with tempfile.TemporaryDirectory(prefix="tetwild-") as folder:
         source, target = Path(folder) / "surface.npz", Path(folder) / "mesh.npz"
         np.savez(
             source,
             vertices=vertices,
             triangles=triangles,
-            edge_length_fraction=settings.edge_length / diagonal,
-            envelope_fraction=settings.envelope / diagonal,
-            stop_energy=settings.stop_energy,
-            iterations=settings.iterations,
-            coarsen=settings.coarsen,
+            edge_length_fraction=share,
+            envelope_fraction=ENVELOPE_SHARE * share,
+            **SHAPING,
         )
         try:
             done = run(
@@ -213,12 +128,12 @@ def _mesh(
                 stderr=subprocess.PIPE,
                 text=True,
                 errors="replace",
-                timeout=settings.time_limit,
+                timeout=TIME_LIMIT,
             )
         except subprocess.TimeoutExpired:
             raise MeshingError(
-                f"pytetwild took longer than time_limit = {settings.time_limit:g} s; give a longer "
-                f"edge_length ({settings.edge_length:g} mm now) or more time"
+                f"pytetwild took longer than {TIME_LIMIT:g} s; give a longer edge_length "
+                f"({edge_length:g} mm now)"
             ) from None
         if done.returncode != 0 or not target.exists():
             raise MeshingError(f"pytetwild {_failure(done.returncode, done.stderr)}")
@@ -237,15 +152,17 @@ def _checked(
     tetrahedra: IntArray,
     vertices: FloatArray,
     triangles: IntArray,
-    settings: TetwildSettings,
-) -> TetrahedralMesh:
+    envelope: float,
+) -> Tetrahedra:
     """Orient the mesh, and refuse it unless it fills the surface."""
     if len(tetrahedra) == 0 or not np.isfinite(nodes).all():
         raise MeshingError(
             f"pytetwild returned {len(tetrahedra)} tetrahedra on {len(nodes)} nodes; expected "
             f"some, with finite coordinates"
         )
-    nodes, tetrahedra = drop_unused_nodes(nodes, orient(nodes, tetrahedra))
+    tetrahedra = orient(nodes, tetrahedra)
+    used, number = np.unique(tetrahedra, return_inverse=True)
+    nodes, tetrahedra = nodes[used], number.reshape(tetrahedra.shape)
     size = volumes(nodes, tetrahedra)
     if size.min() <= 0:
         flat = np.flatnonzero(size <= 0)
@@ -255,39 +172,33 @@ def _checked(
         check_surface(nodes, faces, closed=True, self_intersections=False, name="mesh's surface")
     except GeometryError as fault:
         raise MeshingError(f"pytetwild returned a mesh that is no solid: {fault}") from fault
-    report = TetwildReport(
-        quality=mesh_quality(nodes, tetrahedra, "tet4"),
-        surface_volume=enclosed_volume(vertices, triangles),
-        to_surface=float(
-            closest_points(nodes[np.unique(faces)], vertices, triangles).distance.max()
-        ),
-        from_surface=float(
-            closest_points(vertices[np.unique(triangles)], nodes, faces).distance.max()
-        ),
-    )
-    change = abs(report.quality.volume / report.surface_volume - 1)
-    if change > settings.volume_tolerance:
+    volume, enclosed = float(size.sum()), enclosed_volume(vertices, triangles)
+    change = abs(volume / enclosed - 1)
+    if change > VOLUME_TOLERANCE:
         raise MeshingError(
-            f"the mesh has {report.quality.volume:.4g} mm^3, its surface encloses "
-            f"{report.surface_volume:.4g} mm^3: {change:.1%} apart, volume_tolerance is "
-            f"{settings.volume_tolerance:.1%}; give a smaller envelope"
+            f"the mesh has {volume:.4g} mm^3, its surface encloses {enclosed:.4g} mm^3: "
+            f"{change:.1%} apart, expected at most {VOLUME_TOLERANCE:.0%}; give a shorter "
+            "edge_length"
         )
     # The mesher checks its envelope on samples, hence the margin.
-    if report.to_surface > 1.5 * settings.envelope:
+    away = closest_points(nodes[np.unique(faces)], vertices, triangles).distance.max()
+    if away > 1.5 * envelope:
         raise MeshingError(
-            f"the mesh leaves its surface by {report.to_surface:.3g} mm; the envelope is "
-            f"{settings.envelope:g} mm"
+            f"the mesh leaves its surface by {away:.3g} mm; the envelope is {envelope:g} mm"
         )
-    if report.from_surface > settings.distance_tolerance:
+    missed = closest_points(vertices[np.unique(triangles)], nodes, faces).distance.max()
+    if missed > DISTANCE_TOLERANCE:
         raise MeshingError(
-            f"the mesh misses part of its surface by {report.from_surface:.3g} mm; "
-            f"distance_tolerance is {settings.distance_tolerance:g} mm"
+            f"the mesh misses part of its surface by {missed:.3g} mm, expected at most "
+            f"{DISTANCE_TOLERANCE:g} mm; give a shorter edge_length"
         )
-    return TetrahedralMesh(nodes, tetrahedra, report)
+    return nodes, tetrahedra
 
 
-def _save(path: Path, mesh: TetrahedralMesh) -> None:
-    np.savez_compressed(path, nodes=mesh.nodes, tetrahedra=mesh.tetrahedra, sha256=mesh.sha256)
+def _save(path: Path, mesh: Tetrahedra) -> None:
+    nodes, tetrahedra = mesh
+    stored = content_sha256(nodes, tetrahedra)
+    np.savez_compressed(path, nodes=nodes, tetrahedra=tetrahedra, sha256=stored)
 
 
 def _load(path: Path) -> tuple[FloatArray, IntArray]:
@@ -298,3 +209,91 @@ def _load(path: Path) -> tuple[FloatArray, IntArray]:
     if content_sha256(nodes, tetrahedra) != str(stored):
         raise MeshingError(f"{path}: stored mesh does not match its hash {stored}; delete it")
     return nodes, tetrahedra
+
+
+def content_sha256(nodes: FloatArray, tetrahedra: IntArray) -> str:
+    """SHA-256 of a mesh's content: nodes rounded to 1e-9 mm, and tetrahedra."""
+    digest = hashlib.sha256()
+    # Adding zero turns -0.0 into 0.0, which has other bytes.
+    digest.update(np.ascontiguousarray(np.round(nodes, 9) + 0.0, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(tetrahedra, dtype="<i8").tobytes())
+    return digest.hexdigest()
+
+
+def volumes(nodes: FloatArray, tetrahedra: IntArray) -> FloatArray:
+    """Signed volume ``(m,)`` mm³ of every tetrahedron."""
+    edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
+    result: FloatArray = np.linalg.det(edges) / 6.0
+    return result
+
+
+def orient(nodes: FloatArray, tetrahedra: IntArray) -> IntArray:
+    """Tetrahedra with two corners exchanged wherever the volume is negative."""
+    result = np.array(tetrahedra, dtype=np.int64)
+    negative = volumes(nodes, result) < 0
+    result[negative, 2], result[negative, 3] = result[negative, 3], result[negative, 2].copy()
+    return result
+
+
+def outer_faces(tetrahedra: IntArray) -> tuple[IntArray, IntArray]:
+    """Faces that bound the mesh, normals outwards.
+
+    Returns
+    -------
+    faces
+        ``(f, 3)`` corner nodes.
+    owner
+        ``(f,)`` the tetrahedron of each.
+
+    Raises
+    ------
+    GeometryError
+        A face belongs to more than two tetrahedra.
+    """
+    faces = tetrahedra[:, :4][:, _FACES].reshape(-1, 3)
+    _, inverse, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    if (count > 2).any():
+        owners = np.unique(np.flatnonzero(np.isin(inverse, np.flatnonzero(count > 2))) // 4)
+        raise GeometryError(
+            f"{int((count > 2).sum())} faces belong to more than two tetrahedra (elements "
+            f"{owners[:8].tolist()}); expected at most two"
+        )
+    outer = np.flatnonzero(count[inverse.ravel()] == 1)
+    return faces[outer], outer // 4
+
+
+def promote_to_tet10(nodes: FloatArray, tetrahedra: IntArray) -> tuple[FloatArray, IntArray]:
+    """Add a node at the middle of every edge.
+
+    Returns
+    -------
+    nodes
+        ``(n + n_edges, 3)`` mm, the corners first.
+    elements
+        ``(m, 10)`` in the order of `mvest.elements`.
+    """
+    pairs = np.sort(tetrahedra[:, _MIDDLES].reshape(-1, 2), axis=1)
+    edges, inverse = np.unique(pairs, axis=0, return_inverse=True)
+    middle = len(nodes) + inverse.reshape(-1, 6)
+    return (
+        np.concatenate([nodes, nodes[edges].mean(axis=1)]),
+        np.concatenate([tetrahedra, middle], axis=1),
+    )
+
+
+def tri6_faces(faces: IntArray, elements: IntArray, owner: IntArray) -> IntArray:
+    """Six-node faces ``(f, 6)`` of ``tet10`` elements: corners, then the middles of 01, 12, 20."""
+    result = np.empty((len(faces), 6), dtype=np.int64)
+    result[:, :3] = faces
+    cells = elements[owner]
+    # Local corner number of each face corner in its element.
+    local = np.argmax(cells[:, None, :4] == faces[:, :, None], axis=2)
+    number = np.full((4, 4), -1)
+    for k, (a, b) in enumerate(_MIDDLES):
+        number[a, b] = number[b, a] = 4 + k
+    for i in range(3):
+        position = number[local[:, i], local[:, (i + 1) % 3]]
+        result[:, 3 + i] = cells[np.arange(len(faces)), position]
+    return result

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.studies.imported import HEART_PARTS
 from mvest.valve.anatomy.template import Template
-from mvest.valve.geometry.papillary import HEAD_MM
+from mvest.valve.geometry.segmented import HEAD_MM
 from mvest.valve.geometry.thickening import thicken
 
 TEMPLATE = Template()

@@ -25,8 +25,8 @@ from mvest.cases.plausibility import doubts
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
-from mvest.valve.geometry.papillary import HEAD_MM, papillary_tip
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.segmented import HEAD_MM, papillary_tip
 from tests.exchange.importing.made_up_heart import SHIFT, TEMPLATE, TIPS, heart, parts
 from tests.exchange.surfaces.glb import write_parts
 from tests.places import ROOT

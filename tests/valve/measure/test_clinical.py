@@ -10,7 +10,7 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.measure import clinical
 from mvest.valve.measure.clinical import clinical_meaning, clinical_measurements, clinical_names
 
-CLOSURE = ("orifice_mm2", "passing_ball_mm", "coaptation_length_mm", "coaptation_area_mm2")
+CLOSURE = ("orifice_mm2", "coaptation_length_mm", "coaptation_area_mm2")
 
 
 AS_IT_LIES = np.eye(3)
@@ -25,9 +25,8 @@ def measured(parameters=None, change=None, columns=80, rows=15, turn=AS_IT_LIES)
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Without the closure and the passing ball, which takes a second."""
-    monkeypatch.setattr(clinical, "_closure", lambda *arguments: {})
-    monkeypatch.setattr(clinical, "_ball", lambda *arguments: {})
+    """Without the closure."""
+    monkeypatch.setattr(clinical, "closure", lambda *arguments: {})
 
 
 @pytest.mark.parametrize(
@@ -84,7 +83,6 @@ def test_the_open_valve_has_an_orifice():
     found = measured(columns=24, rows=7)
     assert set(CLOSURE) <= set(found)
     assert found["orifice_mm2"] > 100
-    assert found["passing_ball_mm"] > 8
     assert set(found) == set(clinical_names(("anterior", "posterior")))
 
 
@@ -109,7 +107,7 @@ def test_a_shape_that_defies_a_measurement_has_the_others(monkeypatch, quick):
         raise GeometryError("no tenting")
 
     whole = measured()
-    monkeypatch.setattr(clinical, "measure_tenting", fails)
+    monkeypatch.setattr(clinical, "tenting", fails)
     found = measured()
     assert set(whole) - set(found) == {"tenting_height_mm", "tenting_volume_mm3"}
     valve = Template().valve(24, 7)
@@ -212,11 +210,8 @@ def test_every_number_has_a_meaning_and_a_unit():
     names = ("tip_0", "tip_180")
     valve = Template().valve(24, 7)
     x, tips = valve.surface.vertices, valve.papillary_tips
-    found = clinical_measurements(
-        x, valve.surface, x[valve.annulus], tips, 1.0, tip_names=names, passing_ball=False
-    )
-    assert set(found) == set(clinical_names(("anterior", "posterior"), names, passing_ball=False))
-    assert "passing_ball_mm" not in found
+    found = clinical_measurements(x, valve.surface, x[valve.annulus], tips, 1.0, tip_names=names)
+    assert set(found) == set(clinical_names(("anterior", "posterior"), names))
     ending = {"mm": "_mm", "mm²": "_mm2", "mm³": "_mm3", "": "_ratio"}
     for name in found:
         unit, meaning = clinical_meaning(name)

@@ -244,7 +244,7 @@ def test_a_truth_outlives_comments_docstrings_and_layout(truth):
         ("mvest/mechanics/settings.py", "patch_radius: Length = 2.0", "patch_radius: Length = 2.5"),
         ("mvest/elements.py", "0.445948490915965", "0.445948490915966"),
         ("mvest/valve/mesh/_tetwild_worker.py", "np.int64", "np.int32"),
-        ("mvest/valve/mesh/given.py", "ENVELOPE_SHARE = 0.05", "ENVELOPE_SHARE = 0.06"),
+        ("mvest/valve/mesh/tetwild.py", "ENVELOPE_SHARE = 0.05", "ENVELOPE_SHARE = 0.06"),
     ],
 )
 def test_a_truth_is_made_anew_after_one_line_of_what_makes_it_was_changed(truth, file, old, new):
