@@ -68,7 +68,6 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.kept": LEAVES,
     "mvest.reading": LEAVES,
     "mvest.processes": LEAVES,
-    "mvest._keeper": (),
     "mvest.units": LEAVES,
     "mvest.typing": LEAVES,
     "mvest.quantities": LEAVES,
