@@ -24,14 +24,13 @@ from tests.places import ROOT
 LEAVES = (
     "mvest.errors",
     "mvest.files",
-    "mvest.kept",
+    "mvest.cache",
     "mvest.reading",
     "mvest.processes",
     "mvest.units",
     "mvest.typing",
     "mvest.quantities",
     "mvest.elements",
-    "mvest.source",
 )
 VALUE_OBJECTS = (
     "mvest.valve.anatomy.valve",
@@ -65,7 +64,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest._compiling": (),
     "mvest.errors": LEAVES,
     "mvest.files": LEAVES,
-    "mvest.kept": LEAVES,
+    "mvest.cache": LEAVES,
     "mvest.reading": LEAVES,
     "mvest.processes": LEAVES,
     "mvest.units": LEAVES,
@@ -73,7 +72,6 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.quantities": LEAVES,
     "mvest.elements": LEAVES,
     "mvest.provenance": LEAVES,
-    "mvest.source": LEAVES,
     "mvest.valve": LEAVES,
     "mvest.mechanics": (*LEAVES, *VALUE_OBJECTS),
     "mvest.imaging": (*LEAVES, *VALUE_OBJECTS),

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from experiments.common.building.closure import mechanics_of
 from experiments.common.progress import PartBar
 from experiments.common.schema import NOT_HASHED, Values
+from mvest.cache import Entry, get_or_make
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
@@ -33,7 +34,6 @@ from mvest.imaging.learning.training import (
 )
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.valve_sequence import MovingValve
-from mvest.kept import Entry, get_or_make
 from mvest.problem.stored import Store, key_of
 from mvest.processes import side_by_side
 from mvest.quantities import Count, Length, Processes, Seed, within

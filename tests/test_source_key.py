@@ -11,10 +11,10 @@ from experiments.common.building import closure, patient_store
 from experiments.common.building.twin import MADE_BY
 from experiments.studies import imaged_patient
 from experiments.studies.imaging.detectors import SAMPLED_BY
+from mvest.cache import SOURCES, Sources, source_key
 from mvest.errors import InputError
 from mvest.simulation.population import draw_population
 from mvest.simulation.trials import try_sequence
-from mvest.source import SOURCES, Sources, source_key
 
 FILES = {
     "mvest/__init__.py": "import lazy_loader\n__getattr__, _, __all__ = lazy_loader.attach()\n",
