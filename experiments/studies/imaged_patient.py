@@ -24,7 +24,7 @@ from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples, ValveCase
-from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence
+from mvest.cases.from_images.build import CaseFrames, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
@@ -248,10 +248,15 @@ def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: PatientSet
         std_mm=np.full(n, KNOWN_UNCERTAINTY["std_mm"]),
         correlation_length_mm=KNOWN_UNCERTAINTY["correlation_length_mm"],
     )
-    texts = CaseTexts(
-        patient.name, f"{patient.description}, its true positions", "simulated", "MIT", True
-    )
-    return case_of_sequence(stated, frames, texts)
+    return case_of_sequence(stated, frames, _texts(patient, "its true positions"))
+
+
+def _texts(patient: PatientSettings, what: str) -> dict[str, Any]:
+    about = f"{patient.description}, {what}"
+    return {
+        "name": patient.name, "description": about, "source": "simulated", "licence": "MIT",
+        "simulated": True,
+    }  # fmt: skip
 
 
 def _segmented_case(
@@ -281,9 +286,7 @@ def _segmented_case(
         correlation_length_mm=length,
     )
     vertices, tip_errors = (each[:, frames.in_order] for each in errors(SAMPLES))
-    texts = CaseTexts(
-        patient.name, f"{patient.description}, a perfect segmentation", "simulated", "MIT", True
-    )
+    texts = _texts(patient, "a perfect segmentation")
     return case_of_sequence(seen, frames, texts, error_samples=ErrorSamples(vertices, tip_errors))
 
 

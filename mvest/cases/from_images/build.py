@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -82,20 +83,20 @@ def choose_frames(
     held_out: Mapping[int, float] | None = None,
     min_confidence: float = MIN_CONFIDENCE,
 ) -> CaseFrames:
-    """Choose the frames that were not stated.
+    """Choose the open and the closed frame where they are not stated.
 
     The closed frame is the one in which the leaflets touch over the largest area, the open frame
-    the one with the largest orifice, among frames that are as confident as asked for.
+    the one with the largest orifice, among frames of sufficient confidence.
 
     Parameters
     ----------
     sequence : ValveSequence
     rows : sequence
-        Measures of every frame (`mvest.cases.from_images.measures.measure_sequence`).
+        Its measures (`mvest.cases.from_images.measures.measure_sequence`).
     pressure_mmhg : float or callable
         In the closed frame, or at any time (s).
     open_, closed : int, optional
-        Where they are stated.
+        If stated.
     held_out : mapping, optional
         Frame -> pressure, mmHg.
     min_confidence : float
@@ -104,29 +105,28 @@ def choose_frames(
     Raises
     ------
     InputError
-        A frame that is stated does not exist, or none can be chosen.
+        A stated frame does not exist, or none can be chosen.
     """
     count, held = len(sequence.times), dict(held_out or {})
     for name, number in (("open", open_), ("closed", closed), *(("held-out", k) for k in held)):
         if number is not None and not 0 <= number < count:
             raise InputError(f"{name} frame {number}, expected one of 0 to {count - 1}")
-    sure = [
-        row
-        for row in rows
-        if sequence.frame_confidence[int(row["frame"] or 0)] >= min_confidence
-        and row["orifice_mm2"] is not None
-    ]
+    sure = {
+        t: row
+        for t, row in enumerate(rows)
+        if sequence.frame_confidence[t] >= min_confidence and row["orifice_mm2"] is not None
+    }
     among = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
     derived = []
     if closed is None:
-        closed = closed_frame([row for row in sure if int(row["frame"] or 0) not in held])
+        closed = closed_frame([row for t, row in sure.items() if t not in held])
         derived.append(
             f"closed frame: {closed}, whose leaflets touch over the largest area, {among}"
         )
     if open_ is None:
-        others = [row for row in sure if int(row["frame"] or 0) not in {closed, *held}]
-        best = max(others, key=lambda row: row["orifice_mm2"] or 0.0, default=None)
-        open_ = None if best is None else int(best["frame"] or 0)
+        others = {t: row["orifice_mm2"] or 0.0 for t, row in sure.items() if t not in held}
+        others.pop(-1 if closed is None else closed, None)
+        open_ = max(others, key=others.__getitem__, default=None)
         derived.append(f"open frame: {open_}, with the largest orifice, {among}")
     if open_ is None or closed is None:
         highest = float(np.max(sequence.frame_confidence))
@@ -139,21 +139,10 @@ def choose_frames(
     return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))
 
 
-@dataclass(frozen=True, slots=True)
-class CaseTexts:
-    """What a case says of itself."""
-
-    name: str
-    description: str = ""
-    source: str = ""
-    licence: str = ""
-    simulated: bool = False
-
-
 def case_of_sequence(
     sequence: ValveSequence,
     frames: CaseFrames,
-    texts: CaseTexts,
+    texts: Mapping[str, Any],
     *,
     thickness_mm: Mapping[str, float] | None = None,
     error_samples: ErrorSamples | None = None,
@@ -166,7 +155,8 @@ def case_of_sequence(
     ----------
     sequence : ValveSequence
     frames : CaseFrames
-    texts : CaseTexts
+    texts : mapping
+        The case's name, description, source, licence and whether it is simulated.
     thickness_mm : mapping, optional
         Of each leaflet next to the annulus; generic values if not given.
     error_samples : ErrorSamples, optional
@@ -216,7 +206,7 @@ def case_of_sequence(
         "rest lengths from the closed frame (through its vertices)"
     )
     return ValveCase(
-        **asdict(texts),
+        **texts,
         surface=surface,
         annulus=layout.annulus,
         free_edge=layout.free_edge,
@@ -258,24 +248,22 @@ def _check_frame(sequence: ValveSequence, number: int, side: float, *, is_refere
 
 def _frame(sequence: ValveSequence, frames: CaseFrames, number: int) -> Frame:
     layout, vertices = sequence.layout, sequence.vertices[number]
-    if number == frames.open:
-        name, role, pressure = "open", Role.REFERENCE, 0.0
-    elif number == frames.closed:
-        name, role, pressure = "closed", Role.CLOSED, frames.pressure_mmHg
-    else:
-        name, role, pressure = f"frame_{number}", Role.HELD_OUT, frames.held_out[number]
+    name, role, pressure = {
+        frames.open: ("open", Role.REFERENCE, 0.0),
+        frames.closed: ("closed", Role.CLOSED, frames.pressure_mmHg),
+    }.get(number) or (f"frame_{number}", Role.HELD_OUT, frames.held_out[number])
     return Frame(
-        name,
-        float(sequence.times[number]),
-        role,
-        float(pressure),
-        vertices,
-        layout.triangles,
-        layout.region,
-        vertices[layout.annulus],
-        vertices[layout.free_edge],
-        sequence.tips[number],
-        True,
+        name=name,
+        time=float(sequence.times[number]),
+        role=role,
+        pressure_mmHg=float(pressure),
+        vertices=vertices,
+        triangles=layout.triangles,
+        region=layout.region,
+        annulus=vertices[layout.annulus],
+        free_edge=vertices[layout.free_edge],
+        papillary_tips=sequence.tips[number],
+        corresponds=True,
     )
 
 

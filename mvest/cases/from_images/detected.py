@@ -12,14 +12,19 @@ import numpy as np
 
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import PressureCurve
-from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
+from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
     with_bands,
     without_expected_error,
 )
-from mvest.cases.from_images.files import write_for_slicer, write_surfaces
-from mvest.cases.from_images.measures import Row, measure_sequence, write_measures
+from mvest.cases.from_images.measures import (
+    Row,
+    measure_sequence,
+    write_for_slicer,
+    write_measures,
+    write_surfaces,
+)
 from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
@@ -190,21 +195,21 @@ def detect_in_volume(
     accuracy = measured.at(valve.confidence)
     rows = with_bands(valve, rows, accuracy)
     corrected, errors = without_expected_error(valve, frames, measured)
-    # Evenly spread samples of the errors.
+    # Samples that are evenly spread over the errors.
     spread = np.linspace(0, len(errors) - 1, settings.error_samples)
-    kept = np.unique(spread.round().astype(np.int64))
+    chosen = np.unique(spread.round().astype(np.int64))
     case = case_of_sequence(
         corrected,
         frames,
-        CaseTexts(
-            settings.name or called(volume),
-            settings.description,
-            settings.source or called(volume),
-            settings.licence,
-            settings.simulated,
-        ),
+        {
+            "name": settings.name or called(volume),
+            "description": settings.description,
+            "source": settings.source or called(volume),
+            "licence": settings.licence,
+            "simulated": settings.simulated,
+        },
         thickness_mm=thickness,
-        error_samples=samples_in_world(corrected, frames, errors[kept]),
+        error_samples=samples_in_world(corrected, frames, errors[chosen]),
     )
     off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
     less = (
@@ -243,13 +248,9 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
     images.mkdir(parents=True)
     write_measures(images, detected.rows)
     write_surfaces(images, detected.valve)
-    write_for_slicer(
-        images,
-        detected.volume,
-        detected.valve,
-        float(detected.case.surface.thickness.mean()),
-        [detected.frames.open, detected.frames.closed],
-    )
+    thickness = float(detected.case.surface.thickness.mean())
+    for frame in (detected.frames.open, detected.frames.closed):
+        write_for_slicer(images, detected.volume, detected.valve, thickness, frame)
     files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series"]
     if detected.settings.states_pressure:
         write_case(case, detected.case)

@@ -22,7 +22,7 @@ from scipy.stats import t as student_t
 
 from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.build import CaseFrames
-from mvest.cases.from_images.measures import BOUNDS, Row, is_open, leaflets_of
+from mvest.cases.from_images.measures import Row, is_open, leaflets_of
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -189,7 +189,7 @@ def with_bands(
     reach = float(student_t.ppf(0.975, count - 1)) * np.sqrt(1.0 + 1.0 / count)
     banded = []
     for t, row in enumerate(rows):
-        bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in BOUNDS)
+        bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in ("low", "high"))
         if row[BANDED[0]] is not None:
             which, axes = (0 if is_open(row) else 1), valve_axes(sequence, t)
             moved = _points(sequence, t) - errors[:, which] @ axes.T

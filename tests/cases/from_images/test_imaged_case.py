@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
-from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
+from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
     valve_axes,
@@ -27,7 +27,10 @@ from tests.cases.folders import closing
 from tests.cases.test_folder import assert_equal
 
 LAYOUT = ValveLayout(32, 9)
-TEXTS = CaseTexts("imaged", "a valve from images", "made up", "MIT", True)
+TEXTS = {
+    "name": "imaged", "description": "a valve from images", "source": "made up", "licence": "MIT",
+    "simulated": True,
+}  # fmt: skip
 FRAMES = CaseFrames(0, 2, 118.0, {3: 80.0})
 TURN = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix()
 
