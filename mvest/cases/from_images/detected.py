@@ -251,7 +251,7 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
     thickness = float(detected.case.surface.thickness.mean())
     for frame in (detected.frames.open, detected.frames.closed):
         write_for_slicer(images, detected.volume, detected.valve, thickness, frame)
-    files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series"]
+    files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.pvd"]
     if detected.settings.states_pressure:
         write_case(case, detected.case)
         files.append(f"{CASE}/case.yaml")

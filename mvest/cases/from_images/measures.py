@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
 from mvest.exchange.segmentations import segment_name, voxelise_leaflets, write_segmentation
-from mvest.exchange.surfaces import region_arrays, write_surface
+from mvest.exchange.surfaces import SurfaceFile, region_arrays, write_surface_series
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import (
@@ -165,28 +164,23 @@ def write_measures(folder: Path, rows: Sequence[Row]) -> Path:
 
 
 def write_surfaces(folder: Path, sequence: ValveSequence) -> Path:
-    """Write the valve of every frame for ParaView and 3D Slicer; returns the index.
+    """Write the valve of every frame for ParaView and 3D Slicer; returns the index ``valve.pvd``.
 
     ``valve_0000.vtp``, ... hold the midsurface in LPS mm with ``confidence`` and ``std_mm`` (NaN
-    where it was never measured) at its points and ``region`` in its triangles;
-    ``valve.vtp.series`` lists them with their times in s, as ParaView's readers expect it (ParaView
-    user's guide, "file series"). It is written last.
+    where it was never measured) at its points and ``region`` in its triangles.
 
     Raises
     ------
     InputError
         A point that is not finite, or a file that cannot be written.
     """
-    layout = sequence.layout
+    layout, std = sequence.layout, sequence.std_mm
     cells = region_arrays(layout.region, layout.region_names)
-    files = []
-    for t, time in enumerate(sequence.times):
-        points = {"confidence": sequence.vertex_confidence[t], "std_mm": sequence.std_mm}
-        file = folder / f"valve_{t:04d}.vtp"
-        write_surface(file, sequence.vertices[t], layout.triangles, points, cells)
-        files.append({"name": file.name, "time": float(time)})
-    text = json.dumps({"file-series-version": "1.0", "files": files}, indent=1)
-    return write_atomically(folder / "valve.vtp.series", text + "\n")
+    states = [
+        SurfaceFile(x, layout.triangles, {"confidence": confidence, "std_mm": std}, cells)
+        for x, confidence in zip(sequence.vertices, sequence.vertex_confidence, strict=True)
+    ]
+    return write_surface_series(folder / "valve.pvd", sequence.times.tolist(), states)
 
 
 def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:

@@ -1,6 +1,6 @@
 """Surfaces, landmarks and segmentations of a valve from images, read back."""
 
-import json
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -20,11 +20,9 @@ def test_the_surfaces_carry_their_times_confidence_and_leaflets(tmp_path):
     valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
     valve.std_mm[3] = np.nan
     index = write_surfaces(tmp_path, valve)
-    series = json.loads(index.read_text(encoding="utf-8"))
-    assert index.name == "valve.vtp.series"
-    assert series["file-series-version"] == "1.0"
-    assert [entry["time"] for entry in series["files"]] == [0.0, 0.04]
-    second = read_surface(tmp_path / series["files"][1]["name"])
+    entries = ET.parse(index).findall("Collection/DataSet")
+    assert [float(entry.get("timestep", "")) for entry in entries] == [0.0, 0.04]
+    second = read_surface(tmp_path / entries[1].get("file", ""))
     np.testing.assert_allclose(second.vertices, valve.vertices[1])
     np.testing.assert_array_equal(second.triangles, SMALL.triangles)
     np.testing.assert_allclose(second.point_data["confidence"], valve.vertex_confidence[1])

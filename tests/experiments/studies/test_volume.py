@@ -76,7 +76,7 @@ def test_the_image_step_is_checked_written_and_drawn(run, volume, tmp_path):
     assert status == 0, err
     (folder,) = (tmp_path / "outputs" / "volume").iterdir()
     for name in ("montage.png", "measures_over_time.png", "images/measures.csv",
-                 "images/valve.vtp.series", "case/case.yaml", "case/errors.npz"):  # fmt: skip
+                 "images/valve.pvd", "case/case.yaml", "case/errors.npz"):  # fmt: skip
         assert (folder / name).is_file(), name
     case = read_case(folder / "case")
     # By its content: a file may be called after a patient.
