@@ -187,7 +187,7 @@ def test_what_is_kept_knows_what_makes_it():
     others = ("mvest.imaging", "mvest.estimation.filters", "mvest.personalisation")
     assert not [name for name in truth if name.startswith(others)]
     one = reached(patient_store._simulate, patient_store._write)
-    assert one >= FORWARD | {"mvest.simulation.virtual_patient", "mvest.cases.writer"}
+    assert one >= FORWARD | {"mvest.simulation.virtual_patient", "mvest.cases.folder"}
     assert reached(draw_population) >= FORWARD | {"mvest.imaging.layout"}
     imaged = reached(imaged_patient._simulate, imaged_patient._write)
     assert imaged >= FORWARD | {"mvest.exchange.segmentations", "mvest.imaging.simulator.beams"}

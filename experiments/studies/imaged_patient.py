@@ -24,9 +24,9 @@ from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples, ValveCase
+from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
-from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe

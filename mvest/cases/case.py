@@ -7,8 +7,11 @@ written by a simulation; nothing in it says what the moduli are. All lengths are
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
+from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -22,7 +25,7 @@ LARGEST_ERROR = 20.0
 """mm, displacement of a point in any sample."""
 
 
-class Role(Enum):
+class Role(StrEnum):
     """What a frame is for.
 
     ``REFERENCE`` is the open frame from which the model's geometry is taken; ``CLOSED`` the closed
@@ -77,6 +80,45 @@ class Frame:
     free_edge: FloatArray
     papillary_tips: FloatArray
     corresponds: bool
+
+
+def check_different(
+    field: str, names: Sequence[str], wrong: Callable[[str, str], InputError]
+) -> None:
+    """Raise ``wrong(field, what)`` unless names differ by more than case, spaces and NFKC form."""
+    seen: dict[str, str] = {}
+    for name in names:
+        key = " ".join(normalize("NFKC", name).casefold().split())
+        if key in seen:
+            alike = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
+            raise wrong(field, f"the name {name!r} {alike}; expected different names")
+        seen[key] = name
+
+
+def check_frames(frames: Sequence[Any], wrong: Callable[[str, str], InputError]) -> None:
+    """Raise ``wrong(field, what)`` unless names, times, roles and tips of frames go together.
+
+    ``frames`` are of a case or of its file (`mvest.cases.schema.FrameEntry`).
+    """
+    names = [frame.name for frame in frames]
+    check_different("frames", names, wrong)
+    tips = len(frames[0].papillary_tips)
+    for number, (a, b) in enumerate(itertools.pairwise(frames), start=1):
+        if b.time <= a.time:
+            what = f"{b.time:g} of {b.name!r} is not after {a.time:g} of {a.name!r}"
+            raise wrong(f"frames.{number}.time", f"{what}; put the frames in the order of time")
+        if len(b.papillary_tips) != tips:
+            raise wrong(
+                f"frames.{number}.papillary_tips",
+                f"{len(b.papillary_tips)} tips, but {tips} in frame {names[0]!r}; expected the "
+                "same tips in the same order in all frames",
+            )
+    for role in (Role.REFERENCE, Role.CLOSED)[: len(frames)]:
+        members = [frame.name for frame in frames if frame.role == role]
+        if len(members) != 1:
+            listed = ", ".join(members) or "none"
+            what = f"{len(members)} frames have the role {role} ({listed}), expected exactly one"
+            raise wrong("frames", what)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,19 +260,10 @@ class ValveCase:
     chordae_follow: bool = False
 
     def __post_init__(self) -> None:
-        for role in (Role.REFERENCE, Role.CLOSED)[: len(self.frames)]:
-            members = [frame.name for frame in self.frames if frame.role is role]
-            if len(members) != 1:
-                raise InputError(
-                    f"case {self.name}: {len(members)} frames with the role {role.value} "
-                    f"({', '.join(members) or 'none'}), expected one"
-                )
-        names = [frame.name for frame in self.frames]
-        if len(set(names)) != len(names):
-            raise InputError(f"case {self.name}: frame names {names} are not all different")
-        times = [frame.time for frame in self.frames]
-        if any(b <= a for a, b in itertools.pairwise(times)):
-            raise InputError(f"case {self.name}: frame times {times} s do not increase")
+        def wrong(field: str, what: str) -> InputError:
+            return InputError(f"case {self.name}: {field}: {what}")
+
+        check_frames(self.frames, wrong)
         self._check_uncertainty()
 
     def _check_uncertainty(self) -> None:

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
+from mvest.cases.case import Role
 from mvest.errors import InputError
 from mvest.reading.documents import read_yaml
 from mvest.reading.text import MAX_NUMBER, one_line
@@ -93,7 +94,7 @@ class FrameEntry(_Model):
 
     name: Name = Field(description="text, different for every frame")
     time: Number = Field(description="a number in units.time, larger than that of the frame before")
-    role: Literal["reference", "closed", "fitted", "held_out"] = Field(
+    role: Role = Field(
         description="reference (open; the model starts from it), closed (fitted), fitted (a "
         "further closed frame, under another pressure, fitted with it) or held_out"
     )

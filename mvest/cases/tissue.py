@@ -20,8 +20,8 @@ import numpy as np
 
 from mvest.cases.case import Frame, Role
 from mvest.cases.checks import check_thickness
-from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
-from mvest.cases.rims import Rims, arc_shares, commissures, directed, loop_vector_area
+from mvest.cases.frames import MM_PER, Band, SeenFrame
+from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
 from mvest.cases.schema import CaseFolder, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns
@@ -52,7 +52,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 1.002 (SD 0.03, marginal) and 0.966 (0.013, basal) times as long in sixteen simulated valves."""
 
 
-def read_leaflets(folder: CaseFolder, reference: ReferenceFrame) -> LeafletSurface:
+def read_leaflets(folder: CaseFolder, reference: Band) -> LeafletSurface:
     """The midsurface of the reference frame; what was not given is added to ``derived``."""
     seen, names = reference.seen, tuple(folder.document.region_names().values())
     n = len(seen.vertices)
@@ -87,16 +87,15 @@ def _thickness(
     return np.array([by_name[name] for name in names])[vertex_region]
 
 
-def _fibre(folder: CaseFolder, reference: ReferenceFrame) -> FloatArray:
-    seen, rims = reference.seen, reference.rims
+def _fibre(folder: CaseFolder, reference: Band) -> FloatArray:
+    seen = reference.seen
     if folder.document.fibre is not None:
         return point_data(seen, folder.document.fibre, 3)
     folder.derived.append(
         "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
     )
-    return surface_coordinates(
-        seen.vertices, seen.triangles, rims.annulus, rims.free_edge
-    ).circumferential
+    loops = reference.annulus, reference.free_edge
+    return surface_coordinates(seen.vertices, seen.triangles, *loops).circumferential
 
 
 def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
@@ -118,9 +117,7 @@ def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
     return values
 
 
-def read_chordae(
-    folder: CaseFolder, reference: ReferenceFrame, placed: list[tuple[Frame, Rims]]
-) -> Chordae:
+def read_chordae(folder: CaseFolder, reference: Band, placed: list[tuple[Frame, Band]]) -> Chordae:
     """The chordae of the table, or those laid out; then this is added to ``derived``."""
     given = folder.document.chordae
     if given is None:
@@ -156,9 +153,7 @@ def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
     )
 
 
-def _laid_out(
-    folder: CaseFolder, reference: ReferenceFrame, placed: list[tuple[Frame, Rims]]
-) -> Chordae:
+def _laid_out(folder: CaseFolder, reference: Band, placed: list[tuple[Frame, Band]]) -> Chordae:
     names = list(folder.document.region_names().values())
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
@@ -167,13 +162,13 @@ def _laid_out(
             f"two papillary tips (here: {', '.join(names)}; {len(seen.tips)} tips)"
         )
 
-    def band(x: FloatArray, triangles: IntArray, region: IntArray, rims: Rims) -> LeafletBand:
-        loops = rims.annulus, rims.free_edge
-        return LeafletBand.of(x, triangles, region, *loops, names.index("anterior"))
+    def coordinates(band: Band) -> LeafletBand:
+        loops = band.annulus, band.free_edge
+        return LeafletBand.of(*band.labelled, *loops, names.index("anterior"))
 
-    opened = band(seen.vertices, seen.triangles, reference.region, reference.rims)
+    opened = coordinates(reference)
     seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
-    closed, rims = seen_closed[0] if seen_closed else placed[0]
+    closed, band = seen_closed[0] if seen_closed else placed[0]
     goal: LeafletBand | FloatArray
     if not seen_closed:
         how = (
@@ -185,7 +180,7 @@ def _laid_out(
         how, goal = "the closed frame (through its vertices)", closed.vertices
     else:
         how = "the closed frame (through the same material coordinates in it)"
-        goal = band(closed.vertices, closed.triangles, closed.region, rims)
+        goal = coordinates(band)
     layout = SEEN_ON_BAND if seen_closed else ChordLayout()
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(

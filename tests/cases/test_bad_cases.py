@@ -431,7 +431,7 @@ CASES = {
     "unknown unit": (put("units", "length", "inch"), I, "units.length", "'inch'; expected mm, cm"),
     # Frames.
     "frames out of order": (
-        put("frames", 1, "time", -1.0), I, "frames.1.time", "-1 s of 'closed' is not after 0 s"
+        put("frames", 1, "time", -1.0), I, "frames.1.time", "-1 of 'closed' is not after 0 of"
     ),
     "NaN in times": (
         put("frames", 1, "time", float("nan")),

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case
 from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.cases.folder import PressureCurve
+from mvest.cases.folder import PressureCurve, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
@@ -27,7 +27,6 @@ from mvest.cases.from_images.measures import (
 )
 from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
-from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.volumes import read_volume

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role
-from mvest.cases.folder import read_case
+from mvest.cases.folder import read_case, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
@@ -16,7 +16,6 @@ from mvest.cases.from_images.detector_errors import (
 )
 from mvest.cases.from_images.measures import measure_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
-from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout

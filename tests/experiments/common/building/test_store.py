@@ -15,7 +15,7 @@ import mvest.closure.model
 import mvest.files
 from experiments.common.building.twin import MADE_BY
 from mvest.cache import Counts, Sources
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.problem.stored import Store, StoredModel, key_of
