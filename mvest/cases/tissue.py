@@ -206,7 +206,7 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeafletBand:
-    """A two-leaflet surface whose points can be found by the template's coordinates.
+    """A two-leaflet surface whose points are found by the template's coordinates.
 
     Attributes
     ----------
@@ -233,16 +233,7 @@ class LeafletBand:
         free_edge: IntArray,
         anterior: int,
     ) -> LeafletBand:
-        """Solve for the coordinates of a band.
-
-        Parameters
-        ----------
-        vertices, triangles, region
-            ``(n, 3)`` mm, ``(m, 3)`` and ``(m,)``.
-        annulus, free_edge
-            The two boundary loops.
-        anterior
-            Which region is the anterior leaflet.
+        """Solve for the coordinates of a band, ``anterior`` being the number of that leaflet.
 
         Raises
         ------
@@ -270,8 +261,7 @@ class LeafletBand:
 
     def position(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Positions ``(k, 3)`` mm of points at phi (degrees) and s."""
-        corners, weights = self.locate(phi, s)
-        return _weighted(self.vertices, corners, weights)
+        return _weighted(self.vertices, *self.locate(phi, s))
 
 
 def _angle_table(
@@ -299,33 +289,14 @@ def _weighted(vertices: FloatArray, corners: IntArray, weights: FloatArray) -> F
     return result
 
 
-def assumed_closure(
-    open_valve: LeafletBand,
-    annulus: FloatArray,
-    tips: FloatArray,
-    closed_depth: float = CLOSED_DEPTH,
-) -> FloatArray:
-    """Where the vertices of a valve may be once it is closed, if only its open shape is known.
+def assumed_closure(open_valve: LeafletBand, annulus: FloatArray, tips: FloatArray) -> FloatArray:
+    """Assumed positions ``(n, 3)`` mm of the vertices in the closed valve, from its open shape.
 
     The free edges of the two leaflets meet half-way between where they are, point by point of equal
-    share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
-    follow in proportion to their coordinate s. It is not how the valve closes, but says how long
-    chordae must be to let it.
-
-    Parameters
-    ----------
-    open_valve
-    annulus
-        ``(k, 3)`` mm, in loop order.
-    tips
-        ``(t, 3)`` mm, on the side of the ventricle.
-    closed_depth
-        Of the free edge below the annulus, closed over open.
-
-    Returns
-    -------
-    ndarray
-        ``(n, 3)`` mm.
+    share between the commissures, at `CLOSED_DEPTH` of their depth below the annulus; leaflets
+    follow in proportion to their coordinate s. The valve does not close like this, but the shape
+    says how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the tips
+    ``(t, 3)`` mm are on the side of the ventricle.
     """
     phi, theta = open_valve.edge_angle
     here, there = (open_valve.position(turn, np.ones(len(phi))) for turn in (phi, 360.0 - phi))
@@ -333,7 +304,7 @@ def assumed_closure(
     centre, normal = annulus.mean(axis=0), loop_vector_area(annulus)
     down = normal / np.linalg.norm(normal) * np.sign((tips.mean(axis=0) - centre) @ normal)
     depth = (goal - centre) @ down
-    move = goal - (1 - closed_depth) * depth[:, None] * down - here
+    move = goal - (1 - CLOSED_DEPTH) * depth[:, None] * down - here
     coordinates = open_valve.coordinates
     along = [np.interp(coordinates.theta, theta, each, period=2 * np.pi) for each in move.T]
     return np.asarray(open_valve.vertices + coordinates.s[:, None] * np.stack(along, axis=1))
@@ -348,9 +319,9 @@ def lay_out_chordae(
 ) -> Chordae:
     """Place the chordae of a layout on a valve.
 
-    Every insertion belongs to the nearer of the two tips in the reference frame. As in the
-    template, a chord is as long as ``slack`` times its distance in the closed frame, and at least
-    ``open_slack`` times its distance in the open one.
+    Every chord starts at the nearer of the two tips in the reference frame. As in the template, it
+    is as long as ``slack`` times its distance in the closed frame, and at least ``open_slack``
+    times its distance in the open one.
 
     Parameters
     ----------
@@ -359,11 +330,11 @@ def lay_out_chordae(
     open_tips, closed_tips
         ``(2, 3)`` mm.
     closed_valve
-        The closed frame: ``(n, 3)`` mm, where the vertices of the reference are in it, or a valve
-        with coordinates of its own if its vertices do not correspond.
+        The closed frame: ``(n, 3)`` mm, positions of the reference's vertices, or a valve with
+        coordinates of its own if its vertices do not correspond.
     layout
-        The template's for a closed frame that is intended (`assumed_closure`), and for one that was
-        seen `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are of that kind.
+        The template's for an intended closed frame (`assumed_closure`); for one that was seen
+        `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are of that kind.
 
     Raises
     ------
@@ -378,7 +349,7 @@ def lay_out_chordae(
     if isinstance(closed_valve, np.ndarray):
         closed = _weighted(closed_valve, corners, weights)
     else:
-        closed = _weighted(closed_valve.vertices, *closed_valve.locate(phi, s))
+        closed = closed_valve.position(phi, s)
     reach = np.linalg.norm(insertion[:, None] - open_tips, axis=2)
     tip = np.argmin(reach, axis=1)
     slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)

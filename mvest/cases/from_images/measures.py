@@ -11,7 +11,6 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
-from mvest.exchange.segmentations import segment_name, voxelise_leaflets, write_segmentation
 from mvest.exchange.surfaces import SurfaceFile, region_arrays, write_surface_series
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
@@ -22,7 +21,6 @@ from mvest.imaging.valve_sequence import (
     landmarks,
     slicerheart_labels,
 )
-from mvest.imaging.volume import VolumeSequence
 from mvest.reading.text import write_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.clinical import MeasuredLeaflets, clinical_measurements, clinical_names
@@ -208,33 +206,3 @@ def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:
             ANNULUS_LABELS: PointList(tuple(labels), np.stack(list(labels.values()))),
         },
     )
-
-
-def write_for_slicer(
-    folder: Path, volume: VolumeSequence, valve: ValveSequence, thickness_mm: float, frame: int
-) -> list[Path]:
-    """Write landmarks and a segmentation of a frame for 3D Slicer; returns the paths.
-
-    ``valve_0007.mrk.json`` (see `write_landmarks`) and ``valve_0007.seg.nrrd``, on the voxels of
-    the volume with a segment for each leaflet of this thickness, hold frame 7. Frame k of the
-    volume is frame k of the valve.
-
-    Raises
-    ------
-    InputError
-        As `write_landmarks`.
-    """
-    layout = valve.layout
-    labels = voxelise_leaflets(
-        volume,
-        valve.vertices[frame],
-        layout.triangles,
-        layout.region,
-        np.full(layout.size, thickness_mm),
-    )
-    names = {1 + k: segment_name(region) for k, region in enumerate(layout.region_names)}
-    base = f"valve_{frame:04d}"
-    return [
-        write_landmarks(folder / f"{base}.mrk.json", valve, frame),
-        write_segmentation(folder / f"{base}.seg.nrrd", volume, labels, names),
-    ]

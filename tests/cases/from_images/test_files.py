@@ -5,7 +5,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from mvest.cases.from_images.measures import write_for_slicer, write_landmarks, write_surfaces
+from mvest.cases.from_images.measures import write_landmarks, write_surfaces
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface
@@ -45,22 +45,6 @@ def test_landmarks_are_read_back_in_place(tmp_path):
     assert lists["annulus"].kind == "ClosedCurve"
     np.testing.assert_allclose(lists["annulus"].points, valve.annulus[1])
     np.testing.assert_allclose(lists["free edge"].points, valve.free_edge[1])
-
-
-def test_slicer_gets_the_frames_asked_for(tmp_path):
-    nrrd = pytest.importorskip("nrrd")
-    valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
-    volume = made_up_sequence.volume(valve, spacing=1.5)
-    written = write_for_slicer(tmp_path, volume, valve, 1.2, 1)
-    assert [path.name for path in written] == ["valve_0001.mrk.json", "valve_0001.seg.nrrd"]
-    labels, header = nrrd.read(str(written[1]))
-    assert labels.shape == volume.frames.shape[1:]
-    assert {header["Segment0_Name"], header["Segment1_Name"]} == {
-        "mitral_anterior_leaflet", "mitral_posterior_leaflet",
-    }  # fmt: skip
-    for label, phi in ((1, 90), (2, 270)):
-        at = volume.index(valve.vertices[1, SMALL.vertex(phi, 4)]).round().astype(int)
-        assert labels[tuple(at)] == label
 
 
 def test_a_frame_that_does_not_exist_is_refused(tmp_path):
