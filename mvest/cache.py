@@ -5,9 +5,10 @@ was not written under this name as it is; it is made again, even if its reader a
 
 The key of a maker is a hash of its module and of all modules that this one imports. Imports are
 followed through `mvest` and the packages that join it by :meth:`Sources.include`, also imports
-within functions, but not those for type checking. A text that names a module, or a Python file
-beside the module, counts as an import. Comments, docstrings and layout do not count, nor do the
-packages above an imported module. Files of data and settings are not code: callers describe them.
+within functions, but not those for type checking, nor names that `mvest` itself loads on first use.
+A text that names a module, or a Python file beside the module, counts as an import. Comments,
+docstrings and layout do not count, nor do the packages above an imported module. Files of data and
+settings are not code: callers describe them.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -220,7 +222,7 @@ class Sources:
         """Follow imports into further packages."""
         self._folders |= folders
         # What was read before might name modules of theirs.
-        self._modules: dict[str, tuple[str, set[str]]] = {}
+        self._modules: dict[str, tuple[str, list[str]]] = {}
 
     def key(self, *modules: str) -> str:
         """Hash of modules and of all that they import; InputError for a foreign module."""
@@ -234,58 +236,45 @@ class Sources:
             name = left.pop()
             if name not in found:
                 found.add(name)
-                left += self._module(name)[1]
+                if name not in self._modules:
+                    self._modules[name] = self._read(name)
+                left += self._modules[name][1]
         return found
 
-    def _module(self, name: str) -> tuple[str, set[str]]:
-        """Hash of a module's code, and the modules that it imports."""
-        if name not in self._modules:
-            path = self._path(name)
-            if path is None:
-                raise InputError(f"{name} is no module of {' or '.join(self._folders)}")
-            tree, stub = ast.parse(path.read_bytes()), path.with_suffix(".pyi")
-            package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-            nodes = _counting(tree)
-            # What a package imports on first use is in its stub.
-            nodes += ast.walk(ast.parse(stub.read_bytes())) if stub.is_file() else ()
-            imported = {module for node in nodes for module in self._imported(node, package)}
-            self._modules[name] = hashlib.sha256(ast.dump(tree).encode()).hexdigest(), imported
-        return self._modules[name]
-
-    def _imported(self, node: ast.AST, package: str) -> Iterator[str]:
-        """The modules of these packages that a part of a syntax tree names."""
-        names: list[str] = []
-        match node:
-            case ast.Import():
-                names = [item.name for item in node.names]
-            case ast.ImportFrom():
-                above = package.split(".")[: len(package.split(".")) - node.level + 1]
-                base = ".".join([*(above if node.level else []), *filter(None, [node.module])])
-                inner = [f"{base}.{item.name}" for item in node.names]
-                names = [name if self._path(name) else base for name in inner]
-            case ast.Constant(value=str(text)) if "." in text and text != "__init__.py":
-                names = [f"{package}.{text[:-3]}" if text.endswith(".py") else text]
-        return (name for name in names if self._path(name))
+    def _read(self, name: str) -> tuple[str, list[str]]:
+        """A module's code without its docstrings and comments, and the modules that it names."""
+        path = self._path(name)
+        if path is None:
+            raise InputError(f"{name} is no module of {' or '.join(self._folders)}")
+        code = _without_texts(path.read_bytes())
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        named = re.findall(r"'(\w+(?:\.\w+)+)'", code)
+        named += [f"{package}.{text[:-3]}" for text in named if text.endswith(".py")]
+        for line in re.findall(r"^\s*import (.+)", code, re.MULTILINE):
+            named += re.findall(r"[\w.]+", line)
+        for base, items in re.findall(r"^\s*from ([\w.]+) import (.+)", code, re.MULTILINE):
+            named += [base, *(f"{base}.{item}" for item in re.findall(r"\w+", items))]
+        return code, [module for module in named if self._path(module)]
 
     def _path(self, name: str) -> Path | None:
         """The file of a module; None if it is none of these packages."""
         top, *rest = name.split(".")
-        if top not in self._folders or not all(part.isidentifier() for part in rest):
+        if top not in self._folders:
             return None
         place = self._folders[top].joinpath(*rest)
         files = (place / "__init__.py", place.with_suffix(".py"))
         return next((file for file in files if file.is_file()), None)
 
 
-def _counting(tree: ast.Module) -> list[ast.AST]:
-    """Remove docstrings and imports for type checking from a tree; returns its other nodes."""
-    nodes: list[ast.AST] = [tree]
-    for node in nodes:
+def _without_texts(source: bytes) -> str:
+    """Code without comments, docstrings, layout and imports for type checking."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
         body: Any = getattr(node, "body", None)
         if isinstance(body, list):
-            body[:] = [part for part in body if not _is_silent(part)]
-        nodes += ast.iter_child_nodes(node)
-    return nodes
+            left = [part for part in body if not _is_silent(part)]
+            node.body = left or [ast.Pass()]  # type: ignore[attr-defined]
+    return ast.unparse(tree)
 
 
 def _is_silent(node: ast.stmt) -> bool:

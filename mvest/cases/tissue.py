@@ -289,11 +289,16 @@ def _weighted(vertices: FloatArray, corners: IntArray, weights: FloatArray) -> F
     return result
 
 
-def assumed_closure(open_valve: LeafletBand, annulus: FloatArray, tips: FloatArray) -> FloatArray:
+def assumed_closure(
+    open_valve: LeafletBand,
+    annulus: FloatArray,
+    tips: FloatArray,
+    closed_depth: float = CLOSED_DEPTH,
+) -> FloatArray:
     """Assumed positions ``(n, 3)`` mm of the vertices in the closed valve, from its open shape.
 
     The free edges of the two leaflets meet half-way between where they are, point by point of equal
-    share between the commissures, at `CLOSED_DEPTH` of their depth below the annulus; leaflets
+    share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
     follow in proportion to their coordinate s. The valve does not close like this, but the shape
     says how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the tips
     ``(t, 3)`` mm are on the side of the ventricle.
@@ -304,7 +309,7 @@ def assumed_closure(open_valve: LeafletBand, annulus: FloatArray, tips: FloatArr
     centre, normal = annulus.mean(axis=0), loop_vector_area(annulus)
     down = normal / np.linalg.norm(normal) * np.sign((tips.mean(axis=0) - centre) @ normal)
     depth = (goal - centre) @ down
-    move = goal - (1 - CLOSED_DEPTH) * depth[:, None] * down - here
+    move = goal - (1 - closed_depth) * depth[:, None] * down - here
     coordinates = open_valve.coordinates
     along = [np.interp(coordinates.theta, theta, each, period=2 * np.pi) for each in move.T]
     return np.asarray(open_valve.vertices + coordinates.s[:, None] * np.stack(along, axis=1))
