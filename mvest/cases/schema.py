@@ -34,7 +34,9 @@ def _kind(value: Any) -> str:
     """Which alternative of a field a value belongs to; no key of a file holds the character NUL."""
     if isinstance(value, dict):
         return "\0point data" if "point_data" in value else "\0mapping"
-    return {list: "\0list", str: "\0text"}.get(type(value), "\0number")
+    if isinstance(value, list):
+        return "\0list"
+    return "\0text" if isinstance(value, str) else "\0number"
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER, le=MAX_NUMBER)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,15 +36,13 @@ UNSEEN_STD_MM = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CaseFrames:
-    """Which frames of a sequence are used, by their numbers.
+    """Numbers of the open and the closed frame of a sequence, of which a case is made.
 
     Attributes
     ----------
     open, closed : int
     pressure_mmHg : float
         Transmitral pressure in the closed frame.
-    held_out : mapping
-        Further frames of the closed valve -> transmitral pressure in mmHg.
     derived : tuple of str
         How frames were chosen that were not stated.
     """
@@ -52,25 +50,22 @@ class CaseFrames:
     open: int
     closed: int
     pressure_mmHg: float
-    held_out: Mapping[int, float] = field(default_factory=dict)
     derived: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        used = [self.open, self.closed, *self.held_out]
-        if len(set(used)) != len(used):
-            raise InputError(f"frames {used} (open, closed, held out) are not all different")
+        if self.open == self.closed:
+            raise InputError(f"frame {self.open} is both the open and the closed one")
         low, high = CLOSING_PRESSURE
-        for frame, pressure in ((self.closed, self.pressure_mmHg), *self.held_out.items()):
-            if not low <= pressure <= high:
-                raise InputError(
-                    f"pressure of frame {frame} = {pressure} mmHg on the closed valve, expected "
-                    f"{low:g} to {high:g} mmHg"
-                )
+        if not low <= self.pressure_mmHg <= high:
+            raise InputError(
+                f"pressure of frame {self.closed} = {self.pressure_mmHg} mmHg on the closed valve, "
+                f"expected {low:g} to {high:g} mmHg"
+            )
 
     @property
     def in_order(self) -> list[int]:
-        """Numbers of all of them, in the order of time."""
-        return sorted([self.open, self.closed, *self.held_out])
+        """Both, in the order of time."""
+        return sorted([self.open, self.closed])
 
 
 def choose_frames(
@@ -80,7 +75,6 @@ def choose_frames(
     *,
     open_: int | None = None,
     closed: int | None = None,
-    held_out: Mapping[int, float] | None = None,
     min_confidence: float = MIN_CONFIDENCE,
 ) -> CaseFrames:
     """Choose the open and the closed frame where they are not stated.
@@ -97,8 +91,6 @@ def choose_frames(
         In the closed frame, or at any time (s).
     open_, closed : int, optional
         If stated.
-    held_out : mapping, optional
-        Frame -> pressure, mmHg.
     min_confidence : float
         Of a frame that is chosen.
 
@@ -107,8 +99,8 @@ def choose_frames(
     InputError
         A stated frame does not exist, or none can be chosen.
     """
-    count, held = len(sequence.times), dict(held_out or {})
-    for name, number in (("open", open_), ("closed", closed), *(("held-out", k) for k in held)):
+    count = len(sequence.times)
+    for name, number in (("open", open_), ("closed", closed)):
         if number is not None and not 0 <= number < count:
             raise InputError(f"{name} frame {number}, expected one of 0 to {count - 1}")
     sure = {
@@ -119,14 +111,13 @@ def choose_frames(
     among = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
     derived = []
     if closed is None:
-        closed = closed_frame([row for t, row in sure.items() if t not in held])
+        closed = closed_frame(list(sure.values()))
         derived.append(
             f"closed frame: {closed}, whose leaflets touch over the largest area, {among}"
         )
     if open_ is None:
-        others = {t: row["orifice_mm2"] or 0.0 for t, row in sure.items() if t not in held}
-        others.pop(-1 if closed is None else closed, None)
-        open_ = max(others, key=others.__getitem__, default=None)
+        orifice = {t: row["orifice_mm2"] or 0.0 for t, row in sure.items() if t != closed}
+        open_ = max(orifice, key=orifice.__getitem__, default=None)
         derived.append(f"open frame: {open_}, with the largest orifice, {among}")
     if open_ is None or closed is None:
         highest = float(np.max(sequence.frame_confidence))
@@ -136,7 +127,7 @@ def choose_frames(
         )
     if callable(pressure_mmhg):
         pressure_mmhg = pressure_mmhg(float(sequence.times[closed]))
-    return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))
+    return CaseFrames(open_, closed, pressure_mmhg, tuple(derived))
 
 
 def case_of_sequence(
@@ -247,16 +238,12 @@ def _check_frame(sequence: ValveSequence, number: int, side: float, *, is_refere
 
 
 def _frame(sequence: ValveSequence, frames: CaseFrames, number: int) -> Frame:
-    layout, vertices = sequence.layout, sequence.vertices[number]
-    name, role, pressure = {
-        frames.open: ("open", Role.REFERENCE, 0.0),
-        frames.closed: ("closed", Role.CLOSED, frames.pressure_mmHg),
-    }.get(number) or (f"frame_{number}", Role.HELD_OUT, frames.held_out[number])
+    layout, vertices, is_open = sequence.layout, sequence.vertices[number], number == frames.open
     return Frame(
-        name=name,
+        name="open" if is_open else "closed",
         time=float(sequence.times[number]),
-        role=role,
-        pressure_mmHg=float(pressure),
+        role=Role.REFERENCE if is_open else Role.CLOSED,
+        pressure_mmHg=0.0 if is_open else float(frames.pressure_mmHg),
         vertices=vertices,
         triangles=layout.triangles,
         region=layout.region,

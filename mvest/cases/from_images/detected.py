@@ -182,7 +182,6 @@ def detect_in_volume(
         STAND_IN_MMHG if pressure is None else pressure,
         open_=settings.open_frame,
         closed=settings.closed_frame,
-        held_out={frame: float(value) for frame, value in settings.held_out},
         min_confidence=settings.min_confidence,
     )
     accuracy = measured.at(valve.confidence)

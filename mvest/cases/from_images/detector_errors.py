@@ -114,8 +114,7 @@ def without_expected_error(
 ) -> tuple[ValveSequence, FloatArray]:
     """The valve less its expected error, and errors of other valves about their expected ones.
 
-    Only the frames of the case are changed: the open one by the error of open frames, the others by
-    that of closed ones.
+    Only the two frames of the case are changed.
 
     Returns
     -------
