@@ -72,32 +72,22 @@ class Program(AbstractContextManager["Program"]):
 
     def __init__(self, command: Sequence[str], **options: Any) -> None:
         self._lifeline, other = socket.socketpair()
+        supervisor = [sys.executable, "-I", "-S", __file__, str(other.fileno())]
+        with other:
+            self.process: subprocess.Popen[Any] = subprocess.Popen(
+                [*supervisor, *command],
+                pass_fds=(other.fileno(),),
+                start_new_session=True,
+                **options,
+            )
         try:
-            with other:
-                supervisor = [sys.executable, "-I", "-S", __file__, str(other.fileno())]
-                self.process: subprocess.Popen[Any] = subprocess.Popen(
-                    [*supervisor, *command],
-                    pass_fds=(other.fileno(),),
-                    start_new_session=True,
-                    **options,
-                )
-            self.pid = self._begun(command[0])
-        except BaseException:
-            self._lifeline.close()
-            raise
-
-    def _begun(self, program: str) -> int:
-        """The program's number, once it runs."""
-        try:
-            said = self._lifeline.recv(64).split()
+            failure, self.pid = map(int, self._lifeline.recv(64).split() or (0, 0))
+            if failure or not self.pid:
+                why = os.strerror(failure) if failure else "it was killed"
+                raise OSError(failure, why, command[0])
         except BaseException:
             self.close()
             raise
-        failure, pid = (int(word) for word in said or (b"0", b"0"))
-        if failure or not pid:
-            self.close()
-            raise OSError(failure, os.strerror(failure) if failure else "it was killed", program)
-        return pid
 
     def end(self) -> None:
         """Ask for the program's end, without waiting for it; from any thread."""

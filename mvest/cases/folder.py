@@ -33,7 +33,7 @@ from mvest.cases.case import (
     check_frames,
 )
 from mvest.cases.checks import check_closing_pressure
-from mvest.cases.frames import SECONDS_PER, place_frame, read_frame, reference_band
+from mvest.cases.frames import LOOPS, SECONDS_PER, place_frame, read_frame, reference_band
 from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, ChordaeEntry, PointData
 from mvest.cases.tissue import CHORD_COLUMNS, point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
@@ -96,7 +96,7 @@ class PressureCurve:
         if not first <= time <= last:
             raise InputError(
                 f"time {time:g} s lies outside the pressure curve, which runs from {first:g} to "
-                f"{last:g} s"
+                f"{last:g} s; give the pressure of the frame, or a curve that covers its time"
             )
         return float(scipy.interpolate.PchipInterpolator(self.time, self.pressure_mmHg)(time))
 
@@ -146,6 +146,9 @@ def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]
     arrays: dict[str, Any] = {"vertices": samples.vertices, "tips": samples.tips} | source
     np.savez_compressed(file, frames=np.array(list(frames)), **arrays)
 
+
+TEXTS = ("name", "description", "source", "licence", "simulated")
+"""Fields that a case and its file have in common."""
 
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
 """Leaflets tracked in echocardiography are about 1 mm off, and smoothly so."""
@@ -199,11 +202,7 @@ def read_case(path: Path | str) -> ValveCase:
                 samples = read_error_samples(file, [frame.name for frame in document.frames])
     entry = document.chordae
     case = ValveCase(
-        name=document.name,
-        description=document.description,
-        source=document.source,
-        licence=document.licence,
-        simulated=document.simulated,
+        **{name: getattr(document, name) for name in TEXTS},
         surface=surface,
         annulus=reference.annulus,
         free_edge=reference.free_edge,
@@ -239,7 +238,7 @@ def _pressures(folder: CaseFolder) -> list[float]:
             if frame.pressure is not None:
                 pressure = to_mmhg * frame.pressure
             else:
-                pressure = _from_curve(curve, to_seconds * frame.time)
+                pressure = curve(to_seconds * frame.time)
                 if document.pressure_curve is None:
                     folder.derived.append(
                         f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
@@ -251,31 +250,12 @@ def _pressures(folder: CaseFolder) -> list[float]:
     return result
 
 
-def _from_curve(curve: PressureCurve, time: float) -> float:
-    try:
-        return curve(time)
-    except InputError as fault:
-        raise InputError(
-            f"not given, and {fault}; give the pressure of this frame or a pressure_curve that "
-            "covers it"
-        ) from fault
-
-
 def write_case(folder: Path | str, case: ValveCase) -> Path:
     """Write a case: ``case.yaml``, one ``.vtp`` per frame, loops and chordae as ``.csv``.
 
     Everything is given explicitly, in mm, s and mmHg, so that nothing is derived anew on reading.
-    The folder appears under its name only once it is complete.
-
-    Parameters
-    ----------
-    folder
-        A folder that does not exist yet (or is empty), in one that does.
-
-    Returns
-    -------
-    Path
-        The folder.
+    The folder, which must be new or empty, appears under its name only once it is complete; it is
+    returned.
 
     Raises
     ------
@@ -289,13 +269,7 @@ def write_case(folder: Path | str, case: ValveCase) -> Path:
 
 
 def require_new(folder: Path | str) -> Path:
-    """The folder, where a case may be written.
-
-    Raises
-    ------
-    InputError
-        There is something.
-    """
+    """The folder, where a case may be written; InputError if it has any content."""
     target = Path(folder)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
@@ -305,7 +279,7 @@ def require_new(folder: Path | str) -> Path:
 def _check_reference(case: ValveCase) -> None:
     frame, surface = case.frame(Role.REFERENCE), case.surface
     own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
-    own |= {name: surface.vertices[getattr(case, name)] for name in ("annulus", "free_edge")}
+    own |= {name: surface.vertices[getattr(case, name)] for name in LOOPS}
     for name, wanted in own.items():
         if not np.array_equal(getattr(frame, name), wanted):
             raise InputError(
@@ -327,11 +301,7 @@ def _write_files(folder: Path, case: ValveCase) -> None:
         write_error_samples(folder / "errors.npz", case.error_samples, names)
     document: dict[str, Any] = {
         "version": VERSION,
-        "name": case.name,
-        "description": case.description,
-        "source": case.source,
-        "licence": case.licence,
-        "simulated": case.simulated,
+        **{name: getattr(case, name) for name in TEXTS},
         "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
         "regions": list(case.surface.region_names),
         "thickness": {"point_data": "thickness"},
@@ -370,14 +340,9 @@ def _write_frame(folder: Path, case: ValveCase, number: int, frame: Frame) -> di
         point_data = {"fibre": case.surface.fibre, "thickness": case.surface.thickness}
         if isinstance(case.uncertainty.std_mm, np.ndarray):
             point_data["std_mm"] = case.uncertainty.std_mm
-    write_surface(
-        folder / f"{stem}.vtp",
-        frame.vertices,
-        frame.triangles,
-        point_data,
-        {"region": np.asarray(frame.region)},
-    )
-    for name in ("annulus", "free_edge"):
+    cell_data = {"region": np.asarray(frame.region)}
+    write_surface(folder / f"{stem}.vtp", frame.vertices, frame.triangles, point_data, cell_data)
+    for name in LOOPS:
         file = folder / f"{stem}_{name}.csv"
         if frame.role is Role.REFERENCE:
             write_columns(file, ("vertex",), ([v] for v in getattr(case, name).tolist()))
@@ -388,8 +353,7 @@ def _write_frame(folder: Path, case: ValveCase, number: int, frame: Frame) -> di
         "time": float(frame.time),
         "role": frame.role.value,
         "surface": f"{stem}.vtp",
-        "annulus": f"{stem}_annulus.csv",
-        "free_edge": f"{stem}_free_edge.csv",
+        **{name: f"{stem}_{name}.csv" for name in LOOPS},
         "papillary_tips": np.asarray(frame.papillary_tips, dtype=np.float64).tolist(),
         "pressure": float(frame.pressure_mmHg),
         **({} if frame.role is Role.REFERENCE else {"corresponds": bool(frame.corresponds)}),
