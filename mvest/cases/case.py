@@ -310,14 +310,13 @@ class ValveCase:
             f"{frame.name} ({frame.role.value.replace('_', ' ')}, {frame.pressure_mmHg:.3g} mmHg)"
             for frame in self.frames
         )
-        doubt = self.uncertainty
-        length = doubt.correlation_length_mm
+        seen, length = self.uncertainty, self.uncertainty.correlation_length_mm
         return (
             f"case {self.name}{' (simulated)' if self.simulated else ''}: {regions}\n"
             f"{len(self.surface.vertices)} vertices, {len(self.chordae)} chordae\n"
             f"frames: {frames}\n"
-            f"seen within {doubt.typical_mm:.3g} mm, "
-            f"{f'alike over {length:g} mm' if length else 'independent'}"
+            f"seen within {seen.typical_mm:.3g} mm, "
+            f"{f'correlated over {length:g} mm' if length else 'independent'}"
             + (f"; {len(self.error_samples)} error samples" if self.error_samples else "")
         )
 

@@ -197,18 +197,6 @@ def torn(x, t, r):
     return np.vstack([x, x])[used], t.reshape(-1, 3), r
 
 
-def short_data(folder, document):
-    """A file whose labels are fewer than its triangles."""
-    text = (folder / "open.vtp").read_text()
-    short = text.replace('Name="region"', 'Name="region" format="ascii"', 1)
-    start = short.index(">", short.index('Name="region"')) + 1
-    end = short.index("</DataArray>", start)
-    short = short[:start].replace(' format="binary"', "", 0) + "0 1 1" + short[end:]
-    head = short.index("<DataArray")
-    tag = short[head:start].replace(' format="ascii"', "").replace("binary", "ascii")
-    (folder / "open.vtp").write_text(short[:head] + tag + short[start:])
-
-
 def turned(some):
     def edit(x, t, r):
         t[some] = t[some][:, ::-1]

@@ -6,7 +6,7 @@ import meshio
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
+from mvest.cases.case import Role, Uncertainty
 from mvest.cases.folder import read_case, write_case
 from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
@@ -80,6 +80,21 @@ def test_the_hash_changes_with_every_file_that_is_used_and_no_other(tmp_path):
     one.write_text(one.read_text().removesuffix("\n"))
     following.write_text("\n" + following.read_text())
     assert read_case(folder).sha256 != first
+
+
+def test_a_case_prints_what_a_person_wants_to_know():
+    case = template_case(40, 12)
+    assert str(case).splitlines() == [
+        "case template (simulated): anterior, posterior",
+        f"480 vertices, {len(case.chordae)} chordae",
+        "frames: open (reference, -0.333 mmHg), held (held out, 80.1 mmHg), "
+        "closed (closed, 121 mmHg)",
+        "seen within 0.9 mm, correlated over 7.5 mm",
+    ]
+    plain = dataclasses.replace(case, simulated=False, uncertainty=Uncertainty(0.5))
+    assert str(plain).splitlines()[::3] == [
+        "case template: anterior, posterior", "seen within 0.5 mm, independent"
+    ]  # fmt: skip
 
 
 # --- formats of other programs ------------------------------------------------------------------
