@@ -260,49 +260,39 @@ class ValveCase:
     chordae_follow: bool = False
 
     def __post_init__(self) -> None:
-        def wrong(field: str, what: str) -> InputError:
-            return InputError(f"case {self.name}: {field}: {what}")
-
-        check_frames(self.frames, wrong)
+        check_frames(self.frames, self._wrong)
         self._check_uncertainty()
 
+    def _wrong(self, field: str, what: str) -> InputError:
+        return InputError(f"case {self.name}: {field}: {what}")
+
     def _check_uncertainty(self) -> None:
-        n, std = len(self.surface.vertices), self.uncertainty.std_mm
+        n, std, samples = len(self.surface.vertices), self.uncertainty.std_mm, self.error_samples
         if isinstance(std, np.ndarray):
             if std.shape != (n,):
-                raise InputError(
-                    f"case {self.name}: observation std_mm of {len(std)} vertices, expected {n}"
-                )
+                raise self._wrong("observation", f"std_mm of {len(std)} vertices, expected {n}")
             if self.closed is not None and not self.closed.corresponds:
-                raise InputError(
-                    f"case {self.name}: observation std_mm of each vertex, but the vertices of the "
-                    "closed frame do not correspond; expected one number"
-                )
-        samples = self.error_samples
+                what = "std_mm of each vertex, but the vertices of the closed frame do not "
+                raise self._wrong("observation", f"{what}correspond; expected one number")
         if samples is None:
             return
         f, t = len(self.frames), len(self.frame(Role.REFERENCE).papillary_tips)
         names = self.surface.region_names
         if self.chordae_follow and (len(names) != 2 or "anterior" not in names or t != 2):
-            raise InputError(
-                f"case {self.name}: chordae that follow error samples need two regions, one of "
-                f"them anterior, and two papillary tips (here: {', '.join(names)}; {t} tips)"
-            )
-        for name, given, wanted in (
-            ("vertices", samples.vertices.shape[1:3], (f, n)),
-            ("tips", samples.tips.shape[1:3], (f, t)),
-        ):
-            if given != wanted:
-                raise InputError(
-                    f"case {self.name}: error samples, {name} of {given[0]} frames of {given[1]} "
-                    f"points, expected {wanted[0]} of {wanted[1]}"
-                )
+            what = "following error samples needs two regions, one of them anterior, and two "
+            found = f"papillary tips (here: {', '.join(names)}; {t} tips)"
+            raise self._wrong("chordae", what + found)
+        for name, count in (("vertices", n), ("tips", t)):
+            given = getattr(samples, name).shape[1:3]
+            if given != (f, count):
+                what = f"{name} of {given[0]} frames of {given[1]} points, expected {f} of {count}"
+                raise self._wrong("error samples", what)
         strange = [frame.name for frame in self.frames if not frame.corresponds]
         if strange:
-            raise InputError(
-                f"case {self.name}: error samples, but the vertices of frame {strange[0]!r} do not "
-                "correspond; expected frames that all do"
+            what = (
+                f"the vertices of frame {strange[0]!r} do not correspond; expected frames that do"
             )
+            raise self._wrong("error samples", what)
 
     def __str__(self) -> str:
         regions = ", ".join(self.surface.region_names)
