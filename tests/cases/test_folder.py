@@ -101,12 +101,8 @@ def test_a_case_prints_what_a_person_wants_to_know():
 
 
 def by_pyvista(file, x, triangles, region):
-    pyvista = pytest.importorskip("pyvista")
-    mesh = pyvista.PolyData.from_regular_faces(x, triangles)
-    if file.suffix in (".vtp", ".vtu"):
-        mesh.cell_data["region"] = region
-    if file.suffix == ".vtu":
-        mesh = mesh.cast_to_unstructured_grid()
+    mesh = pytest.importorskip("pyvista").PolyData.from_regular_faces(x, triangles)
+    mesh.cell_data["region"] = region
     mesh.save(file)
 
 
@@ -116,25 +112,7 @@ def by_meshio(file, x, triangles, region):
     meshio.Mesh(x, cells, cell_data=data).write(file)
 
 
-def by_trimesh(file, x, triangles, region):
-    trimesh = pytest.importorskip("trimesh")
-    trimesh.Trimesh(x, triangles, process=False).export(file)
-
-
-WRITERS = [
-    (by_pyvista, ".vtp"),
-    (by_pyvista, ".vtu"),
-    (by_pyvista, ".stl"),
-    (by_pyvista, ".ply"),
-    (by_pyvista, ".obj"),
-    (by_meshio, ".vtu"),
-    (by_meshio, ".stl"),
-    (by_meshio, ".obj"),
-    (by_meshio, ".ply"),
-    (by_trimesh, ".stl"),
-    (by_trimesh, ".obj"),
-    (by_trimesh, ".ply"),
-]
+WRITERS = [(by_pyvista, ".vtp"), *((by_meshio, end) for end in (".vtu", ".stl", ".obj", ".ply"))]
 
 
 @pytest.mark.parametrize(("write", "suffix"), WRITERS)
