@@ -73,13 +73,17 @@ class Program(AbstractContextManager["Program"]):
     def __init__(self, command: Sequence[str], **options: Any) -> None:
         self._lifeline, other = socket.socketpair()
         supervisor = [sys.executable, "-I", "-S", __file__, str(other.fileno())]
-        with other:
-            self.process: subprocess.Popen[Any] = subprocess.Popen(
-                [*supervisor, *command],
-                pass_fds=(other.fileno(),),
-                start_new_session=True,
-                **options,
-            )
+        try:
+            with other:
+                self.process: subprocess.Popen[Any] = subprocess.Popen(
+                    [*supervisor, *command],
+                    pass_fds=(other.fileno(),),
+                    start_new_session=True,
+                    **options,
+                )
+        except BaseException:
+            self._lifeline.close()
+            raise
         try:
             failure, self.pid = map(int, self._lifeline.recv(64).split() or (0, 0))
             if failure or not self.pid:
