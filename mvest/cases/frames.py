@@ -50,7 +50,7 @@ class SeenFrame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Band:
+class CheckedFrame:
     """A frame that was checked to be a band of leaflets, with its labels and boundary loops."""
 
     seen: SeenFrame
@@ -122,7 +122,7 @@ def _read_loop(
         return points
 
 
-def reference_band(folder: CaseFolder, seen: SeenFrame) -> Band:
+def reference_band(folder: CaseFolder, seen: SeenFrame) -> CheckedFrame:
     """The reference frame with its loops, or an error with the first thing that is wrong."""
     for name, given in seen.loops.items():
         if given is not None and given.ndim != 1:
@@ -139,7 +139,7 @@ def reference_band(folder: CaseFolder, seen: SeenFrame) -> Band:
     return band
 
 
-def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> Band:
+def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> CheckedFrame:
     """The regions and loops of a frame that is checked to be a band."""
     with folder.at(f"{seen.where}.surface"):
         check_band(seen.vertices, seen.triangles, self_intersections=self_intersections)
@@ -162,11 +162,11 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> B
             f"{seen.ears[:5].tolist()} ({len(seen.ears)} in all), which had all three corners on "
             "one edge of the valve"
         )
-    return Band(seen, seen.region, *rims)
+    return CheckedFrame(seen, seen.region, *rims)
 
 
 def _check_place(
-    folder: CaseFolder, band: Band, annulus: FloatArray, side: float, field: str
+    folder: CaseFolder, band: CheckedFrame, annulus: FloatArray, side: float, field: str
 ) -> None:
     """Raise unless annulus, tips and triangles lie to each other as in a valve."""
     seen = band.seen
@@ -179,15 +179,15 @@ def _check_place(
 
 
 def place_frame(
-    folder: CaseFolder, reference: Band, seen: SeenFrame, pressure_mmhg: float
-) -> tuple[Frame, Band]:
+    folder: CaseFolder, reference: CheckedFrame, seen: SeenFrame, pressure_mmhg: float
+) -> tuple[Frame, CheckedFrame]:
     """A frame with its annulus and free edge where they are."""
     corresponds = _corresponds(folder, reference.seen, seen)
     if seen is reference.seen:
         band = reference
     elif corresponds:
         _check_same_valve(folder, seen, reference)
-        band = Band(seen, reference.region, reference.annulus, reference.free_edge)
+        band = CheckedFrame(seen, reference.region, reference.annulus, reference.free_edge)
     else:
         band = _band(folder, seen, self_intersections=False)
         with folder.at(f"{seen.where}.surface"):
@@ -214,7 +214,7 @@ def place_frame(
     return frame, band
 
 
-def _check_same_valve(folder: CaseFolder, seen: SeenFrame, reference: Band) -> None:
+def _check_same_valve(folder: CaseFolder, seen: SeenFrame, reference: CheckedFrame) -> None:
     """Raise unless a corresponding frame is a band with the labels and loops of the reference."""
     with folder.at(f"{seen.where}.surface"):
         check_band(seen.vertices, seen.triangles, self_intersections=False)
@@ -252,7 +252,9 @@ def _corresponds(folder: CaseFolder, first: SeenFrame, seen: SeenFrame) -> bool:
     return stated
 
 
-def _annulus(folder: CaseFolder, reference: Band, band: Band, corresponds: bool) -> FloatArray:
+def _annulus(
+    folder: CaseFolder, reference: CheckedFrame, band: CheckedFrame, corresponds: bool
+) -> FloatArray:
     """Where the annulus vertices of the reference are in a frame, ``(k, 3)`` mm."""
     seen, given = band.seen, band.seen.loops["annulus"]
     with folder.at(f"{seen.where}.annulus"):

@@ -20,7 +20,7 @@ import numpy as np
 
 from mvest.cases.case import Frame, Role
 from mvest.cases.checks import check_thickness
-from mvest.cases.frames import MM_PER, Band, SeenFrame
+from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
 from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
 from mvest.cases.schema import CaseFolder, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
@@ -52,7 +52,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 1.002 (SD 0.03, marginal) and 0.966 (0.013, basal) times as long in sixteen simulated valves."""
 
 
-def read_leaflets(folder: CaseFolder, reference: Band) -> LeafletSurface:
+def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
     """The midsurface of the reference frame; what was not given is added to ``derived``."""
     seen, names = reference.seen, tuple(folder.document.region_names().values())
     n = len(seen.vertices)
@@ -87,7 +87,7 @@ def _thickness(
     return np.array([by_name[name] for name in names])[vertex_region]
 
 
-def _fibre(folder: CaseFolder, reference: Band) -> FloatArray:
+def _fibre(folder: CaseFolder, reference: CheckedFrame) -> FloatArray:
     seen = reference.seen
     if folder.document.fibre is not None:
         return point_data(seen, folder.document.fibre, 3)
@@ -117,7 +117,9 @@ def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
     return values
 
 
-def read_chordae(folder: CaseFolder, reference: Band, placed: list[tuple[Frame, Band]]) -> Chordae:
+def read_chordae(
+    folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
+) -> Chordae:
     """The chordae of the table, or those laid out; then this is added to ``derived``."""
     given = folder.document.chordae
     if given is None:
@@ -153,7 +155,9 @@ def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
     )
 
 
-def _laid_out(folder: CaseFolder, reference: Band, placed: list[tuple[Frame, Band]]) -> Chordae:
+def _laid_out(
+    folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
+) -> Chordae:
     names = list(folder.document.region_names().values())
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
@@ -162,7 +166,7 @@ def _laid_out(folder: CaseFolder, reference: Band, placed: list[tuple[Frame, Ban
             f"two papillary tips (here: {', '.join(names)}; {len(seen.tips)} tips)"
         )
 
-    def coordinates(band: Band) -> LeafletBand:
+    def coordinates(band: CheckedFrame) -> LeafletBand:
         loops = band.annulus, band.free_edge
         return LeafletBand.of(*band.labelled, *loops, names.index("anterior"))
 
