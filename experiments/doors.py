@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.common.schema import build, schema
 from experiments.console import Parser
 from experiments.interruption import interruptible
-from mvest.cases.writer import require_new, write_case
+from mvest.cases.folder import require_new, write_case
 from mvest.errors import ConfigurationError
 from mvest.exchange import exporting, importing
 

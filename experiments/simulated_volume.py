@@ -24,7 +24,7 @@ from experiments.common.places import CONF
 from experiments.common.progress import PartBar, announce_compilation
 from experiments.common.schema import build, schema
 from experiments.console import Parser
-from mvest.cases.from_images.files import write_landmarks, write_surfaces
+from mvest.cases.from_images.measures import write_landmarks, write_surfaces
 from mvest.errors import ConfigurationError, MvestError
 from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
 from mvest.files import write_atomically

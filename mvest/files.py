@@ -55,7 +55,7 @@ def write_atomically(
                 content(part)
             else:
                 part.write_bytes(_encoded(content, target) if isinstance(content, str) else content)
-            for file in _files(part) if sync else ():
+            for file in filter(Path.is_file, [part, *part.rglob("*")]) if sync else ():
                 with file.open("rb+") as stream:
                     os.fsync(stream.fileno())
             if part.is_dir() and target.is_dir():
@@ -123,7 +123,7 @@ SETTLED_NS = 2_000_000_000
 def _sha256(file: Path) -> str:
     about = file.stat()
     if not stat.S_ISREG(about.st_mode):
-        # A pipe would be waited for.
+        # Reading a pipe would wait.
         raise InputError(f"cannot read {file}: no file")
     key = (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
     if abs(time.time_ns() - max(about.st_mtime_ns, about.st_ctime_ns)) < SETTLED_NS:
@@ -133,7 +133,7 @@ def _sha256(file: Path) -> str:
 
 @lru_cache(maxsize=4096)
 def _remembered(file: Path, key: tuple[int, ...]) -> str:
-    """A large volume is read once, however often it is asked whether it has changed."""
+    """A large volume is read once, however often its digest is needed."""
     return _digest(file)
 
 
@@ -143,7 +143,7 @@ def _digest(file: Path) -> str:
 
 
 def _encoded(text: str, target: Path) -> bytes:
-    """UTF-8; a character that has none is no reason to lose the others."""
+    """UTF-8, with a ? and a note for a character that has none."""
     try:
         return text.encode()
     except UnicodeEncodeError as error:
@@ -153,17 +153,13 @@ def _encoded(text: str, target: Path) -> bytes:
 
 
 def remove_parts(folder: Path, name: str = "") -> None:
-    """Take away what killed processes left of files and folders in ``folder``, or of one ``name``.
+    """Remove what killed processes left of files in ``folder``, or of one ``name``.
 
-    Nobody may be writing them.
+    No process may be writing them.
     """
     for part in folder.glob(f"{PREFIX}*"):
         if part.name.endswith(f"-{name}" if name else ""):
             _remove(part)
-
-
-def _files(part: Path) -> list[Path]:
-    return [file for file in [part, *part.rglob("*")] if file.is_file()]
 
 
 def _remove(part: Path) -> None:

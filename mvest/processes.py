@@ -1,13 +1,19 @@
-"""Processes that end with the one that started them: the one place that starts any that computes.
+"""Start child processes that exit when their parent does. All computing processes start here.
 
-Whatever becomes of this process, a kill that nobody can catch included, a program that it has
-started is ended within two seconds, and with it what that one has started in turn. A keeper beside
-each program (`mvest._keeper`) sees to it.
+A supervisor runs beside each program: this file, run as a script. It holds one end of a socket, the
+lifeline. The system closes the other end when the parent dies, even of a signal that nobody can
+catch. The supervisor then ends the program, and what that one has started, within two seconds. On
+Linux it also ends what has left the program's process group (prctl(2), child subreaper), and the
+program dies with a supervisor that is killed.
+
+Imports only the standard library, so that a supervisor starts in milliseconds.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -21,23 +27,27 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-KEEPER = Path(__file__).with_name("_keeper.py")
-
 ROOT = Path(__file__).resolve().parents[1]
-"""What holds this package, and those that were installed with it."""
+"""Folder that holds this package, and those that were installed with it."""
 
 GRACE_S = 1.0
-"""Between asking a program to stop and stopping it."""
+"""Time from asking a program to stop to killing it."""
 
-LOOK_S = 0.5
-"""Between two looks of a pool's process for the one that started it."""
+MAX_WAIT_S = 2.0
+"""Time that killed processes get to be gone."""
+
+POLL_S, WATCH_S = 0.01, 0.5
+"""Time between two looks at killed processes, and at the parent of a pool."""
+
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
+"""Options of prctl(2)."""
 
 
 class Program(AbstractContextManager["Program"]):
     """A running program, which ends with this process and takes with it all that it has started.
 
-    It leads a session of its own, so that what a terminal tells this process does not reach it. As
-    a context it is ended on leaving; otherwise when nothing refers to it any more.
+    It leads a session of its own, so that signals of a terminal do not reach it. A context manager
+    ends it on leaving; otherwise it ends when nothing refers to it any more.
 
     Parameters
     ----------
@@ -49,8 +59,8 @@ class Program(AbstractContextManager["Program"]):
     Attributes
     ----------
     process : subprocess.Popen
-        Of the keeper: the streams are the program's, and it ends as the program does, with the
-        same exit status or signal.
+        The supervisor. Its streams are the program's, and it ends with the program's exit status
+        or signal.
     pid : int
         Number of the program, and of its session and group.
 
@@ -62,38 +72,32 @@ class Program(AbstractContextManager["Program"]):
 
     def __init__(self, command: Sequence[str], **options: Any) -> None:
         self._lifeline, other = socket.socketpair()
+        supervisor = [sys.executable, "-I", "-S", __file__, str(other.fileno())]
         try:
             with other:
-                keeper = [sys.executable, "-I", "-S", str(KEEPER), str(other.fileno())]
                 self.process: subprocess.Popen[Any] = subprocess.Popen(
-                    [*keeper, str(GRACE_S), *command],
+                    [*supervisor, *command],
                     pass_fds=(other.fileno(),),
                     start_new_session=True,
                     **options,
                 )
-            self.pid = self._begun(command[0])
         except BaseException:
             self._lifeline.close()
             raise
-
-    def _begun(self, program: str) -> int:
-        """The program's number, once it runs."""
         try:
-            said = self._lifeline.recv(64).split()
+            failure, self.pid = map(int, self._lifeline.recv(64).split() or (0, 0))
+            if failure or not self.pid:
+                why = os.strerror(failure) if failure else "it was killed"
+                raise OSError(failure, why, command[0])
         except BaseException:
             self.close()
             raise
-        failure, pid = (int(word) for word in said or (b"0", b"0"))
-        if failure or not pid:
-            self.close()
-            raise OSError(failure, os.strerror(failure) if failure else "it was killed", program)
-        return pid
 
     def end(self) -> None:
         """Ask for the program's end, without waiting for it; from any thread."""
         with suppress(OSError):  # it has ended
             self._lifeline.shutdown(socket.SHUT_WR)
-            # A keeper that was stopped does not notice.
+            # A supervisor that was stopped does not notice.
             self.process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
@@ -206,7 +210,86 @@ def _watch(parent: int) -> None:
 
     def look() -> None:
         while os.getppid() == parent:
-            time.sleep(LOOK_S)
+            time.sleep(WATCH_S)
         os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=look, daemon=True).start()
+
+
+def _supervise(lifeline: int, command: list[str]) -> None:
+    """Run a program to its end or that of the lifeline; end with its exit status or signal."""
+    supervisor = os.getpid()
+    os.set_inheritable(lifeline, False)
+    _prctl(PR_SET_CHILD_SUBREAPER, 1)
+
+    def end_with_supervisor() -> None:
+        _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != supervisor:  # it died before
+            os._exit(1)
+
+    try:
+        program = subprocess.Popen(command, start_new_session=True, preexec_fn=end_with_supervisor)
+    except OSError as error:
+        os.write(lifeline, f"{error.errno} 0".encode())
+        os._exit(127)
+    with suppress(OSError):
+        os.write(lifeline, f"0 {program.pid}".encode())
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nothing, stream)
+    # A signal to the supervisor is meant for the program.
+    for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(which, lambda number, _: _signal(-program.pid, number))
+
+    def end_with_lifeline() -> None:
+        os.read(lifeline, 1)
+        _signal(-program.pid, signal.SIGTERM)
+        time.sleep(GRACE_S)
+        _signal(-program.pid, signal.SIGKILL)
+
+    threading.Thread(target=end_with_lifeline, daemon=True).start()
+    status = program.wait()
+    _kill_descendants(program.pid)
+    if status < 0:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if status != -signal.SIGKILL:
+            signal.signal(-status, signal.SIG_DFL)
+        os.kill(supervisor, -status)
+    os._exit(status)
+
+
+def _kill_descendants(group: int) -> None:
+    """Kill a program's group and the orphans that this process has adopted."""
+    until = time.monotonic() + MAX_WAIT_S
+    children = [0]
+    while children and time.monotonic() < until:
+        children = _children()
+        for target in (-group, *children):
+            _signal(target, signal.SIGKILL)
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        time.sleep(POLL_S if children else 0)
+
+
+def _children() -> list[int]:
+    """Processes whose parent this is, where the system lists them."""
+    with suppress(OSError):
+        return [int(n) for n in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()]
+    return []
+
+
+def _prctl(option: int, value: int) -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+
+
+def _signal(target: int, which: int) -> None:
+    """Signal a process, or the group that a negative number names, if it exists."""
+    # macOS refuses if all of a group has ended and waits to be collected.
+    with suppress(ProcessLookupError, PermissionError):
+        os.kill(target, which)
+
+
+if __name__ == "__main__":
+    _supervise(int(sys.argv[1]), sys.argv[2:])

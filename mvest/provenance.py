@@ -63,7 +63,7 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
         ``platform``, ``machine`` and ``cpu_count``.
     """
     return {
-        "git": git_state(directory if directory is not None else Path(__file__).resolve().parent),
+        "git": git_state(directory or Path(__file__).resolve().parent),
         "versions": {name: _version(name) for name in KEY_PACKAGES},
         "threads": {name: os.environ.get(name) for name in THREAD_VARIABLES},
         "python": platform.python_version(),
@@ -76,18 +76,12 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
 def git_state(directory: Path) -> dict[str, Any]:
     """Commit checked out in a folder, and whether its tracked files differ from it.
 
-    Parameters
-    ----------
-    directory : Path
-        Any folder of a checkout.
-
     Returns
     -------
     dict
-        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside
-        ``results/`` was changed); both
-        None outside a checkout, in a folder of which it tracks nothing, before the first commit,
-        or where git is not installed.
+        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside ``results/``
+        was changed). Both are None outside a checkout, in a folder of which it tracks nothing,
+        before the first commit, or without git.
     """
     sha = _git(directory, "rev-parse", "--verify", "HEAD")
     # Packages that are installed within somebody's checkout are no part of it.
@@ -100,17 +94,13 @@ def git_state(directory: Path) -> dict[str, Any]:
 
 
 def _git(directory: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(directory), *arguments]
     try:
-        finished = subprocess.run(
-            ["git", "-C", str(directory), *arguments],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=30,
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=30
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return None
-    return finished.stdout.strip() if finished.returncode == 0 else None
 
 
 def _version(name: str) -> str | None:
@@ -121,68 +111,44 @@ def _version(name: str) -> str | None:
 
 
 def canonical_json(value: Any) -> str:
-    """One and the same text for equal data, whatever the order of its keys.
+    """The same text for equal data, whatever the order of its keys: JSON with sorted keys, ASCII.
 
     Tuples, NumPy arrays and NumPy scalars are written as their plain counterparts, paths as text.
-    Numbers are kept apart by type, as they are in JSON: 1 and 1.0 give different texts.
-
-    Parameters
-    ----------
-    value : object
-        Nested mappings with text keys, sequences, arrays, numbers, text, booleans and None.
-
-    Returns
-    -------
-    str
-        JSON without spaces, keys sorted, ASCII only.
+    1 and 1.0 give different texts, as in JSON.
 
     Raises
     ------
     InputError
-        If something in it has no JSON form, NaN and infinities included.
+        Something in it has no JSON form, NaN and infinities included.
     """
-    return json.dumps(
-        _plain(value, "value"), sort_keys=True, separators=(",", ":"), allow_nan=False
-    )
+    plain = _plain(value, "value")
+    return json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """SHA-256 (64 hexadecimal digits) of the canonical JSON of a configuration.
-
-    Raises
-    ------
-    InputError
-        If the configuration holds something without a JSON form.
-    """
+    """SHA-256 (64 hexadecimal digits) of the `canonical_json` of a configuration."""
     return hashlib.sha256(canonical_json(config).encode("ascii")).hexdigest()
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write data as JSON, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        The file to write or replace; its folder must exist.
-    value : object
-        As for `canonical_json`; here the keys keep their order.
+    """Write data as JSON, whole or not at all; keys keep their order, otherwise `canonical_json`.
 
     Raises
     ------
     InputError
-        If the data has no JSON form, or the file cannot be written.
+        The data has no JSON form, or the file cannot be written.
     """
     text = json.dumps(_plain(value, "value"), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     write_atomically(path, text, sync=True)
 
 
 def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data with a digest of their content, which `require_sealed` checks when they are read.
+    """Plain data with a digest of their content, which `require_sealed` checks on reading.
 
     Raises
     ------
     InputError
-        If the data has no JSON form.
+        The data has no JSON form.
     """
     plain = _plain(value, "value")
     return {"sha256": _sealing(plain), **{k: v for k, v in plain.items() if k != "sha256"}}
@@ -194,14 +160,14 @@ def require_sealed(data: Mapping[str, Any], where: str) -> None:
     Raises
     ------
     InputError
-        If their digest is missing or that of others.
+        Their digest is missing or does not match.
     """
     if data.get("sha256") != _sealing(data):
         raise InputError(f"{where}: its content is not what was written (SHA-256 does not match)")
 
 
 def _sealing(data: Mapping[str, Any]) -> str:
-    """Of data that are plain already, as they are written: what has no UTF-8 is a ? there."""
+    """Digest of plain data as they are written: with a ? for what has no UTF-8."""
     content = {key: value for key, value in data.items() if key != "sha256"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode(errors="replace")).hexdigest()

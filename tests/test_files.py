@@ -21,6 +21,8 @@ def test_text_bytes_and_what_a_function_writes_take_the_name(tmp_path, content, 
     assert write_atomically(str(path), content, sync=sync) == path
     assert path.read_bytes() == b"\xc3\xa5b\n"
     assert list(tmp_path.iterdir()) == [path]
+    (tmp_path / "other").touch()
+    assert path.stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
 def test_a_function_is_given_a_hidden_name_with_the_same_ending_beside_the_file(tmp_path):

@@ -15,7 +15,6 @@ from tests.places import ROOT
 from tests.processes import alive, gone, linux, until
 
 MAY_START = {
-    "mvest/_keeper.py",
     "mvest/processes.py",
     # Questions that are answered or given up within seconds, and compute nothing.
     "mvest/provenance.py",
@@ -79,7 +78,7 @@ def test_what_cannot_be_started_is_an_error(tmp_path):
         run([str(tmp_path / "plain")])
 
 
-def test_a_signal_to_the_keeper_reaches_the_program():
+def test_a_signal_to_the_supervisor_reaches_the_program():
     with Program(["/bin/sleep", "60"]) as program:
         program.process.terminate()
         assert program.process.wait(30) == -signal.SIGTERM
@@ -118,7 +117,7 @@ def test_a_kill_of_the_parent_ends_a_program_that_does_not_listen(tmp_path, how)
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     try:
-        # Parent, keeper, shell and three.
+        # Parent, supervisor, shell and three.
         until(lambda: len(alive(tmp_path)) == 6 and (tmp_path / "up").exists())
     finally:
         parent.kill()
@@ -127,7 +126,7 @@ def test_a_kill_of_the_parent_ends_a_program_that_does_not_listen(tmp_path, how)
 
 
 @linux
-def test_a_program_ends_with_a_keeper_that_is_killed(tmp_path):
+def test_a_program_ends_with_a_supervisor_that_is_killed(tmp_path):
     with Program(["/bin/sleep", "300"], cwd=tmp_path) as program:
         os.kill(program.process.pid, signal.SIGKILL)
         assert gone(tmp_path)

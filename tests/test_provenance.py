@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import stat
 import subprocess
 from pathlib import Path
 
@@ -147,45 +146,12 @@ def test_a_written_file_reads_back_and_replaces_the_old_one(tmp_path: Path) -> N
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.json"]
 
 
-def test_a_written_file_has_the_permissions_of_any_other(tmp_path: Path) -> None:
-    write_json(tmp_path / "result.json", {})
-    (tmp_path / "other.json").write_text("{}")
-    modes = {
-        stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("result.json", "other.json")
-    }
-    assert len(modes) == 1
-
-
-def test_an_interruption_leaves_the_old_file_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "result.json"
-    write_json(path, {"run": 1})
-
-    def interrupt(descriptor: int) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        write_json(path, {"run": 2})
-    assert json.loads(path.read_text()) == {"run": 1}
-    assert [entry.name for entry in tmp_path.iterdir()] == ["result.json"]
-
-
 def test_data_without_a_json_form_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     write_json(path, {"run": 1})
     with pytest.raises(InputError, match="nan"):
         write_json(path, {"run": float("nan")})
     assert json.loads(path.read_text()) == {"run": 1}
-
-
-def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot write .*absent/result\.json.*folder must exist"):
-        write_json(tmp_path / "absent" / "result.json", {})
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(InputError, match=r"cannot write .*taken"):
-        write_json(tmp_path / "taken", {})
 
 
 def test_sealed_data_are_known_again_and_every_change_is_seen(tmp_path: Path) -> None:

@@ -23,9 +23,9 @@ from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples
-from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence
+from mvest.cases.folder import write_case
+from mvest.cases.from_images.build import CaseFrames, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
-from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe
@@ -234,7 +234,10 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
     }
     for name, (sequence, what, errors) in better.items():
         about = f"{patient.description}, {what}"
-        texts = CaseTexts(patient.name, about, "simulated", "MIT", simulated=True)
+        texts = {
+            "name": patient.name, "description": about, "source": "simulated", "licence": "MIT",
+            "simulated": True,
+        }  # fmt: skip
         case = case_of_sequence(sequence, frames, texts, error_samples=errors)
         write_case(place / HIDDEN / name, case)
     write_json(

@@ -35,6 +35,7 @@ from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
+from mvest.cases.folder import write_case
 from mvest.cases.frames import MM_PER
 from mvest.cases.plausibility import free_orifice
 from mvest.cases.tissue import (
@@ -43,7 +44,6 @@ from mvest.cases.tissue import (
     assumed_closure,
     lay_out_chordae,
 )
-from mvest.cases.writer import write_case
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, run_gate
 from mvest.errors import ConfigurationError, InputError

@@ -22,8 +22,7 @@ from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Number, Record
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.problem.skill import prior_alone

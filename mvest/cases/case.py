@@ -7,8 +7,11 @@ written by a simulation; nothing in it says what the moduli are. All lengths are
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
+from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -22,7 +25,7 @@ LARGEST_ERROR = 20.0
 """mm, displacement of a point in any sample."""
 
 
-class Role(Enum):
+class Role(StrEnum):
     """What a frame is for.
 
     ``REFERENCE`` is the open frame from which the model's geometry is taken; ``CLOSED`` the closed
@@ -77,6 +80,45 @@ class Frame:
     free_edge: FloatArray
     papillary_tips: FloatArray
     corresponds: bool
+
+
+def check_different(
+    field: str, names: Sequence[str], wrong: Callable[[str, str], InputError]
+) -> None:
+    """Raise ``wrong(field, what)`` unless names differ by more than case, spaces and NFKC form."""
+    seen: dict[str, str] = {}
+    for name in names:
+        key = " ".join(normalize("NFKC", name).casefold().split())
+        if key in seen:
+            alike = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
+            raise wrong(field, f"the name {name!r} {alike}; expected different names")
+        seen[key] = name
+
+
+def check_frames(frames: Sequence[Any], wrong: Callable[[str, str], InputError]) -> None:
+    """Raise ``wrong(field, what)`` unless names, times, roles and tips of frames go together.
+
+    ``frames`` are of a case or of its file (`mvest.cases.schema.FrameEntry`).
+    """
+    names = [frame.name for frame in frames]
+    check_different("frames", names, wrong)
+    tips = len(frames[0].papillary_tips)
+    for number, (a, b) in enumerate(itertools.pairwise(frames), start=1):
+        if b.time <= a.time:
+            what = f"{b.time:g} of {b.name!r} is not after {a.time:g} of {a.name!r}"
+            raise wrong(f"frames.{number}.time", f"{what}; put the frames in the order of time")
+        if len(b.papillary_tips) != tips:
+            raise wrong(
+                f"frames.{number}.papillary_tips",
+                f"{len(b.papillary_tips)} tips, but {tips} in frame {names[0]!r}; expected the "
+                "same tips in the same order in all frames",
+            )
+    for role in (Role.REFERENCE, Role.CLOSED)[: len(frames)]:
+        members = [frame.name for frame in frames if frame.role == role]
+        if len(members) != 1:
+            listed = ", ".join(members) or "none"
+            what = f"{len(members)} frames have the role {role} ({listed}), expected exactly one"
+            raise wrong("frames", what)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,58 +260,39 @@ class ValveCase:
     chordae_follow: bool = False
 
     def __post_init__(self) -> None:
-        for role in (Role.REFERENCE, Role.CLOSED)[: len(self.frames)]:
-            members = [frame.name for frame in self.frames if frame.role is role]
-            if len(members) != 1:
-                raise InputError(
-                    f"case {self.name}: {len(members)} frames with the role {role.value} "
-                    f"({', '.join(members) or 'none'}), expected one"
-                )
-        names = [frame.name for frame in self.frames]
-        if len(set(names)) != len(names):
-            raise InputError(f"case {self.name}: frame names {names} are not all different")
-        times = [frame.time for frame in self.frames]
-        if any(b <= a for a, b in itertools.pairwise(times)):
-            raise InputError(f"case {self.name}: frame times {times} s do not increase")
+        check_frames(self.frames, self._wrong)
         self._check_uncertainty()
 
+    def _wrong(self, field: str, what: str) -> InputError:
+        return InputError(f"case {self.name}: {field}: {what}")
+
     def _check_uncertainty(self) -> None:
-        n, std = len(self.surface.vertices), self.uncertainty.std_mm
+        n, std, samples = len(self.surface.vertices), self.uncertainty.std_mm, self.error_samples
         if isinstance(std, np.ndarray):
             if std.shape != (n,):
-                raise InputError(
-                    f"case {self.name}: observation std_mm of {len(std)} vertices, expected {n}"
-                )
+                raise self._wrong("observation", f"std_mm of {len(std)} vertices, expected {n}")
             if self.closed is not None and not self.closed.corresponds:
-                raise InputError(
-                    f"case {self.name}: observation std_mm of each vertex, but the vertices of the "
-                    "closed frame do not correspond; expected one number"
-                )
-        samples = self.error_samples
+                what = "std_mm of each vertex, but the vertices of the closed frame do not "
+                raise self._wrong("observation", f"{what}correspond; expected one number")
         if samples is None:
             return
         f, t = len(self.frames), len(self.frame(Role.REFERENCE).papillary_tips)
         names = self.surface.region_names
         if self.chordae_follow and (len(names) != 2 or "anterior" not in names or t != 2):
-            raise InputError(
-                f"case {self.name}: chordae that follow error samples need two regions, one of "
-                f"them anterior, and two papillary tips (here: {', '.join(names)}; {t} tips)"
-            )
-        for name, given, wanted in (
-            ("vertices", samples.vertices.shape[1:3], (f, n)),
-            ("tips", samples.tips.shape[1:3], (f, t)),
-        ):
-            if given != wanted:
-                raise InputError(
-                    f"case {self.name}: error samples, {name} of {given[0]} frames of {given[1]} "
-                    f"points, expected {wanted[0]} of {wanted[1]}"
-                )
+            what = "following error samples needs two regions, one of them anterior, and two "
+            found = f"papillary tips (here: {', '.join(names)}; {t} tips)"
+            raise self._wrong("chordae", what + found)
+        for name, count in (("vertices", n), ("tips", t)):
+            given = getattr(samples, name).shape[1:3]
+            if given != (f, count):
+                what = f"{name} of {given[0]} frames of {given[1]} points, expected {f} of {count}"
+                raise self._wrong("error samples", what)
         strange = [frame.name for frame in self.frames if not frame.corresponds]
         if strange:
-            raise InputError(
-                f"case {self.name}: error samples, but the vertices of frame {strange[0]!r} do not "
-                "correspond; expected frames that all do"
+            what = (
+                f"the vertices of frame {strange[0]!r} do not correspond; expected frames that do"
             )
+            raise self._wrong("error samples", what)
 
     def __str__(self) -> str:
         regions = ", ".join(self.surface.region_names)
@@ -277,14 +300,13 @@ class ValveCase:
             f"{frame.name} ({frame.role.value.replace('_', ' ')}, {frame.pressure_mmHg:.3g} mmHg)"
             for frame in self.frames
         )
-        doubt = self.uncertainty
-        length = doubt.correlation_length_mm
+        seen, length = self.uncertainty, self.uncertainty.correlation_length_mm
         return (
             f"case {self.name}{' (simulated)' if self.simulated else ''}: {regions}\n"
             f"{len(self.surface.vertices)} vertices, {len(self.chordae)} chordae\n"
             f"frames: {frames}\n"
-            f"seen within {doubt.typical_mm:.3g} mm, "
-            f"{f'alike over {length:g} mm' if length else 'independent'}"
+            f"seen within {seen.typical_mm:.3g} mm, "
+            f"{f'correlated over {length:g} mm' if length else 'independent'}"
             + (f"; {len(self.error_samples)} error samples" if self.error_samples else "")
         )
 

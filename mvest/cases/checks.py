@@ -6,17 +6,12 @@ and the field before them.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-from unicodedata import normalize
-
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist
 
 from mvest.cases.rims import loop_vector_area
-from mvest.cases.schema import CaseFolder
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_checks import check_surface
@@ -30,50 +25,6 @@ LARGEST_THICKNESS = 5.0
 """mm."""
 FARTHEST_TIP = 100.0
 """mm from the centre of the annulus."""
-
-
-def _check_different(folder: CaseFolder, field: str, names: Sequence[str]) -> None:
-    """Raise unless names differ by more than Unicode normal form, case and spaces."""
-    seen: dict[str, str] = {}
-    for name in names:
-        key = " ".join(normalize("NFKC", name).casefold().split())
-        if key in seen:
-            alike = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
-            raise folder.wrong(field, f"the name {name!r} {alike}; expected different names")
-        seen[key] = name
-
-
-def check_names_and_frames(folder: CaseFolder) -> None:
-    """Raise unless the names of regions, and frames' names, times, roles and tips go together."""
-    frames = folder.document.frames
-    names = [frame.name for frame in frames]
-    _check_different(folder, "regions", list(folder.document.region_names().values()))
-    _check_different(folder, "frames", names)
-    for number, (a, b) in enumerate(itertools.pairwise(frames), start=1):
-        if b.time <= a.time:
-            unit = folder.document.units.time
-            raise folder.wrong(
-                f"frames.{number}.time",
-                f"{b.time:g} {unit} of {b.name!r} is not after {a.time:g} {unit} of {a.name!r}; "
-                "put the frames in the order of time",
-            )
-    for role in ("reference", "closed")[: len(frames)]:
-        members = [frame.name for frame in frames if frame.role == role]
-        if len(members) != 1:
-            listed = ", ".join(members) or "none"
-            raise folder.wrong(
-                "frames",
-                f"{len(members)} frames have the role {role} ({listed}), expected exactly one",
-            )
-    count = {len(frame.papillary_tips) for frame in frames}
-    first = len(frames[0].papillary_tips)
-    for number, frame in enumerate(frames):
-        if len(count) > 1 and len(frame.papillary_tips) != first:
-            raise folder.wrong(
-                f"frames.{number}.papillary_tips",
-                f"{len(frame.papillary_tips)} tips, but {first} in frame {names[0]!r}; expected "
-                "the same tips in the same order in all frames",
-            )
 
 
 def check_band(vertices: FloatArray, triangles: IntArray, *, self_intersections: bool) -> None:

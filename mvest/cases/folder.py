@@ -1,4 +1,4 @@
-"""Reading a case from its folder: ``case.yaml`` and the files that it names.
+"""Reading and writing a case as a folder: ``case.yaml`` and the files that it names.
 
 What a field means stands in ``README.md`` beside this module. Every error begins with the file and
 the field it comes from.
@@ -21,15 +21,26 @@ from typing import Any
 
 import numpy as np
 import scipy
+import yaml
 
-from mvest.cases.case import ErrorSamples, Role, Uncertainty, ValveCase
-from mvest.cases.checks import check_closing_pressure, check_names_and_frames
-from mvest.cases.frames import SECONDS_PER, check_reference, place_frame, read_frame
-from mvest.cases.schema import CASE_FILE, CaseFolder, ChordaeEntry, PointData
-from mvest.cases.tissue import point_data, read_chordae, read_leaflets
+from mvest.cases.case import (
+    ErrorSamples,
+    Frame,
+    Role,
+    Uncertainty,
+    ValveCase,
+    check_different,
+    check_frames,
+)
+from mvest.cases.checks import check_closing_pressure
+from mvest.cases.frames import LOOPS, SECONDS_PER, place_frame, read_frame, reference_band
+from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, ChordaeEntry, PointData
+from mvest.cases.tissue import CHORD_COLUMNS, point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
+from mvest.exchange.surfaces import write_surface
+from mvest.files import write_atomically
 from mvest.reading.npz import read_npz
-from mvest.reading.text import one_line, read_numbers
+from mvest.reading.text import one_line, read_numbers, write_columns
 from mvest.typing import FloatArray
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
 from mvest.valve.anatomy.valve import checked_floats
@@ -85,7 +96,7 @@ class PressureCurve:
         if not first <= time <= last:
             raise InputError(
                 f"time {time:g} s lies outside the pressure curve, which runs from {first:g} to "
-                f"{last:g} s"
+                f"{last:g} s; give the pressure of the frame, or a curve that covers its time"
             )
         return float(scipy.interpolate.PchipInterpolator(self.time, self.pressure_mmHg)(time))
 
@@ -136,6 +147,9 @@ def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]
     np.savez_compressed(file, frames=np.array(list(frames)), **arrays)
 
 
+TEXTS = ("name", "description", "source", "licence", "simulated")
+"""Fields that a case and its file have in common."""
+
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
 """Leaflets tracked in echocardiography are about 1 mm off, and smoothly so."""
 
@@ -160,10 +174,11 @@ def read_case(path: Path | str) -> ValveCase:
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
     document, derived = folder.document, folder.derived
-    check_names_and_frames(folder)
+    check_different("regions", list(document.region_names().values()), folder.wrong)
+    check_frames(document.frames, folder.wrong)
     seen = [read_frame(folder, number) for number in range(len(document.frames))]
-    first = next(s for s in seen if s.entry.role == Role.REFERENCE.value)
-    reference = check_reference(folder, first)
+    first = next(s for s in seen if s.entry.role == Role.REFERENCE)
+    reference = reference_band(folder, first)
     pressures = _pressures(folder)
     placed = [place_frame(folder, reference, s, p) for s, p in zip(seen, pressures, strict=True)]
     surface = read_leaflets(folder, reference)
@@ -187,14 +202,10 @@ def read_case(path: Path | str) -> ValveCase:
                 samples = read_error_samples(file, [frame.name for frame in document.frames])
     entry = document.chordae
     case = ValveCase(
-        name=document.name,
-        description=document.description,
-        source=document.source,
-        licence=document.licence,
-        simulated=document.simulated,
+        **{name: getattr(document, name) for name in TEXTS},
         surface=surface,
-        annulus=reference.rims.annulus,
-        free_edge=reference.rims.free_edge,
+        annulus=reference.annulus,
+        free_edge=reference.free_edge,
         frames=tuple(frame for frame, _ in placed),
         chordae=chordae,
         uncertainty=uncertainty,
@@ -227,23 +238,123 @@ def _pressures(folder: CaseFolder) -> list[float]:
             if frame.pressure is not None:
                 pressure = to_mmhg * frame.pressure
             else:
-                pressure = _from_curve(curve, to_seconds * frame.time)
+                pressure = curve(to_seconds * frame.time)
                 if document.pressure_curve is None:
                     folder.derived.append(
                         f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
                         "transmitral curve, whose clock is taken to be that of the frames"
                     )
-            if frame.role != Role.REFERENCE.value:
+            if frame.role != Role.REFERENCE:
                 check_closing_pressure(pressure, unit)
         result.append(pressure)
     return result
 
 
-def _from_curve(curve: PressureCurve, time: float) -> float:
-    try:
-        return curve(time)
-    except InputError as fault:
-        raise InputError(
-            f"not given, and {fault}; give the pressure of this frame or a pressure_curve that "
-            "covers it"
-        ) from fault
+def write_case(folder: Path | str, case: ValveCase) -> Path:
+    """Write a case: ``case.yaml``, one ``.vtp`` per frame, loops and chordae as ``.csv``.
+
+    Everything is given explicitly, in mm, s and mmHg, so that nothing is derived anew on reading.
+    The folder, which must be new or empty, appears under its name only once it is complete; it is
+    returned.
+
+    Raises
+    ------
+    InputError
+        The folder is not empty or cannot be written, or the reference frame is not the surface of
+        the case.
+    """
+    target = require_new(folder)
+    _check_reference(case)
+    return write_atomically(target, lambda part: _write_files(part, case))
+
+
+def require_new(folder: Path | str) -> Path:
+    """The folder, where a case may be written; InputError if it has any content."""
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
+    return target
+
+
+def _check_reference(case: ValveCase) -> None:
+    frame, surface = case.frame(Role.REFERENCE), case.surface
+    own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
+    own |= {name: surface.vertices[getattr(case, name)] for name in LOOPS}
+    for name, wanted in own.items():
+        if not np.array_equal(getattr(frame, name), wanted):
+            raise InputError(
+                f"case {case.name}: {name} of the reference frame {frame.name!r} is not as the "
+                "surface has it"
+            )
+
+
+def _write_files(folder: Path, case: ValveCase) -> None:
+    folder.mkdir()
+    chordae, std = case.chordae, case.uncertainty.std_mm
+    observation: dict[str, Any] = {
+        "std_mm": {"point_data": "std_mm"} if isinstance(std, np.ndarray) else float(std),
+        "correlation_length_mm": float(case.uncertainty.correlation_length_mm),
+    }
+    if case.error_samples is not None:
+        observation["error_samples"] = "errors.npz"
+        names = [frame.name for frame in case.frames]
+        write_error_samples(folder / "errors.npz", case.error_samples, names)
+    document: dict[str, Any] = {
+        "version": VERSION,
+        **{name: getattr(case, name) for name in TEXTS},
+        "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
+        "regions": list(case.surface.region_names),
+        "thickness": {"point_data": "thickness"},
+        "fibre": "fibre",
+        "frames": [_write_frame(folder, case, k, own) for k, own in enumerate(case.frames)],
+        "chordae": {
+            "file": "chordae.csv",
+            "toe_strain": float(chordae.toe_strain),
+            "families": list(chordae.family_names),
+            **({"follow": True} if case.chordae_follow else {}),
+        },
+        "observation": observation,
+        "derived": list(case.derived),
+    }
+    families = [chordae.family_names[k] for k in chordae.family]
+    write_columns(
+        folder / "chordae.csv",
+        CHORD_COLUMNS,
+        zip(
+            chordae.tip.tolist(),
+            *chordae.insertion.T.tolist(),
+            families,
+            chordae.rest_length.tolist(),
+            chordae.axial_stiffness.tolist(),
+            strict=True,
+        ),
+    )
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+    (folder / CASE_FILE).write_text(text, encoding="utf-8")
+
+
+def _write_frame(folder: Path, case: ValveCase, number: int, frame: Frame) -> dict[str, Any]:
+    stem = f"frame_{number:02d}"
+    point_data = {}
+    if frame.role is Role.REFERENCE:
+        point_data = {"fibre": case.surface.fibre, "thickness": case.surface.thickness}
+        if isinstance(case.uncertainty.std_mm, np.ndarray):
+            point_data["std_mm"] = case.uncertainty.std_mm
+    cell_data = {"region": np.asarray(frame.region)}
+    write_surface(folder / f"{stem}.vtp", frame.vertices, frame.triangles, point_data, cell_data)
+    for name in LOOPS:
+        file = folder / f"{stem}_{name}.csv"
+        if frame.role is Role.REFERENCE:
+            write_columns(file, ("vertex",), ([v] for v in getattr(case, name).tolist()))
+        else:
+            write_columns(file, ("x", "y", "z"), getattr(frame, name).tolist())
+    return {
+        "name": frame.name,
+        "time": float(frame.time),
+        "role": frame.role.value,
+        "surface": f"{stem}.vtp",
+        **{name: f"{stem}_{name}.csv" for name in LOOPS},
+        "papillary_tips": np.asarray(frame.papillary_tips, dtype=np.float64).tolist(),
+        "pressure": float(frame.pressure_mmHg),
+        **({} if frame.role is Role.REFERENCE else {"corresponds": bool(frame.corresponds)}),
+    }

@@ -12,7 +12,7 @@ moving a vertex.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,15 +22,8 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import directed_edges
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rims:
-    """The boundary of a band.
-
-    Attributes
-    ----------
-    annulus, free_edge : ndarray
-        Vertices in the order of the loop.
-    """
+class Rims(NamedTuple):
+    """The two boundary loops of a band, as vertices in the order of the loop."""
 
     annulus: IntArray
     free_edge: IntArray
@@ -62,32 +55,28 @@ def find_rims(
         is the wider one, as if the tips lay on the atrial side.
     """
     loops = two_loops(vertices, triangles)
-    given = {"annulus": annulus, "free_edge": free_edge}
-    place = {
-        name: _which(name, wanted, loops) for name, wanted in given.items() if wanted is not None
-    }
-    if len(place) == 2 and place["annulus"] == place["free_edge"]:
-        raise GeometryError("annulus and free_edge are the same boundary loop; expected both loops")
-    if not place:
+    if annulus is None and free_edge is None:
         distance = [
             np.linalg.norm(vertices[loop][:, None] - tips, axis=2).min(axis=1).mean()
             for loop in loops
         ]
-        place["free_edge"] = int(np.argmin(distance))
+        near = int(np.argmin(distance))
         area = [np.linalg.norm(loop_vector_area(vertices[loop])) for loop in loops]
-        if area[place["free_edge"]] > area[1 - place["free_edge"]]:
-            near = place["free_edge"]
+        if area[near] > area[1 - near]:
             raise GeometryError(
                 f"the papillary tips are nearest to the wider edge of the surface (which encloses "
                 f"{area[near]:.0f} mm^2, the other {area[1 - near]:.0f} mm^2), so they seem to lie "
                 f"above the annulus, on the atrial side; correct papillary_tips, or name the "
                 f"annulus if this is right"
             )
-    if "annulus" not in place:
-        place["annulus"] = 1 - place["free_edge"]
+        return Rims(loops[1 - near], loops[near])
+    outer = None if annulus is None else _which("annulus", annulus, loops)
+    inner = None if free_edge is None else _which("free_edge", free_edge, loops)
+    if outer == inner:
+        raise GeometryError("annulus and free_edge are the same boundary loop; expected both loops")
     return Rims(
-        loops[place["annulus"]] if annulus is None else annulus,
-        loops[1 - place["annulus"]] if free_edge is None else free_edge,
+        loops[1 - inner] if annulus is None and inner is not None else np.asarray(annulus),
+        loops[1 - outer] if free_edge is None and outer is not None else np.asarray(free_edge),
     )
 
 
@@ -127,20 +116,21 @@ def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
 
 def _which(name: str, wanted: IntArray, loops: list[IntArray]) -> int:
     """Number of the boundary loop that a list of vertices runs along, in either direction."""
+
+    def edges(loop: IntArray) -> set[frozenset[int]]:
+        pairs = np.stack([loop, np.roll(loop, -1)], axis=1)
+        return set(map(frozenset, pairs.tolist()))
+
     for number, loop in enumerate(loops):
-        if set(loop.tolist()) == set(wanted.tolist()):
-            turned = np.roll(loop, -int(np.flatnonzero(loop == wanted[0])[0]))
-            if len(wanted) == len(loop) and (
-                np.array_equal(wanted, turned) or np.array_equal(wanted, np.roll(turned[::-1], 1))
-            ):
+        if len(wanted) == len(loop) and set(wanted.tolist()) == set(loop.tolist()):
+            if edges(wanted) == edges(loop):
                 return number
             raise GeometryError(
                 f"{name}: its vertices are those of a boundary loop, but not in the order of the "
                 "loop; sort them so that neighbours share an edge"
             )
     best = max(loops, key=lambda loop: np.isin(loop, wanted).sum())
-    missing = np.setdiff1d(best, wanted)
-    extra = np.setdiff1d(wanted, best)
+    missing, extra = np.setdiff1d(best, wanted), np.setdiff1d(wanted, best)
     raise GeometryError(
         f"{name} is not closed: its {len(wanted)} vertices are not one of the boundary loops "
         f"({', '.join(str(len(loop)) for loop in loops)} vertices); of the nearest it misses "

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
+from mvest.cases.case import Role
 from mvest.errors import InputError
 from mvest.reading.documents import read_yaml
 from mvest.reading.text import MAX_NUMBER, one_line
@@ -33,8 +34,6 @@ def _kind(value: Any) -> str:
     """Which alternative of a field a value belongs to; no key of a file holds the character NUL."""
     if isinstance(value, dict):
         return "\0point data" if "point_data" in value else "\0mapping"
-    if isinstance(value, BaseModel):
-        return "\0point data" if isinstance(value, PointData) else "\0mapping"
     if isinstance(value, list):
         return "\0list"
     return "\0text" if isinstance(value, str) else "\0number"
@@ -93,7 +92,7 @@ class FrameEntry(_Model):
 
     name: Name = Field(description="text, different for every frame")
     time: Number = Field(description="a number in units.time, larger than that of the frame before")
-    role: Literal["reference", "closed", "fitted", "held_out"] = Field(
+    role: Role = Field(
         description="reference (open; the model starts from it), closed (fitted), fitted (a "
         "further closed frame, under another pressure, fitted with it) or held_out"
     )
@@ -242,24 +241,26 @@ def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, st
     return field, f"found {found}; expected {expected}"
 
 
+PARTS: Mapping[str | int, type[BaseModel]] = {
+    "units": Units,
+    "thickness": PointData,
+    "frames": FrameEntry,
+    "chordae": ChordaeEntry,
+    "observation": ObservationEntry,
+    "std_mm": PointData,
+}
+"""The models of fields."""
+
+
 def _place(path: Sequence[int | str]) -> tuple[type[BaseModel], str]:
     """The model that a path leads to (or through last), and the description of its last field."""
     model: type[BaseModel] = CaseFile
     description = "a mapping of fields"
     for part in path:
-        if isinstance(part, str) and part in model.model_fields:
-            info = model.model_fields[part]
-            description = info.description or description
-            model = _model_in(info.annotation) or model
+        if part in model.model_fields:
+            description = model.model_fields[str(part)].description or description
+            model = PARTS.get(part, model)
     return model, description
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """The model that a field holds, by itself, in a list, or as one of several alternatives."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    models = (_model_in(part) for part in get_args(annotation))
-    return next((model for model in models if model is not None), None)
 
 
 CASE_FILE = "case.yaml"

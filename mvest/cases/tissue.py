@@ -20,8 +20,8 @@ import numpy as np
 
 from mvest.cases.case import Frame, Role
 from mvest.cases.checks import check_thickness
-from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
-from mvest.cases.rims import Rims, arc_shares, commissures, directed, loop_vector_area
+from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
+from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
 from mvest.cases.schema import CaseFolder, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns
@@ -52,7 +52,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 1.002 (SD 0.03, marginal) and 0.966 (0.013, basal) times as long in sixteen simulated valves."""
 
 
-def read_leaflets(folder: CaseFolder, reference: ReferenceFrame) -> LeafletSurface:
+def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
     """The midsurface of the reference frame; what was not given is added to ``derived``."""
     seen, names = reference.seen, tuple(folder.document.region_names().values())
     n = len(seen.vertices)
@@ -87,16 +87,15 @@ def _thickness(
     return np.array([by_name[name] for name in names])[vertex_region]
 
 
-def _fibre(folder: CaseFolder, reference: ReferenceFrame) -> FloatArray:
-    seen, rims = reference.seen, reference.rims
+def _fibre(folder: CaseFolder, reference: CheckedFrame) -> FloatArray:
+    seen = reference.seen
     if folder.document.fibre is not None:
         return point_data(seen, folder.document.fibre, 3)
     folder.derived.append(
         "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
     )
-    return surface_coordinates(
-        seen.vertices, seen.triangles, rims.annulus, rims.free_edge
-    ).circumferential
+    loops = reference.annulus, reference.free_edge
+    return surface_coordinates(seen.vertices, seen.triangles, *loops).circumferential
 
 
 def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
@@ -119,7 +118,7 @@ def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
 
 
 def read_chordae(
-    folder: CaseFolder, reference: ReferenceFrame, placed: list[tuple[Frame, Rims]]
+    folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
     """The chordae of the table, or those laid out; then this is added to ``derived``."""
     given = folder.document.chordae
@@ -157,7 +156,7 @@ def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
 
 
 def _laid_out(
-    folder: CaseFolder, reference: ReferenceFrame, placed: list[tuple[Frame, Rims]]
+    folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
     names = list(folder.document.region_names().values())
     seen = reference.seen
@@ -167,13 +166,13 @@ def _laid_out(
             f"two papillary tips (here: {', '.join(names)}; {len(seen.tips)} tips)"
         )
 
-    def band(x: FloatArray, triangles: IntArray, region: IntArray, rims: Rims) -> LeafletBand:
-        loops = rims.annulus, rims.free_edge
-        return LeafletBand.of(x, triangles, region, *loops, names.index("anterior"))
+    def coordinates(band: CheckedFrame) -> LeafletBand:
+        loops = band.annulus, band.free_edge
+        return LeafletBand.of(*band.labelled, *loops, names.index("anterior"))
 
-    opened = band(seen.vertices, seen.triangles, reference.region, reference.rims)
+    opened = coordinates(reference)
     seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
-    closed, rims = seen_closed[0] if seen_closed else placed[0]
+    closed, band = seen_closed[0] if seen_closed else placed[0]
     goal: LeafletBand | FloatArray
     if not seen_closed:
         how = (
@@ -185,7 +184,7 @@ def _laid_out(
         how, goal = "the closed frame (through its vertices)", closed.vertices
     else:
         how = "the closed frame (through the same material coordinates in it)"
-        goal = band(closed.vertices, closed.triangles, closed.region, rims)
+        goal = coordinates(band)
     layout = SEEN_ON_BAND if seen_closed else ChordLayout()
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(
@@ -211,7 +210,7 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeafletBand:
-    """A two-leaflet surface whose points can be found by the template's coordinates.
+    """A two-leaflet surface whose points are found by the template's coordinates.
 
     Attributes
     ----------
@@ -238,16 +237,7 @@ class LeafletBand:
         free_edge: IntArray,
         anterior: int,
     ) -> LeafletBand:
-        """Solve for the coordinates of a band.
-
-        Parameters
-        ----------
-        vertices, triangles, region
-            ``(n, 3)`` mm, ``(m, 3)`` and ``(m,)``.
-        annulus, free_edge
-            The two boundary loops.
-        anterior
-            Which region is the anterior leaflet.
+        """Solve for the coordinates of a band, ``anterior`` being the number of that leaflet.
 
         Raises
         ------
@@ -275,8 +265,7 @@ class LeafletBand:
 
     def position(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Positions ``(k, 3)`` mm of points at phi (degrees) and s."""
-        corners, weights = self.locate(phi, s)
-        return _weighted(self.vertices, corners, weights)
+        return _weighted(self.vertices, *self.locate(phi, s))
 
 
 def _angle_table(
@@ -310,27 +299,13 @@ def assumed_closure(
     tips: FloatArray,
     closed_depth: float = CLOSED_DEPTH,
 ) -> FloatArray:
-    """Where the vertices of a valve may be once it is closed, if only its open shape is known.
+    """Assumed positions ``(n, 3)`` mm of the vertices in the closed valve, from its open shape.
 
     The free edges of the two leaflets meet half-way between where they are, point by point of equal
     share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
-    follow in proportion to their coordinate s. It is not how the valve closes, but says how long
-    chordae must be to let it.
-
-    Parameters
-    ----------
-    open_valve
-    annulus
-        ``(k, 3)`` mm, in loop order.
-    tips
-        ``(t, 3)`` mm, on the side of the ventricle.
-    closed_depth
-        Of the free edge below the annulus, closed over open.
-
-    Returns
-    -------
-    ndarray
-        ``(n, 3)`` mm.
+    follow in proportion to their coordinate s. The valve does not close like this, but the shape
+    says how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the tips
+    ``(t, 3)`` mm are on the side of the ventricle.
     """
     phi, theta = open_valve.edge_angle
     here, there = (open_valve.position(turn, np.ones(len(phi))) for turn in (phi, 360.0 - phi))
@@ -353,9 +328,9 @@ def lay_out_chordae(
 ) -> Chordae:
     """Place the chordae of a layout on a valve.
 
-    Every insertion belongs to the nearer of the two tips in the reference frame. As in the
-    template, a chord is as long as ``slack`` times its distance in the closed frame, and at least
-    ``open_slack`` times its distance in the open one.
+    Every chord starts at the nearer of the two tips in the reference frame. As in the template, it
+    is as long as ``slack`` times its distance in the closed frame, and at least ``open_slack``
+    times its distance in the open one.
 
     Parameters
     ----------
@@ -364,11 +339,11 @@ def lay_out_chordae(
     open_tips, closed_tips
         ``(2, 3)`` mm.
     closed_valve
-        The closed frame: ``(n, 3)`` mm, where the vertices of the reference are in it, or a valve
-        with coordinates of its own if its vertices do not correspond.
+        The closed frame: ``(n, 3)`` mm, positions of the reference's vertices, or a valve with
+        coordinates of its own if its vertices do not correspond.
     layout
-        The template's for a closed frame that is intended (`assumed_closure`), and for one that was
-        seen `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are of that kind.
+        The template's for an intended closed frame (`assumed_closure`); for one that was seen
+        `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are of that kind.
 
     Raises
     ------
@@ -383,7 +358,7 @@ def lay_out_chordae(
     if isinstance(closed_valve, np.ndarray):
         closed = _weighted(closed_valve, corners, weights)
     else:
-        closed = _weighted(closed_valve.vertices, *closed_valve.locate(phi, s))
+        closed = closed_valve.position(phi, s)
     reach = np.linalg.norm(insertion[:, None] - open_tips, axis=2)
     tip = np.argmin(reach, axis=1)
     slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)

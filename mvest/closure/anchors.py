@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from mvest.cache import Entry, prune
 from mvest.errors import InputError
-from mvest.kept import Entry, prune
 from mvest.mechanics.parameters import Parameter, is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.reading.npz import read_npz
@@ -148,7 +148,7 @@ class Anchors:
         ----------
         key : str
             Of all that decides the state but its parameters, by :func:`content_digest`, and of the
-            code, by :func:`mvest.source.source_key`.
+            code, by :func:`mvest.cache.source_key`.
         place : (p,)
             Whole numbers, the point over the spacing.
         make : callable

@@ -13,6 +13,7 @@ from itertools import accumulate
 
 import numpy as np
 
+from mvest.cache import source_key
 from mvest.closure.anchors import NOT_FOUND, Anchors, Coordinates, Kept, content_digest
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.estimation.prediction import Prediction
@@ -30,7 +31,6 @@ from mvest.mechanics.valve_system import (
     held_loading,
     retune,
 )
-from mvest.source import source_key
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed

@@ -1,7 +1,7 @@
 """What studies make on their way and share: simulations, cycles, virtual patients, samples.
 
 All of it is kept by one rule. An entry is named by what it was made from and by the code that made
-it (:mod:`mvest.source`), is made once, and appears whole or not at all.
+it (:mod:`mvest.cache`), is made once, and appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mvest.cache import Counts, Entry, source_key
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
-from mvest.kept import Counts, Entry
 from mvest.provenance import config_hash
 from mvest.reading.npz import read_npz
-from mvest.source import source_key
 from mvest.typing import FloatArray
 
 T = TypeVar("T")

@@ -19,9 +19,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.folder import read_case
+from mvest.cases.folder import read_case, write_case
 from mvest.cases.schema import CASE_FILE
-from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart

@@ -7,10 +7,9 @@ import pytest
 
 from experiments.run import main
 from mvest.cases.case import Role
-from mvest.cases.folder import read_case
+from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import doubts
 from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
-from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template
@@ -42,7 +41,7 @@ def test_the_closed_frame_is_asked_for_in_one_line(anatomy):
         anatomy.frame(Role.CLOSED)
     assert "\n" not in str(raised.value)
     held = replace(template_case(40, 12).frames[1], time=0.5)
-    with pytest.raises(InputError, match="0 frames with the role closed"):
+    with pytest.raises(InputError, match="0 frames have the role closed"):
         replace(anatomy, frames=(*anatomy.frames, held))
 
 

@@ -197,18 +197,6 @@ def torn(x, t, r):
     return np.vstack([x, x])[used], t.reshape(-1, 3), r
 
 
-def short_data(folder, document):
-    """A file whose labels are fewer than its triangles."""
-    text = (folder / "open.vtp").read_text()
-    short = text.replace('Name="region"', 'Name="region" format="ascii"', 1)
-    start = short.index(">", short.index('Name="region"')) + 1
-    end = short.index("</DataArray>", start)
-    short = short[:start].replace(' format="binary"', "", 0) + "0 1 1" + short[end:]
-    head = short.index("<DataArray")
-    tag = short[head:start].replace(' format="ascii"', "").replace("binary", "ascii")
-    (folder / "open.vtp").write_text(short[:head] + tag + short[start:])
-
-
 def turned(some):
     def edit(x, t, r):
         t[some] = t[some][:, ::-1]
@@ -275,8 +263,6 @@ def tip_table(folder, document):
     document["frames"][1]["annulus"] = "loop.csv"
 
 
-NESTED = "[" * 30 + "]" * 30
-BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 OPEN, CLOSED = "frames.0.surface", "frames.1.surface"
 I, G = InputError, GeometryError
 
@@ -307,24 +293,16 @@ CASES = {
     "handle": (
         surface(handle, "closed"), G, CLOSED, "Euler number -2, expected 0: .* has 1 handle"
     ),
-    "unused vertex": (
-        surfaces(lambda x, t, r: (np.vstack([x, x[:1]]), t, r)), G, OPEN, r"vertices \[192\]"
-    ),
-    "degenerate triangle": (
-        surface(lambda x, t, r: (np.vstack([x[:84], x[85:86], x[85:]]), t, r), "closed"),
-        G, CLOSED, "degenerate triangle",
-    ),
     "NaN in vertices": (not_a_number("open"), G, OPEN, r"open.obj: points \[7\] are not finite"),
-    "vertex beyond sense": (
-        surfaces(lambda x, t, r: (np.vstack([[1e200] * 3, x[1:]]), t, r)),
-        G, OPEN, r"points \[0\] are not finite numbers of at most 1e\+09",
-    ),
     "another region": (
         surface(lambda x, t, r: (x, t, 1 - r), "closed"),
         I, CLOSED, r"belong to another region than in the reference",
     ),
     "a seam that gapes": (
         seam(0.01), G, OPEN, r"2 pieces that do not touch .* sharing the vertices of their seams"
+    ),
+    "unused vertex": (
+        surfaces(lambda x, t, r: (np.vstack([x, x[:1]]), t, r)), G, OPEN, r"vertices \[192\]"
     ),
     # Labels.
     "too few labels": (labels_as_text("0 1 1"), I, OPEN, 'damaged: .*"region"'),
@@ -431,17 +409,10 @@ CASES = {
     "unknown unit": (put("units", "length", "inch"), I, "units.length", "'inch'; expected mm, cm"),
     # Frames.
     "frames out of order": (
-        put("frames", 1, "time", -1.0), I, "frames.1.time", "-1 s of 'closed' is not after 0 s"
-    ),
-    "NaN in times": (
-        put("frames", 1, "time", float("nan")),
-        I, "frames.1.time", "found '.nan', expected a finite",
+        put("frames", 1, "time", -1.0), I, "frames.1.time", "-1 of 'closed' is not after 0 of"
     ),
     "a time is text": (
         put("frames", 1, "time", "1e-3"), I, "frames.1.time", "this is text: YAML wants .* 1.0e-3"
-    ),
-    "a time beyond sense": (
-        put("frames", 1, "time", 1e300), I, "frames.1.time", "found '1.0e.300', expected"
     ),
     "a time is true": (put("frames", 1, "time", True), I, "frames.1.time", "found True"),
     "two references": (
@@ -498,12 +469,10 @@ CASES = {
     "negative tip index": (cell(5, "tip", "-1"), I, "chordae", "tip of row 5 is '-1'"),
     "rest length 0": (cell(2, "rest_length_mm", "0"), I, "chordae", "rest_length of chord 2 is 0"),
     "stiffness negative": (cell(2, "stiffness_n", "-1"), I, "chordae", "stiffness of .* 2 is -1"),
-    "chord beyond sense": (cell(1, "x", "1e300"), I, "chordae", "x of row 1 .*at most 1e.09"),
     "NaN in chordae": (cell(1, "x", "nan"), I, "chordae", "x of row 1 is 'nan'"),
     "another column": (
         text("tip,x,y,z\n0,1,2,3\n", "chordae.csv"), I, "chordae", "columns tip,x,y,z, expected tip"
     ),
-    "empty table": (text("", "chordae.csv"), I, "chordae", "columns none, expected tip,x,y,z"),
     "toe strain": (
         put("chordae", {"file": "chordae.csv", "toe_strain": 2.0}),
         I, "chordae.toe_strain", r"found 2.0; expected strain",
@@ -527,18 +496,12 @@ CASES = {
         both(text("x", "open.off"), put("frames", 0, "surface", "open.off")),
         I, OPEN, r"extension '.off', expected .vtu, .vtp, .stl, .obj, .ply",
     ),
-    "damaged file": (text("<VTKFile", "open.vtp"), I, OPEN, "damaged: Error parsing XML"),
-    "a file that is quoted": (labels_as_text("x" * 5000), I, OPEN, 'damaged: .*"region"'),
     "truncated file": (
         lambda folder, document: os.truncate(folder / "closed.vtp", 3000), I, CLOSED, "damaged"
     ),
     "a folder instead of a file": (
         both(lambda folder, _: (folder / "d.csv").mkdir(), put("chordae", "d.csv")),
         I, "chordae", "no such file",
-    ),
-    "table of bytes": (
-        lambda folder, document: (folder / "chordae.csv").write_bytes(b"\xff\xfe\x00"),
-        I, "chordae", "no UTF-8 text",
     ),
     "path out of the folder": (
         put("frames", 0, "surface", "../case/open.vtp"), I, OPEN, "leads out of the folder"
@@ -549,10 +512,6 @@ CASES = {
             lambda folder, _: (folder / "a.csv").symlink_to(folder / "a.csv"),
             put("chordae", "a.csv"),
         ), I, "chordae", "cannot be found|no such file",
-    ),
-    "an open quote": (
-        text("tip,x,y,z,family,rest_length_mm,stiffness_n\n\"" + "0," * 70000, "chordae.csv"),
-        I, "chordae", "no comma-separated text",
     ),
     "absolute path": (put("chordae", "/" + "etc/hosts"), I, "chordae", "leads out of the folder"),
     "link out of the folder": (link_out, I, OPEN, "leads out of the folder"),
@@ -569,7 +528,6 @@ CASES = {
     "no name of a frame": (drop("frames", 0, "name"), I, "frames.0.name", "is missing"),
     "a list of regions with a number": (put("regions", ["a", 1]), I, "regions.1", "found 1"),
     "regions of one name": (put("regions", ["a", "b", "a"]), I, "regions", "'a' occurs twice"),
-    "a merge key": (put("text", "version: 1\n<<: {name: x}\n"), I, "<<", "a merge key; write its"),
     "a merge key in quotes": (put("<<", {"name": "x"}), I, "<<", "unknown key; expected one of"),
     "a key like a kind": (put("<text>", 1), I, "<text>", "unknown key; expected one of"),
     "regions as text": (put("regions", "anterior"), I, "regions", "found 'anterior'; expected a"),
@@ -585,15 +543,8 @@ CASES = {
         text("version: !!python/object/apply:os.system ['true']"),
         I, "line 1", "asks for an object; expected plain values",
     ),
-    "a list": (text("- version"), I, "holds a list", "expected a mapping"),
-    "nothing": (text(""), I, "holds a NoneType", "expected a mapping"),
     "a repeated key": (text("version: 1\nname: a\nname: b"), I, "name", r"twice \(again in line 3"),
-    "a bomb": (text(BOMB), I, "line 1", "anchors and aliases are not used"),
-    "nested": (text(f"version: {NESTED}"), I, "line 1", "nested more than 20 deep"),
     "no YAML": (text("version: [1"), I, "no valid YAML", "expected"),
-    "an impossible date": (text("name: 2024-13-45"), I, "name", "is a date; put text in quotes"),
-    "a list as a key": (text("? [1, 2]\n: 3"), I, "line 1", "no single word or number"),
-    "large": (text("name: " + "x" * 1_000_001), I, "1000007 bytes", "expected at most 1000000"),
 }  # fmt: skip
 
 

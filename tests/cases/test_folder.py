@@ -6,9 +6,8 @@ import meshio
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.case import Role, Uncertainty
+from mvest.cases.folder import read_case, write_case
 from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template
@@ -83,16 +82,27 @@ def test_the_hash_changes_with_every_file_that_is_used_and_no_other(tmp_path):
     assert read_case(folder).sha256 != first
 
 
+def test_a_case_prints_what_a_person_wants_to_know():
+    case = template_case(40, 12)
+    assert str(case).splitlines() == [
+        "case template (simulated): anterior, posterior",
+        f"480 vertices, {len(case.chordae)} chordae",
+        "frames: open (reference, -0.333 mmHg), held (held out, 80.1 mmHg), "
+        "closed (closed, 121 mmHg)",
+        "seen within 0.9 mm, correlated over 7.5 mm",
+    ]
+    plain = dataclasses.replace(case, simulated=False, uncertainty=Uncertainty(0.5))
+    assert str(plain).splitlines()[::3] == [
+        "case template: anterior, posterior", "seen within 0.5 mm, independent"
+    ]  # fmt: skip
+
+
 # --- formats of other programs ------------------------------------------------------------------
 
 
 def by_pyvista(file, x, triangles, region):
-    pyvista = pytest.importorskip("pyvista")
-    mesh = pyvista.PolyData.from_regular_faces(x, triangles)
-    if file.suffix in (".vtp", ".vtu"):
-        mesh.cell_data["region"] = region
-    if file.suffix == ".vtu":
-        mesh = mesh.cast_to_unstructured_grid()
+    mesh = pytest.importorskip("pyvista").PolyData.from_regular_faces(x, triangles)
+    mesh.cell_data["region"] = region
     mesh.save(file)
 
 
@@ -102,25 +112,7 @@ def by_meshio(file, x, triangles, region):
     meshio.Mesh(x, cells, cell_data=data).write(file)
 
 
-def by_trimesh(file, x, triangles, region):
-    trimesh = pytest.importorskip("trimesh")
-    trimesh.Trimesh(x, triangles, process=False).export(file)
-
-
-WRITERS = [
-    (by_pyvista, ".vtp"),
-    (by_pyvista, ".vtu"),
-    (by_pyvista, ".stl"),
-    (by_pyvista, ".ply"),
-    (by_pyvista, ".obj"),
-    (by_meshio, ".vtu"),
-    (by_meshio, ".stl"),
-    (by_meshio, ".obj"),
-    (by_meshio, ".ply"),
-    (by_trimesh, ".stl"),
-    (by_trimesh, ".obj"),
-    (by_trimesh, ".ply"),
-]
+WRITERS = [(by_pyvista, ".vtp"), *((by_meshio, end) for end in (".vtu", ".stl", ".obj", ".ply"))]
 
 
 @pytest.mark.parametrize(("write", "suffix"), WRITERS)

@@ -27,6 +27,8 @@ def test_every_field_is_in_the_readme_and_no_other():
 def test_the_schema_describes_every_field_and_allows_no_other():
     schema = case_schema()
     for part in [schema, *schema["$defs"].values()]:
+        if "enum" in part:
+            continue
         assert part["additionalProperties"] is False
         assert all("description" in field for field in part["properties"].values())
     assert schema["required"] == ["version", "name", "units", "regions", "frames"]

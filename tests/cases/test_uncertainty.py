@@ -7,8 +7,7 @@ import pytest
 import yaml
 
 from mvest.cases.case import ErrorSamples, Role, Uncertainty
-from mvest.cases.folder import read_case, write_error_samples
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case, write_error_samples
 from mvest.errors import InputError
 from tests.cases.folders import plain_folder, save, template_case
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import mvest.source
+import mvest.cache
+from mvest.cache import SOURCES, Sources
 from mvest.closure.anchors import Anchors, Coordinates, Kept, content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.settings import ModulusField
 from mvest.mechanics.steps import StepReason
 from mvest.processes import side_by_side
-from mvest.source import SOURCES, Sources
 from tests.closure.test_model import AT, CLOSING, GENTLE, MODULI, OPEN, TINY, model_of
 
 SPACING = 0.4
@@ -142,7 +142,7 @@ def test_a_kept_state_belongs_to_all_that_decides_it(tmp_path, monkeypatch):
     for k, model in enumerate(changed):
         model.close(NEAR)
         assert len(files(tmp_path)) == k + 1
-    monkeypatch.setattr(mvest.source, "SOURCES", Sources(mvest=edited(tmp_path / "code")))
+    monkeypatch.setattr(mvest.cache, "SOURCES", Sources(mvest=edited(tmp_path / "code")))
     gentle(tmp_path).close(NEAR)
     assert len(files(tmp_path)) == len(changed) + 1
     # What only decides where a closure begins is none of it.

@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from experiments import cli
 from experiments.common.places import CONF
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from tests.made_up_closure import made_up_case
 from tests.places import ROOT
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings

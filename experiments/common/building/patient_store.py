@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.schema import Values
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.problem.stored import Store
 from mvest.provenance import write_json

@@ -17,6 +17,7 @@ import numpy as np
 from experiments.common.building.closure import mechanics_of
 from experiments.common.progress import PartBar
 from experiments.common.schema import NOT_HASHED, Values
+from mvest.cache import Entry, get_or_make
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters, Trees
@@ -27,7 +28,6 @@ from mvest.imaging.learning.training import (
     volume_samples,
 )
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, MovingValve
-from mvest.kept import Entry, get_or_make
 from mvest.problem.stored import Store
 from mvest.processes import side_by_side
 from mvest.quantities import Count, Length, Processes, Seed, Share, within

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,15 +36,13 @@ UNSEEN_STD_MM = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CaseFrames:
-    """Which frames of a sequence are used, by their numbers.
+    """Numbers of the open and the closed frame of a sequence, of which a case is made.
 
     Attributes
     ----------
     open, closed : int
     pressure_mmHg : float
         Transmitral pressure in the closed frame.
-    held_out : mapping
-        Further frames of the closed valve -> transmitral pressure in mmHg.
     derived : tuple of str
         How frames were chosen that were not stated.
     """
@@ -51,25 +50,22 @@ class CaseFrames:
     open: int
     closed: int
     pressure_mmHg: float
-    held_out: Mapping[int, float] = field(default_factory=dict)
     derived: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        used = [self.open, self.closed, *self.held_out]
-        if len(set(used)) != len(used):
-            raise InputError(f"frames {used} (open, closed, held out) are not all different")
+        if self.open == self.closed:
+            raise InputError(f"frame {self.open} is both the open and the closed one")
         low, high = CLOSING_PRESSURE
-        for frame, pressure in ((self.closed, self.pressure_mmHg), *self.held_out.items()):
-            if not low <= pressure <= high:
-                raise InputError(
-                    f"pressure of frame {frame} = {pressure} mmHg on the closed valve, expected "
-                    f"{low:g} to {high:g} mmHg"
-                )
+        if not low <= self.pressure_mmHg <= high:
+            raise InputError(
+                f"pressure of frame {self.closed} = {self.pressure_mmHg} mmHg on the closed valve, "
+                f"expected {low:g} to {high:g} mmHg"
+            )
 
     @property
     def in_order(self) -> list[int]:
-        """Numbers of all of them, in the order of time."""
-        return sorted([self.open, self.closed, *self.held_out])
+        """Both, in the order of time."""
+        return sorted([self.open, self.closed])
 
 
 def choose_frames(
@@ -79,54 +75,49 @@ def choose_frames(
     *,
     open_: int | None = None,
     closed: int | None = None,
-    held_out: Mapping[int, float] | None = None,
     min_confidence: float = MIN_CONFIDENCE,
 ) -> CaseFrames:
-    """Choose the frames that were not stated.
+    """Choose the open and the closed frame where they are not stated.
 
     The closed frame is the one in which the leaflets touch over the largest area, the open frame
-    the one with the largest orifice, among frames that are as confident as asked for.
+    the one with the largest orifice, among frames of sufficient confidence.
 
     Parameters
     ----------
     sequence : ValveSequence
     rows : sequence
-        Measures of every frame (`mvest.cases.from_images.measures.measure_sequence`).
+        Its measures (`mvest.cases.from_images.measures.measure_sequence`).
     pressure_mmhg : float or callable
         In the closed frame, or at any time (s).
     open_, closed : int, optional
-        Where they are stated.
-    held_out : mapping, optional
-        Frame -> pressure, mmHg.
+        If stated.
     min_confidence : float
         Of a frame that is chosen.
 
     Raises
     ------
     InputError
-        A frame that is stated does not exist, or none can be chosen.
+        A stated frame does not exist, or none can be chosen.
     """
-    count, held = len(sequence.times), dict(held_out or {})
-    for name, number in (("open", open_), ("closed", closed), *(("held-out", k) for k in held)):
+    count = len(sequence.times)
+    for name, number in (("open", open_), ("closed", closed)):
         if number is not None and not 0 <= number < count:
             raise InputError(f"{name} frame {number}, expected one of 0 to {count - 1}")
-    sure = [
-        row
-        for row in rows
-        if sequence.frame_confidence[int(row["frame"] or 0)] >= min_confidence
-        and row["orifice_mm2"] is not None
-    ]
+    sure = {
+        t: row
+        for t, row in enumerate(rows)
+        if sequence.frame_confidence[t] >= min_confidence and row["orifice_mm2"] is not None
+    }
     among = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
     derived = []
     if closed is None:
-        closed = closed_frame([row for row in sure if int(row["frame"] or 0) not in held])
+        closed = closed_frame(list(sure.values()))
         derived.append(
             f"closed frame: {closed}, whose leaflets touch over the largest area, {among}"
         )
     if open_ is None:
-        others = [row for row in sure if int(row["frame"] or 0) not in {closed, *held}]
-        best = max(others, key=lambda row: row["orifice_mm2"] or 0.0, default=None)
-        open_ = None if best is None else int(best["frame"] or 0)
+        orifice = {t: row["orifice_mm2"] or 0.0 for t, row in sure.items() if t != closed}
+        open_ = max(orifice, key=orifice.__getitem__, default=None)
         derived.append(f"open frame: {open_}, with the largest orifice, {among}")
     if open_ is None or closed is None:
         highest = float(np.max(sequence.frame_confidence))
@@ -136,24 +127,13 @@ def choose_frames(
         )
     if callable(pressure_mmhg):
         pressure_mmhg = pressure_mmhg(float(sequence.times[closed]))
-    return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))
-
-
-@dataclass(frozen=True, slots=True)
-class CaseTexts:
-    """What a case says of itself."""
-
-    name: str
-    description: str = ""
-    source: str = ""
-    licence: str = ""
-    simulated: bool = False
+    return CaseFrames(open_, closed, pressure_mmhg, tuple(derived))
 
 
 def case_of_sequence(
     sequence: ValveSequence,
     frames: CaseFrames,
-    texts: CaseTexts,
+    texts: Mapping[str, Any],
     *,
     thickness_mm: Mapping[str, float] | None = None,
     error_samples: ErrorSamples | None = None,
@@ -166,7 +146,8 @@ def case_of_sequence(
     ----------
     sequence : ValveSequence
     frames : CaseFrames
-    texts : CaseTexts
+    texts : mapping
+        The case's name, description, source, licence and whether it is simulated.
     thickness_mm : mapping, optional
         Of each leaflet next to the annulus; generic values if not given.
     error_samples : ErrorSamples, optional
@@ -216,7 +197,7 @@ def case_of_sequence(
         "rest lengths from the closed frame (through its vertices)"
     )
     return ValveCase(
-        **asdict(texts),
+        **texts,
         surface=surface,
         annulus=layout.annulus,
         free_edge=layout.free_edge,
@@ -257,25 +238,19 @@ def _check_frame(sequence: ValveSequence, number: int, side: float, *, is_refere
 
 
 def _frame(sequence: ValveSequence, frames: CaseFrames, number: int) -> Frame:
-    layout, vertices = sequence.layout, sequence.vertices[number]
-    if number == frames.open:
-        name, role, pressure = "open", Role.REFERENCE, 0.0
-    elif number == frames.closed:
-        name, role, pressure = "closed", Role.CLOSED, frames.pressure_mmHg
-    else:
-        name, role, pressure = f"frame_{number}", Role.HELD_OUT, frames.held_out[number]
+    layout, vertices, is_open = sequence.layout, sequence.vertices[number], number == frames.open
     return Frame(
-        name,
-        float(sequence.times[number]),
-        role,
-        float(pressure),
-        vertices,
-        layout.triangles,
-        layout.region,
-        vertices[layout.annulus],
-        vertices[layout.free_edge],
-        sequence.tips[number],
-        True,
+        name="open" if is_open else "closed",
+        time=float(sequence.times[number]),
+        role=Role.REFERENCE if is_open else Role.CLOSED,
+        pressure_mmHg=0.0 if is_open else float(frames.pressure_mmHg),
+        vertices=vertices,
+        triangles=layout.triangles,
+        region=layout.region,
+        annulus=vertices[layout.annulus],
+        free_edge=vertices[layout.free_edge],
+        papillary_tips=sequence.tips[number],
+        corresponds=True,
     )
 
 

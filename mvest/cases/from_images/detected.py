@@ -11,18 +11,22 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.cases.folder import PressureCurve
-from mvest.cases.from_images.build import CaseFrames, CaseTexts, case_of_sequence, choose_frames
+from mvest.cases.folder import PressureCurve, write_case
+from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
     with_bands,
     without_expected_error,
 )
-from mvest.cases.from_images.files import write_for_slicer, write_surfaces
-from mvest.cases.from_images.measures import Row, measure_sequence, write_measures
+from mvest.cases.from_images.measures import (
+    Row,
+    measure_sequence,
+    write_landmarks,
+    write_measures,
+    write_surfaces,
+)
 from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
-from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.volumes import read_volume
@@ -114,7 +118,7 @@ def read_for_case(file: Path, settings: ImagedSettings) -> VolumeSequence:
     Raises
     ------
     InputError
-        If it cannot be read or has one frame only.
+        It cannot be read or has one frame only.
     """
     volume = read_volume(
         file,
@@ -150,18 +154,18 @@ def detect_in_volume(
     Raises
     ------
     NoValveError
-        If the volume shows no valve; it has the best candidate that was not accepted.
+        The volume shows no valve; the error has the best candidate that was not accepted.
     MvestError
-        If the volume cannot be read, or the valve in it makes no case.
+        The volume cannot be read, or the valve in it makes no case.
     """
     settings = settings or ImagedSettings()
-    # What is asked for, before anything that takes long.
-    said: list[str] = []
-    by_hand = _landmarks(settings, said)
-    curve = None
+    # Settings are checked before anything that takes long.
+    landmarks, unplaced = _landmarks(settings)
+    pressure: Any = settings.pressure_mmHg
     if settings.pressure_curve is not None:
-        curve = PressureCurve(*read_numbers(Path(settings.pressure_curve), ("time", "pressure")).T)
-    if estimate and not settings.states_pressure:
+        table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
+        pressure = PressureCurve(*table.T)
+    elif estimate and pressure is None:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
             "pressure on the closed valve"
@@ -172,39 +176,36 @@ def detect_in_volume(
         volume,
         model,
         min_confidence=settings.min_confidence,
-        landmarks=by_hand,
+        landmarks=landmarks or None,
         progress=progress,
     )
     thickness = settings.thickness
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
-    pressure = settings.pressure_mmHg
     frames = choose_frames(
         valve,
         rows,
-        curve or (STAND_IN_MMHG if pressure is None else pressure),
+        STAND_IN_MMHG if pressure is None else pressure,
         open_=settings.open_frame,
         closed=settings.closed_frame,
-        held_out={frame: float(value) for frame, value in settings.held_out},
         min_confidence=settings.min_confidence,
     )
     accuracy = measured.at(valve.confidence)
-    rows = with_bands(valve, rows, accuracy)
     corrected, errors = without_expected_error(valve, frames, measured)
-    # Evenly spread samples of the errors.
+    # Samples that are evenly spread over the errors.
     spread = np.linspace(0, len(errors) - 1, settings.error_samples)
-    kept = np.unique(spread.round().astype(np.int64))
+    chosen = np.unique(spread.round().astype(np.int64))
     case = case_of_sequence(
         corrected,
         frames,
-        CaseTexts(
-            settings.name or called(volume),
-            settings.description,
-            settings.source or called(volume),
-            settings.licence,
-            settings.simulated,
-        ),
+        {
+            "name": settings.name or called(volume),
+            "description": settings.description,
+            "source": settings.source or called(volume),
+            "licence": settings.licence,
+            "simulated": settings.simulated,
+        },
         thickness_mm=thickness,
-        error_samples=samples_in_world(corrected, frames, errors[kept]),
+        error_samples=samples_in_world(corrected, frames, errors[chosen]),
     )
     off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
     less = (
@@ -212,30 +213,22 @@ def detect_in_volume(
         f"a valve, by simulated volumes ({off.mean():.2f} mm in the closed frame)"
     )
     return DetectedValve(
-        volume,
-        valve,
-        rows,
-        frames,
-        replace(case, derived=(*case.derived, less, *said)),
-        settings,
-        model,
-        _unlike(valve.confidence, accuracy),
+        volume=volume,
+        valve=valve,
+        rows=with_bands(valve, rows, accuracy),
+        frames=frames,
+        case=replace(case, derived=(*case.derived, less, *unplaced)),
+        settings=settings,
+        model=model,
+        unlike=_unlike(valve.confidence, accuracy),
     )
 
 
 def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
     """Write measures, surfaces, landmarks and, if its pressure is stated, the case.
 
-    Parameters
-    ----------
-    detected : DetectedValve
-    folder : Path
-        Gets the folders ``images`` and ``case``; what they held before is removed.
-
-    Returns
-    -------
-    list of str
-        The main files, below the folder.
+    The folders ``images`` and ``case`` within the given one are emptied before. Returns the main
+    files, relative to it.
     """
     images, case = folder / IMAGES, folder / CASE
     for place in (images, case):
@@ -243,14 +236,9 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
     images.mkdir(parents=True)
     write_measures(images, detected.rows)
     write_surfaces(images, detected.valve)
-    write_for_slicer(
-        images,
-        detected.volume,
-        detected.valve,
-        float(detected.case.surface.thickness.mean()),
-        [detected.frames.open, detected.frames.closed],
-    )
-    files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series"]
+    for frame in (detected.frames.open, detected.frames.closed):
+        write_landmarks(images / f"valve_{frame:04d}.mrk.json", detected.valve, frame)
+    files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.pvd"]
     if detected.settings.states_pressure:
         write_case(case, detected.case)
         files.append(f"{CASE}/case.yaml")
@@ -260,7 +248,7 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
 def image_step(
     detected: DetectedValve, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
 ) -> dict[str, tuple[Mapping[str, Any], ...]]:
-    """What a record says of the image step, as details (`mvest.personalisation.record`).
+    """Details of the image step for a record (`mvest.personalisation.record`).
 
     Parameters
     ----------
@@ -273,9 +261,8 @@ def image_step(
     Returns
     -------
     dict
-        ``image_step``, one row: volume, shape, spacing_mm, modality, sha256, open_frame,
-        closed_frame, confidence (of each frame), unlike, model_sha256, trained_on, sentences,
-        files; ``image_frames``: the measures of each frame; ``pictures``.
+        ``image_step``, one row about volume, frames, model and files; ``image_frames``: the
+        measures of each frame; ``pictures``.
     """
     volume, frames = detected.volume, detected.frames
     about = {
@@ -336,11 +323,10 @@ def _unlike(confidence: float, accuracy: DetectionAccuracy) -> str:
     )
 
 
-def _landmarks(
-    settings: ImagedSettings, derived: list[str]
-) -> dict[int, dict[str, FloatArray]] | None:
-    """Frame -> name -> position (mm), of the files that settings name."""
+def _landmarks(settings: ImagedSettings) -> tuple[dict[int, dict[str, FloatArray]], list[str]]:
+    """Frame -> name -> position (mm) of the files in the settings; sentences on unplaced ones."""
     landmarks: dict[int, dict[str, FloatArray]] = {}
+    unplaced = []
     for frame, file in settings.landmarks:
         lists = read_markups(Path(file))
         mine = [
@@ -356,7 +342,7 @@ def _landmarks(
                 f"{', '.join(LANDMARKS)}, each once (lists {', '.join(lists)})"
             )
         landmarks[frame] = points
-        unplaced = [label for item in mine for label in item.unplaced]
-        if unplaced:
-            derived.append(f"landmarks of frame {frame}: {', '.join(unplaced)} not placed")
-    return landmarks or None
+        missing = [label for item in mine for label in item.unplaced]
+        if missing:
+            unplaced.append(f"landmarks of frame {frame}: {', '.join(missing)} not placed")
+    return landmarks, unplaced

@@ -22,7 +22,7 @@ from scipy.stats import t as student_t
 
 from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.build import CaseFrames
-from mvest.cases.from_images.measures import BOUNDS, Row, is_open
+from mvest.cases.from_images.measures import Row, is_open
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -44,11 +44,22 @@ BANDED = (
     "tip_depth_mm",
     "tip_separation_mm",
 )
-"""Measures that get a band: of annulus and tips, which take no fine detail of leaflets.
+"""Measures that get a band: those of annulus and tips, which need no fine detail of leaflets.
 
 Detected leaflets are smoother than true ones, and differences between the two rougher than either:
 areas of leaflets that are moved by them would say more of the roughness than of the area.
 """
+
+
+def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Axes of the valve in a frame, the columns of ``(3, 3)``, in which errors are measured."""
+    pose = pose_of(sequence.vertices[frame], sequence.tips[frame], sequence.layout)
+    return np.asarray(pose.rotation[0])
+
+
+def _points(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Leaflets and, after them, tips ``(n + 2, 3)`` mm."""
+    return np.concatenate([sequence.vertices[frame], sequence.tips[frame]])
 
 
 def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
@@ -65,20 +76,14 @@ def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
     return np.concatenate([errors, tips], axis=2)
 
 
-def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
-    """Axes of the valve in a frame, the columns of ``(3, 3)``, in which errors are measured."""
-    pose = pose_of(sequence.vertices[frame], sequence.tips[frame], sequence.layout)
-    return np.asarray(pose.rotation[0])
-
-
 def samples_in_world(
     sequence: ValveSequence, frames: CaseFrames, errors: FloatArray
 ) -> ErrorSamples:
     """Errors measured on other valves, as displacements in the frames of a case.
 
-    With each of them goes what it would be on the other side, as in a mirror: valves are nearly
-    alike on both sides of the middle of their leaflets, and so is what is wrong with how they are
-    seen. Few samples stand for twice as many, though not for as many that are independent.
+    Each error is used a second time as its mirror image: valves, and errors of detecting them, are
+    nearly symmetric about the middle of their leaflets. The two samples share a source, because
+    they are not independent.
 
     Parameters
     ----------
@@ -107,31 +112,20 @@ def samples_in_world(
 def without_expected_error(
     sequence: ValveSequence, frames: CaseFrames, accuracy: DetectionAccuracy
 ) -> tuple[ValveSequence, FloatArray]:
-    """The valve less the error that is expected of it, and errors of other valves about theirs.
+    """The valve less its expected error, and errors of other valves about their expected ones.
 
-    What detectors are off by on average where they find such a valve (`expected_error`), no spread
-    of errors can make up for: closed free edges that lie where most do, for instance. Only the
-    frames of the case are changed: the open one by the error of open frames, the others by that of
-    closed ones.
-
-    Parameters
-    ----------
-    sequence : ValveSequence
-    frames : CaseFrames
-    accuracy : DetectionAccuracy
-        Of the detectors; errors about what is expected are as wide as is stated of a volume of this
-        confidence.
+    Only the two frames of the case are changed.
 
     Returns
     -------
     sequence : ValveSequence
     errors : (K, 2, n + 2, 3) mm
-        Of leaflets and, after them, tips.
+        Of leaflets and, after them, tips, as wide as is stated of a volume of this confidence.
 
     Raises
     ------
     InputError
-        They are not of this layout, or of fewer than two valves.
+        The errors are not of this layout, or of fewer than two valves.
     """
     shape = np.stack(
         [
@@ -139,7 +133,7 @@ def without_expected_error(
             for n in (frames.open, frames.closed)
         ]
     )
-    expected, samples = expected_error(sequence.layout, accuracy, shape)
+    expected, samples = _expected_error(sequence.layout, accuracy, shape)
     vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
     for number in frames.in_order:
         off = expected[int(number != frames.open)] @ valve_axes(sequence, number).T
@@ -149,21 +143,16 @@ def without_expected_error(
     return replace(sequence, vertices=vertices, tips=tips), samples
 
 
-def _points(sequence: ValveSequence, frame: int) -> FloatArray:
-    """Leaflets and, after them, tips ``(n + 2, 3)`` mm."""
-    return np.concatenate([sequence.vertices[frame], sequence.tips[frame]])
-
-
 def with_bands(
     sequence: ValveSequence, rows: Sequence[Row], accuracy: DetectionAccuracy
 ) -> list[Row]:
-    """Measures of every frame, and between which bounds 95 % of true ones are expected.
+    """Measures of every frame with the bounds between which 95 % of true ones are expected.
 
     The valve of each frame is moved back by every error of the detectors on another valve, and
-    measured again: a band is where one more of these values is expected (Student's bounds for one
-    further normal number). It lies about where the valve is without the mean error, and so not
-    always about what was measured. Errors are known of open and of closed frames; what is neither
-    quite takes those of the nearer by its orifice (`OPEN_SHARE`).
+    measured again. The band is where one more of these values is expected (Student's bounds for one
+    further normal number). It contains the correction of the mean error, so it need not lie about
+    what was measured. Frames take the errors of open or of closed ones by their orifice
+    (`OPEN_SHARE`).
 
     Parameters
     ----------
@@ -181,14 +170,14 @@ def with_bands(
     Raises
     ------
     InputError
-        They are of fewer than two valves, or not of this layout.
+        The errors are of fewer than two valves, or not of this layout.
     """
     errors, annulus = _errors_of(sequence.layout, accuracy), sequence.layout.annulus
     count = len(errors)
     reach = float(student_t.ppf(0.975, count - 1)) * np.sqrt(1.0 + 1.0 / count)
     banded = []
     for t, row in enumerate(rows):
-        bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in BOUNDS)
+        bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in ("low", "high"))
         if row[BANDED[0]] is not None:
             which, axes = (0 if is_open(row) else 1), valve_axes(sequence, t)
             moved = _points(sequence, t) - errors[:, which] @ axes.T
@@ -203,38 +192,6 @@ def with_bands(
     return banded
 
 
-def expected_error(
-    layout: ValveLayout, accuracy: DetectionAccuracy, shape: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The error that is expected of detectors, and how it may vary, in a volume of confidence 1.
-
-    Parameters
-    ----------
-    layout : ValveLayout
-    accuracy : DetectionAccuracy
-    shape : (2, n + 2, 3) mm
-        Leaflets and, after them, papillary tips of the open and the closed frame, each as it was
-        found and in its own axes.
-
-    Returns
-    -------
-    expected : (2, n + 2, 3) mm
-        Found less true, in the valve's axes.
-    samples : (S, 2, n + 2, 3) mm
-        See `error_at_shape`; what of their size is owed to confidence is `accuracy.factor`.
-
-    Raises
-    ------
-    InputError
-        Errors are of fewer than two valves, or not of this layout.
-    """
-    errors = _errors_of(layout, accuracy)
-    shapes = None
-    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
-        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
-    return error_at_shape(layout, errors, shapes, shape)
-
-
 def coverage(
     layout: ValveLayout,
     accuracy: DetectionAccuracy,
@@ -242,7 +199,7 @@ def coverage(
     shapes: FloatArray,
     confidence: FloatArray,
 ) -> list[dict[str, float]]:
-    """How true the stated errors are of valves that were not among the samples, by frame.
+    """How well the stated errors hold for valves that were not among the samples.
 
     Parameters
     ----------
@@ -251,7 +208,7 @@ def coverage(
     errors : (S, 2, n, 3) mm
         Found less true, in the open and the closed frame.
     shapes : (S, 2, n + 2, 3) mm
-        Where the valves were found; see `expected_error`.
+        Leaflets and, after them, tips, as they were found, in the valve's axes.
     confidence : (S,)
         Of each volume.
 
@@ -264,11 +221,9 @@ def coverage(
     """
     n = layout.size
     factors = np.array([accuracy.factor(one) for one in confidence])[:, None, None, None]
-    expected, samples = zip(
-        *(expected_error(layout, accuracy, shape) for shape in shapes), strict=True
-    )
-    left = (errors - np.stack(expected)[:, :, :n]) / factors
-    spread = np.stack([np.sqrt((one[:, :, :n] ** 2).mean(axis=(0, 3))) for one in samples])
+    pairs = [_expected_error(layout, accuracy, shape) for shape in shapes]
+    left = (errors - np.stack([expected[:, :n] for expected, _ in pairs])) / factors
+    spread = np.stack([np.sqrt((one[:, :, :n] ** 2).mean(axis=(0, 3))) for _, one in pairs])
     rows = []
     for k in range(2):
         own = errors[:, k : k + 1]
@@ -288,6 +243,17 @@ def coverage(
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt((values**2).mean()))
+
+
+def _expected_error(
+    layout: ValveLayout, accuracy: DetectionAccuracy, shape: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`error_at_shape` by the detectors' accuracy in a volume of confidence 1."""
+    errors = _errors_of(layout, accuracy)
+    shapes = None
+    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
+        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
+    return error_at_shape(layout, errors, shapes, shape)
 
 
 def error_at_shape(

@@ -1,8 +1,7 @@
-"""Measures of a valve from images in every frame, and the tables that hold them."""
+"""Measures of a valve from images in every frame, and its files for ParaView and 3D Slicer."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -10,14 +9,18 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.exchange.markups import PointList, write_markups
+from mvest.exchange.surfaces import SurfaceFile, region_arrays, write_surface_series
 from mvest.files import write_atomically
-from mvest.imaging.valve_sequence import TIPS, ValveSequence
-from mvest.reading.text import write_columns
-from mvest.valve.measure.clinical import (
-    clinical_meaning,
-    clinical_measurements,
-    clinical_names,
+from mvest.imaging.valve_sequence import (
+    ANNULUS_LABELS,
+    TIPS,
+    ValveSequence,
+    landmarks,
+    slicerheart_labels,
 )
+from mvest.reading.text import write_columns
+from mvest.valve.measure.clinical import clinical_measurements, clinical_names
 
 Row: TypeAlias = dict[str, float | None]
 
@@ -29,25 +32,19 @@ is half of that in an annulus of 800 mm².
 """
 
 CLOSED_ONLY = ("tenting_", "prolapse_", "billow_")
-"""What is defined for closed leaflets only, by the beginning of its name."""
-
-BOUNDS = {"low": "lower bound", "high": "upper bound"}
-"""Endings of names of what bounds a measure."""
-
-_OWN = {
-    "frame": ("", "number of the frame from 0 on"),
-    "time_s": ("s", "time of the frame"),
-    "confidence": ("", "how sure the image step is of this frame, 0 (no valve) to 1"),
-    "vertex_confidence_mean": ("", "mean over the leaflets' points of their confidence, 0 to 1"),
-    "contact_distance_mm": ("mm", "distance of midsurfaces up to which leaflets count as touching"),
-}
+"""Beginnings of the names of measures that are defined for closed leaflets only."""
 
 
 def contact_distance(sequence: ValveSequence, thickness_mm: float) -> float:
     """Distance (mm) of midsurfaces up to which leaflets from images count as touching.
 
-    Their thickness, and one standard deviation of the distance of two points that are each wrong
-    by the median of ``std_mm``; the thickness alone where that was never measured.
+    Their thickness, plus the standard deviation of the distance of two points with the median
+    ``std_mm``; the thickness alone if that was never measured.
+
+    Raises
+    ------
+    InputError
+        The thickness is no positive number.
     """
     if not (np.isfinite(thickness_mm) and thickness_mm > 0):
         raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")
@@ -56,20 +53,16 @@ def contact_distance(sequence: ValveSequence, thickness_mm: float) -> float:
 
 
 def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
-    """Measure a valve in every frame.
-
-    Parameters
-    ----------
-    sequence : ValveSequence
-    thickness_mm : float
-        Of the leaflets.
+    """Measure a valve with leaflets of this thickness (mm) in every frame.
 
     Returns
     -------
     list of dict
-        For each frame the same names, which `measure_meaning` explains. None is what the shape
-        defies: everything in a frame without a valve (confidence 0) or with points that are not
-        finite numbers, and tenting, prolapse and billowing of an open valve (`OPEN_SHARE`).
+        The same names for each frame: ``frame`` (from 0 on), ``time_s``, ``confidence`` (0 to 1),
+        ``vertex_confidence_mean``, ``contact_distance_mm`` and those of
+        `mvest.valve.measure.clinical`. None is what cannot be measured: everything in a frame
+        without a valve (confidence 0) or with points that are not finite, and tenting, prolapse
+        and billowing of an open valve (`OPEN_SHARE`).
 
     Raises
     ------
@@ -105,7 +98,7 @@ def _measured(sequence: ValveSequence, t: int, reach: float) -> Mapping[str, flo
 
 
 def is_open(measures: Mapping[str, float | None]) -> bool:
-    """Whether a valve of these measures is open, as it is called where they tell nothing."""
+    """Whether a valve of these measures is open, or cannot be told to be closed."""
     orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
     return orifice is None or area is None or orifice >= OPEN_SHARE * area
 
@@ -115,10 +108,9 @@ def _finite(value: Any) -> float | None:
 
 
 def closed_frame(rows: Sequence[Row]) -> int | None:
-    """Frame in which the leaflets touch over the largest area, of the measures of all frames.
+    """Frame in which the leaflets touch over the largest area.
 
-    Where they touch in none the one with the smallest orifice; None if no frame has either. The
-    orifice alone would take leaflets for closed that only overlap in the line of sight.
+    If they touch in none, the one with the smallest orifice; None if no frame has either.
     """
     known = [row for row in rows if row["coaptation_area_mm2"] is not None]
     known = [row for row in known if row["orifice_mm2"] is not None]
@@ -128,30 +120,12 @@ def closed_frame(rows: Sequence[Row]) -> int | None:
     return int(best["frame"] or 0)
 
 
-def measure_meaning(name: str) -> tuple[str, str]:
-    """Unit (empty for pure numbers) and meaning of an entry of `measure_sequence`.
+# -- files ----------------------------------------------------------------------------------------
+def write_measures(folder: Path, rows: Sequence[Row]) -> Path:
+    """Write ``measures.csv`` to an existing folder; returns its path.
 
-    Or of a bound of one (`mvest.cases.from_images.detector_errors`).
-    """
-    for end, words in BOUNDS.items():
-        if name.endswith(f"_{end}"):
-            unit, meaning = measure_meaning(name.removesuffix(f"_{end}"))
-            return unit, f"{words} of the 95 % band of: {meaning}"
-    return _OWN[name] if name in _OWN else clinical_meaning(name)
-
-
-def write_measures(folder: Path, rows: Sequence[Row]) -> list[Path]:
-    """Write the measures of every frame; returns the paths.
-
-    ``measures.csv`` has one row per frame, the units in its columns, an empty cell for what could
-    not be measured; ``measures.json`` the same (null), with unit and meaning of every name.
-
-    Parameters
-    ----------
-    folder : Path
-        Exists.
-    rows : sequence of dict
-        From `measure_sequence`.
+    It has one row per frame, with units in the names of its columns and an empty cell for what
+    could not be measured.
 
     Raises
     ------
@@ -160,14 +134,54 @@ def write_measures(folder: Path, rows: Sequence[Row]) -> list[Path]:
     """
     if not rows:
         raise InputError(f"{folder}: no frames to write, expected at least one")
-    table, document = folder / "measures.csv", folder / "measures.json"
-
     cells = [["" if row[key] is None else f"{row[key]:.7g}" for key in rows[0]] for row in rows]
-    meanings = {
-        key: dict(zip(("unit", "meaning"), measure_meaning(key), strict=True)) for key in rows[0]
-    }
-    text = json.dumps({"measures": meanings, "frames": list(rows)}, indent=1, allow_nan=False)
-    return [
-        write_atomically(table, lambda file: write_columns(file, list(rows[0]), cells)),
-        write_atomically(document, text + "\n"),
+    return write_atomically(
+        folder / "measures.csv", lambda file: write_columns(file, list(rows[0]), cells)
+    )
+
+
+def write_surfaces(folder: Path, sequence: ValveSequence) -> Path:
+    """Write the valve of every frame for ParaView and 3D Slicer; returns the index ``valve.pvd``.
+
+    ``valve_0000.vtp``, ... hold the midsurface in LPS mm with ``confidence`` and ``std_mm`` (NaN
+    where it was never measured) at its points and ``region`` in its triangles.
+
+    Raises
+    ------
+    InputError
+        A point that is not finite, or a file that cannot be written.
+    """
+    layout, std = sequence.layout, sequence.std_mm
+    cells = region_arrays(layout.region, layout.region_names)
+    states = [
+        SurfaceFile(x, layout.triangles, {"confidence": confidence, "std_mm": std}, cells)
+        for x, confidence in zip(sequence.vertices, sequence.vertex_confidence, strict=True)
     ]
+    return write_surface_series(folder / "valve.pvd", sequence.times.tolist(), states)
+
+
+def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:
+    """Write the named points of one frame as markups of 3D Slicer (``.mrk.json``).
+
+    The lists are ``landmarks`` (see `mvest.imaging.layout`), ``annulus`` and ``free edge`` as
+    closed curves, which begin at phi = 0, and SlicerHeart's labels of the annulus.
+
+    Raises
+    ------
+    InputError
+        No such frame, a point that is not finite, another extension, or a file that cannot be
+        written.
+    """
+    named = landmarks(valve, frame)
+    down = valve.tips[frame].mean(axis=0) - valve.annulus[frame].mean(axis=0)
+    half = valve.annulus.shape[1] // 2
+    labels = slicerheart_labels(valve.annulus[frame], half, down)
+    return write_markups(
+        path,
+        {
+            "landmarks": PointList(tuple(named), np.stack(list(named.values()))),
+            "annulus": PointList.numbered("annulus", valve.annulus[frame], "ClosedCurve"),
+            "free edge": PointList.numbered("edge", valve.free_edge[frame], "ClosedCurve"),
+            ANNULUS_LABELS: PointList(tuple(labels), np.stack(list(labels.values()))),
+        },
+    )

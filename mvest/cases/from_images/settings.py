@@ -37,8 +37,6 @@ class ImagedSettings:
         Transmitral, in the closed frame.
     pressure_curve : str or None
         File ``.csv`` of ``time,pressure`` (s, mmHg) at the times of the volume, instead.
-    held_out : tuple of (frame, mmHg)
-        Further closed frames, which no filter is shown.
     thickness_mm : tuple of float
         Of the `LEAFLETS`; empty: generic.
     min_confidence : float
@@ -61,7 +59,6 @@ class ImagedSettings:
     closed_frame: Count | None = None
     pressure_mmHg: Pressure | None = None
     pressure_curve: str | None = None
-    held_out: tuple[Any, ...] = ()
     thickness_mm: tuple[Thickness, ...] = ()
     min_confidence: Share = MIN_CONFIDENCE
     error_samples: Count = 200
@@ -87,11 +84,10 @@ class ImagedSettings:
                 "imaged.pressure_mmHg and imaged.pressure_curve are both given, expected one of "
                 "them, the transmitral pressure on the closed valve"
             )
-        for setting, number, what in (("landmarks", False, "FILE"), ("held_out", True, "mmHg")):
-            for pair in getattr(self, setting):
-                own = isinstance(pair, Sequence) and len(pair) == 2 and isinstance(pair[0], int)
-                if not own or not isinstance(pair[1], float | int if number else str):
-                    raise InputError(f"imaged.{setting} has {pair!r}, expected [frame, {what}]")
+        for pair in self.landmarks:
+            two = isinstance(pair, Sequence) and len(pair) == 2
+            if not two or not isinstance(pair[0], int) or not isinstance(pair[1], str):
+                raise InputError(f"imaged.landmarks has {pair!r}, expected [frame, FILE]")
 
     @property
     def states_pressure(self) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from mvest.cache import Entry
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import Prediction
 from mvest.exchange.external.contract import (
@@ -25,7 +26,6 @@ from mvest.exchange.external.contract import (
     write_request,
 )
 from mvest.files import require_writable, sha256_of
-from mvest.kept import Entry
 from mvest.processes import Program
 from mvest.provenance import config_hash
 from mvest.typing import FloatArray

@@ -18,8 +18,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from mvest.cache import Entry
 from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
-from mvest.kept import Entry
 from mvest.processes import ending, run
 from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray

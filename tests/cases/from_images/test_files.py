@@ -1,11 +1,11 @@
 """Surfaces, landmarks and segmentations of a valve from images, read back."""
 
-import json
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
-from mvest.cases.from_images.files import write_for_slicer, write_landmarks, write_surfaces
+from mvest.cases.from_images.measures import write_landmarks, write_surfaces
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface
@@ -20,11 +20,9 @@ def test_the_surfaces_carry_their_times_confidence_and_leaflets(tmp_path):
     valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
     valve.std_mm[3] = np.nan
     index = write_surfaces(tmp_path, valve)
-    series = json.loads(index.read_text(encoding="utf-8"))
-    assert index.name == "valve.vtp.series"
-    assert series["file-series-version"] == "1.0"
-    assert [entry["time"] for entry in series["files"]] == [0.0, 0.04]
-    second = read_surface(tmp_path / series["files"][1]["name"])
+    entries = ET.parse(index).findall("Collection/DataSet")
+    assert [float(entry.get("timestep", "")) for entry in entries] == [0.0, 0.04]
+    second = read_surface(tmp_path / entries[1].get("file", ""))
     np.testing.assert_allclose(second.vertices, valve.vertices[1])
     np.testing.assert_array_equal(second.triangles, SMALL.triangles)
     np.testing.assert_allclose(second.point_data["confidence"], valve.vertex_confidence[1])
@@ -49,27 +47,8 @@ def test_landmarks_are_read_back_in_place(tmp_path):
     np.testing.assert_allclose(lists["free edge"].points, valve.free_edge[1])
 
 
-def test_slicer_gets_the_frames_asked_for(tmp_path):
-    nrrd = pytest.importorskip("nrrd")
-    valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
-    volume = made_up_sequence.volume(valve, spacing=1.5)
-    written = write_for_slicer(tmp_path, volume, valve, 1.2, [1])
-    assert [path.name for path in written] == ["valve_0001.mrk.json", "valve_0001.seg.nrrd"]
-    labels, header = nrrd.read(str(written[1]))
-    assert labels.shape == volume.frames.shape[1:]
-    assert {header["Segment0_Name"], header["Segment1_Name"]} == {
-        "mitral_anterior_leaflet", "mitral_posterior_leaflet",
-    }  # fmt: skip
-    for label, phi in ((1, 90), (2, 270)):
-        at = volume.index(valve.vertices[1, SMALL.vertex(phi, 4)]).round().astype(int)
-        assert labels[tuple(at)] == label
-
-
-def test_what_cannot_be_written_is_refused(tmp_path):
+def test_a_frame_that_does_not_exist_is_refused(tmp_path):
     valve = made_up_sequence.sequence((1.0,), SMALL)
-    volume = made_up_sequence.volume(valve, spacing=3.0)
-    with pytest.raises(InputError, match="thickness_mm = 0"):
-        write_for_slicer(tmp_path, volume, valve, 0.0, [0])
     with pytest.raises(InputError, match="frame 1, expected 0 to 0"):
         write_landmarks(tmp_path / "points.mrk.json", valve, 1)
     assert list(tmp_path.iterdir()) == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.from_images.detector_errors import BANDED, valve_axes, with_bands
-from mvest.cases.from_images.measures import measure_meaning, measure_sequence
+from mvest.cases.from_images.measures import measure_sequence
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
@@ -71,12 +71,6 @@ def test_a_frame_without_a_valve_has_no_band():
     rows = measure_sequence(valve, 1.0)
     empty = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))[1]
     assert {empty[f"{name}_{end}"] for name in BANDED for end in ("low", "high")} == {None}
-
-
-def test_a_bound_has_the_unit_of_what_it_bounds():
-    unit, meaning = measure_meaning("annulus_area_mm2_low")
-    assert unit == "mm²"
-    assert meaning.startswith("lower bound of the 95 % band of: area within the annulus")
 
 
 def test_errors_of_one_valve_and_of_another_layout_are_refused(valve, rows):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.doors import export_command
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.exchange.exporting.febio import FebioOptions, export_febio
 from mvest.mechanics.forces.cables import cable_force

@@ -9,7 +9,7 @@ import pytest
 import SimpleITK
 
 from mvest.cases.case import Role
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.exchange.exporting.slicer import SlicerOptions, export_slicer
 from mvest.valve.geometry.thickening import thicken

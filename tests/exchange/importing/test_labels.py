@@ -12,8 +12,7 @@ import pytest
 import SimpleITK
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case
 from mvest.errors import InputError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.typing import FloatArray, IntArray

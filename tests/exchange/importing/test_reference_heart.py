@@ -20,9 +20,8 @@ from experiments.studies.imported import (
     heart_files,
     import_heart,
 )
-from mvest.cases.folder import read_case
+from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import doubts
-from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.valve.geometry.proximity import closest_points

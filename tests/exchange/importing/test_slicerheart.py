@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.exchange.markups import PointList, write_markups

@@ -17,7 +17,7 @@ from experiments.common.schema import Reads, build
 from experiments.common.study import load_settings, study_names
 from experiments.run import main
 from experiments.studies.imported import HEART_PARTS, DonorSettings, recorded_valve
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from mvest.exchange.external.contract import write_points
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.volume import Modality, VolumeSequence

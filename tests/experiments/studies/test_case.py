@@ -14,7 +14,7 @@ from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.case import STUDY, Settings
 from mvest.cases.case import ErrorSamples
-from mvest.cases.writer import write_case
+from mvest.cases.folder import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.personalisation import Treatment, check, default_settings
 from mvest.problem.verdict import ONE_STATE

@@ -17,8 +17,7 @@ from experiments.common.building.closure import (
 from experiments.common.building.gate import anatomy_digest
 from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of, plain
-from mvest.cases.folder import read_case
-from mvest.cases.writer import write_case
+from mvest.cases.folder import read_case, write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.scenarios.scenario import plane_of
 from mvest.valve.anatomy.template import Template

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 
 import experiments
+import mvest.cache
 import mvest.closure.model
 import mvest.files
-import mvest.source
 from experiments.common.building.twin import MADE_BY
-from mvest.cases.writer import write_case
+from mvest.cache import Counts, Sources
+from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
-from mvest.kept import Counts
 from mvest.problem.stored import Store, StoredModel, key_of
-from mvest.source import Sources
 
 
 class Model:
@@ -201,7 +200,7 @@ def truth(tmp_path, monkeypatch):
     def is_simulated() -> bool:
         model = Model()
         with monkeypatch.context() as patched:
-            patched.setattr(mvest.source, "SOURCES", Sources(**roots))
+            patched.setattr(mvest.cache, "SOURCES", Sources(**roots))
             Store(tmp_path / "outputs").model("truth", model, VALUES, MADE_BY)(AT)
         return model.calls == 1
 

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-import mvest.kept
+from mvest.cache import Counts, Entry, get_or_make, prune
 from mvest.errors import InputError, MeshingError
-from mvest.kept import Counts, Entry, get_or_make, prune
 
 
 def read(path: Path) -> str:
@@ -209,7 +208,7 @@ def test_of_several_that_need_the_same_entries_one_makes_them_and_no_two_wait_fo
 MAKER = """
 import sys, time
 from pathlib import Path
-from mvest.kept import Entry
+from mvest.cache import Entry
 
 folder, name = Path(sys.argv[1]), sys.argv[2]
 
@@ -252,7 +251,7 @@ def test_locks_are_taken_in_one_order_whatever_the_order_of_the_entries(tmp_path
         taken.append(path.name)
         return FileLock(path)
 
-    monkeypatch.setattr(mvest.kept, "FileLock", lock)
+    monkeypatch.setattr("filelock.FileLock", lock)
     get_or_make([Entry(tmp_path / name, read) for name in "bca"], lambda numbers: numbers, write)
     assert taken == [".a.lock", ".b.lock", ".c.lock"]
 

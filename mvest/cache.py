@@ -1,0 +1,300 @@
+"""A cache on disk for expensive results, and keys of the code that makes them.
+
+Beside each entry lies its digest, ``.NAME.sha256``. An entry without it, or that does not match it,
+was not written under this name as it is; it is made again, even if its reader accepts it.
+
+The key of a maker is a hash of its module and of all modules that this one imports. Imports are
+followed through `mvest` and the packages that join it by :meth:`Sources.include`, also imports
+within functions, but not those for type checking, nor names that `mvest` itself loads on first use.
+A text that names a module, or a Python file beside the module, counts as an import. Comments,
+docstrings and layout do not count, nor do the packages above an imported module. Files of data and
+settings are not code: callers describe them.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Generic, TypeVar
+
+from mvest.errors import InputError, cannot_write
+from mvest.files import remove_parts, sha256_of, write_atomically
+
+T = TypeVar("T")
+
+DAMAGE = (OSError, ValueError, LookupError, TypeError)
+"""What readers raise for a file that a broken disk or a user has changed."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """How often an entry was read (``hits``) and made (``misses``)."""
+
+    hits: int = 0
+    misses: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Entry(Generic[T]):
+    """A cached file or folder, which is there whole or not at all.
+
+    Attributes
+    ----------
+    path : Path
+        Named by everything that decides its content.
+    read : callable
+        Reads a path; refuses what is damaged.
+    remake : bool
+        Whether a damaged entry is made again. One that cannot be reproduced is refused instead.
+    counts : Counts
+    """
+
+    path: Path
+    read: Callable[[Path], T]
+    remake: bool = True
+    counts: Counts = field(default_factory=Counts)
+
+    def found(self) -> T | None:
+        """The cached value; None if there is none, or a damaged one that can be made again."""
+        if not self.path.exists():
+            return None
+        try:
+            # What cannot be made again holds its digest itself, which its reader checks.
+            if self.remake and self._digest(self.path) != self.seal.read_text(encoding="utf-8"):
+                return None
+            value = self.read(self.path)
+        except DAMAGE:
+            if not self.remake:
+                raise
+            return None
+        with suppress(OSError):  # a read-only cache
+            os.utime(self.path)
+        return value
+
+    @property
+    def seal(self) -> Path:
+        """The file of its digest."""
+        return self.path.with_name(f".{self.path.name}.sha256")
+
+    def _digest(self, path: Path) -> str:
+        """Digest of the content and the name: an entry that was moved is another one."""
+        about = f"{self.path.parent.name}/{self.path.name} {sha256_of(path)}"
+        return hashlib.sha256(about.encode()).hexdigest()
+
+    def get_or_make(
+        self,
+        make: Callable[[], Any],
+        write: Callable[[Path, Any], object],
+        keep: Callable[[Any], bool] = lambda _: True,
+    ) -> T:
+        """The cached value, made now if there is none: see :func:`get_or_make`."""
+        return get_or_make([self], lambda _: [make()], write, keep)[0]
+
+    def keep(self, value: Any, write: Callable[[Path, Any], object]) -> T:
+        """Cache a value; returns what others will read."""
+        write_atomically(self.path, lambda part: write(part, value), sync=True)
+        # A process that dies in between leaves an entry without its digest, which is made again.
+        write_atomically(self.seal, self._digest(self.path))
+        return self.read(self.path)
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Let one of several processes in; the others wait."""
+        import filelock  # which takes longer to import than all else here
+
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            lock = filelock.FileLock(self.path.with_name(f".{self.path.name}.lock"))
+            lock.acquire()
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+        try:
+            yield
+        finally:
+            lock.release()
+
+
+def get_or_make(
+    entries: Sequence[Entry[T]],
+    make: Callable[[list[int]], Iterable[Any]],
+    write: Callable[[Path, Any], object],
+    keep: Callable[[Any], bool] = lambda _: True,
+) -> list[T]:
+    """The cached values of entries; missing ones are made together.
+
+    Of several processes that need the same entries, the first makes them and the others wait.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+    make : callable
+        Numbers of entries -> their values, one after another; each is cached as it comes.
+    write : callable
+        Writes a value to a path, as a file or as a folder.
+    keep : callable
+        Whether a value is cached. One that is not is returned as it is.
+
+    Returns
+    -------
+    list
+        What was read from the cache, also right after it was made.
+
+    Raises
+    ------
+    InputError
+        If the cache cannot be written.
+    """
+    values: list[Any] = [entry.found() for entry in entries]
+    left = [k for k, value in enumerate(values) if value is None]
+    with ExitStack() as locks:
+        # In one order, so that no two processes wait for each other.
+        for _, entry in sorted({entries[k].path: entries[k] for k in left}.items()):
+            locks.enter_context(entry.alone())
+        for k in left:
+            values[k] = entries[k].found()
+        left = [k for k in left if values[k] is None]
+        for entry in (entries[k] for k in left):
+            remove_parts(entry.path.parent, entry.path.name)
+            if entry.path.exists():
+                print(f"note: {entry.path} is damaged and is made again", file=sys.stderr)
+        for k, value in zip(left, make(left) if left else (), strict=True):
+            values[k] = entries[k].keep(value, write) if keep(value) else value
+            entries[k].counts.misses += 1
+    for k in set(range(len(entries))) - set(left):
+        entries[k].counts.hits += 1
+    return values
+
+
+def prune(folder: Path, pattern: str, largest_mb: float) -> None:
+    """Remove the least recently used files of a cache that has grown beyond a size.
+
+    Parameters
+    ----------
+    folder : Path
+    pattern : str
+        Of the names of the entries, which are files.
+    largest_mb : float
+        Size in 10^6 bytes; a larger cache is reduced to nine tenths of it.
+    """
+    used = []
+    for path in folder.glob(pattern):
+        with suppress(OSError):  # removed meanwhile
+            about = path.stat()
+            used.append((about.st_mtime_ns, about.st_size, path))
+    size, removed = sum(bytes_ for _, bytes_, _ in used), 0
+    if size <= 1e6 * largest_mb:
+        return
+    for _, bytes_, path in sorted(used)[:-1]:
+        if size <= 0.9e6 * largest_mb:
+            break
+        for part in (path, Entry(path, Path.read_bytes).seal):
+            part.unlink(missing_ok=True)
+        size, removed = size - bytes_, removed + 1
+    print(
+        f"note: {folder} holds more than {largest_mb:g} MB; of its entries {removed} were removed "
+        "that were not used for longest",
+        file=sys.stderr,
+    )
+
+
+class Sources:
+    """The code of some packages, as it is when it is first read: that of this process.
+
+    Parameters
+    ----------
+    **folders : Path
+        Of each package.
+    """
+
+    def __init__(self, **folders: Path) -> None:
+        self._folders: dict[str, Path] = {}
+        self.include(**folders)
+
+    def include(self, **folders: Path) -> None:
+        """Follow imports into further packages."""
+        self._folders |= folders
+        # What was read before might name modules of theirs.
+        self._modules: dict[str, tuple[str, list[str]]] = {}
+
+    def key(self, *modules: str) -> str:
+        """Hash of modules and of all that they import; InputError for a foreign module."""
+        reached = sorted((name, self._modules[name][0]) for name in self.reached(*modules))
+        return hashlib.sha256(repr(reached).encode()).hexdigest()
+
+    def reached(self, *modules: str) -> set[str]:
+        """Names of modules and of all that they import."""
+        found, left = set[str](), list(modules)
+        while left:
+            name = left.pop()
+            if name not in found:
+                found.add(name)
+                if name not in self._modules:
+                    self._modules[name] = self._read(name)
+                left += self._modules[name][1]
+        return found
+
+    def _read(self, name: str) -> tuple[str, list[str]]:
+        """A module's code without its docstrings and comments, and the modules that it names."""
+        path = self._path(name)
+        if path is None:
+            raise InputError(f"{name} is no module of {' or '.join(self._folders)}")
+        code = _without_texts(path.read_bytes())
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        named = re.findall(r"'(\w+(?:\.\w+)+)'", code)
+        named += [f"{package}.{text[:-3]}" for text in named if text.endswith(".py")]
+        for line in re.findall(r"^\s*import (.+)", code, re.MULTILINE):
+            named += re.findall(r"[\w.]+", line)
+        for base, items in re.findall(r"^\s*from ([\w.]+) import (.+)", code, re.MULTILINE):
+            named += [base, *(f"{base}.{item}" for item in re.findall(r"\w+", items))]
+        return code, [module for module in named if self._path(module)]
+
+    def _path(self, name: str) -> Path | None:
+        """The file of a module; None if it is none of these packages."""
+        top, *rest = name.split(".")
+        if top not in self._folders:
+            return None
+        place = self._folders[top].joinpath(*rest)
+        files = (place / "__init__.py", place.with_suffix(".py"))
+        return next((file for file in files if file.is_file()), None)
+
+
+def _without_texts(source: bytes) -> str:
+    """Code without comments, docstrings, layout and imports for type checking."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body: Any = getattr(node, "body", None)
+        if isinstance(body, list):
+            left = [part for part in body if not _is_silent(part)]
+            node.body = left or [ast.Pass()]  # type: ignore[attr-defined]
+    return ast.unparse(tree)
+
+
+def _is_silent(node: ast.stmt) -> bool:
+    if isinstance(node, ast.If):
+        return "TYPE_CHECKING" in ast.unparse(node.test)
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+
+
+SOURCES = Sources(mvest=Path(__file__).parent)
+
+
+def source_key(*made_by: Any) -> str:
+    """Key of the code of modules, and of the modules of functions or classes.
+
+    Raises
+    ------
+    InputError
+        If one of them is of another package.
+    """
+    names = (
+        made.__name__ if isinstance(made, ModuleType) else str(made.__module__) for made in made_by
+    )
+    return SOURCES.key(*names)
