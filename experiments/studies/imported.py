@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -23,13 +22,18 @@ from experiments.common.building.closing import close_valve, draw_closing
 from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
-    closure_model,
     folder_hash,
     mechanics_of,
 )
 from experiments.common.building.filters import build_filter
-from experiments.common.building.gate import anatomy_digest, gate_cases, gate_rows
-from experiments.common.building.twin import build_twin
+from experiments.common.building.gate import (
+    anatomy_digest,
+    ask_gate,
+    closures_of,
+    gate_cases,
+    gate_rows,
+)
+from experiments.common.building.twin import build_twin, estimate_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import Reads, Values, contents
@@ -45,11 +49,11 @@ from mvest.cases.tissue import (
 )
 from mvest.cases.writer import write_case
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GATE_CASES, run_gate
+from mvest.closure.robustness import GATE_CASES
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction
-from mvest.estimation.wrappers import Remembered, SharedStart
+from mvest.estimation.wrappers import Remembered
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.regions import part_of
@@ -58,9 +62,11 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
+from mvest.problem.fields import valve_fields
 from mvest.problem.problem import Problem
 from mvest.problem.record import EstimateRecord, record_of
 from mvest.quantities import Length, Share, Thickness
+from mvest.reporting.skill import estimates_table
 from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
@@ -350,7 +356,10 @@ def _donor(job: Job[Settings]) -> Result:
     failed = [one for one in records if not one.converged]
     ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
     return Result(
-        tables={"": table(rows, **DISTANCES), "moduli": moduli_table(records)},
+        tables={
+            "": table(rows, **DISTANCES),
+            "moduli": estimates_table("estimation", records),
+        },
         estimates=tuple(records),
         numbers={
             "data": DONOR_CITATION,
@@ -374,39 +383,12 @@ DISTANCES: dict[str, Column | str] = {
 }
 
 
-def moduli_table(records: list[EstimateRecord]) -> Table:
-    """A row for each modulus of each estimate."""
-    keys = ("parameter", "truth", "prior_mean", "estimate", "std", "bound", "relative_error")
-    rows = [
-        {"estimation": one.case} | {key: row.get(key) for key in (*keys, "distance_mean", "reason")}
-        for one in records
-        for row in one.rows()
-        if row.get("kind", "modulus") == "modulus"
-    ]
-    columns: dict[str, Column | str] = {
-        "truth": Column("MPa"),
-        "prior_mean": Column("MPa", hidden=True),
-        "estimate": Column("MPa", std="std"),
-        "bound": Column("MPa", ".2g", label="data alone leave"),
-        "relative_error": Column(digits="+.2%", label="error"),
-        "distance_mean": "mm",
-        "reason": Column(hidden=True),
-    }
-    return table(rows, estimation="", parameter="", **columns)
-
-
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
     """As those of a case (`mvest.problem.fields`)."""
-    surface, tips = valve.coarse.surface, valve.recording.valve.motion.papillary_tips
+    tips = valve.recording.valve.motion.papillary_tips
     away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
     return {
-        "triangles": surface.triangles,
-        "region": surface.region,
-        "annulus": valve.coarse.annulus,
-        "free_edge": valve.coarse.free_edge,
-        "rest": surface.vertices,
-        "frames": np.array(["closed"]),
-        "seen": np.array([True]),
+        **valve_fields(valve.coarse, ["closed"]),
         "tips": tips[[0, -1]],
         "observed": valve.seen[None],
         **{name: points[None] for name, points in shapes.items()},
@@ -470,14 +452,7 @@ def _heart(job: Job[Settings]) -> Result:
         there = _on_case(values, import_heart(heart.source, options)[0], place)
         there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
         rows += _closure_rows(name, assumed, close_valve(there, name).ends().steps())
-    truth = np.array(own["truth"]["values"], dtype=float)
-    gate = run_gate(
-        lambda each: closure_model(own, each),
-        truth,
-        asked,
-        on_case=lambda row: _say(f"gate, {row.case}: max {row.max_mm:.2g} mm, {row.reason}"),
-        on_path=lambda path: _say(f"gate, along {path.name}: {path.reason or 'no jump'}"),
-    )
+    gate = ask_gate(own, asked)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
     shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
     failed = [one.reason for one in records if not one.converged]
@@ -490,7 +465,7 @@ def _heart(job: Job[Settings]) -> Result:
             "shape": table([dict(zip(("name", "value", "unit"), r, strict=True)) for r in shape]),
             "meshes": table(_meshes(own), volume="mm³:.0f"),
             "gate": gate_rows(gate),
-            "moduli": moduli_table(records),
+            "moduli": estimates_table("estimation", records),
             "derived": table([{"what follows from the source": text} for text in case.derived]),
         },
         estimates=tuple(records),
@@ -499,17 +474,10 @@ def _heart(job: Job[Settings]) -> Result:
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",
         mesh=Mesh.of(closing.model.mesh),
-        forward_solves=1
-        + len(heart.closures)
-        + len(gate.rows)
-        + sum(path.closures for path in gate.paths),
+        forward_solves=1 + len(heart.closures) + closures_of(gate),
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
         f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
     )
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
@@ -585,17 +553,7 @@ def _meshes(values: Values) -> list[dict[str, Any]]:
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
     """Moduli from one simulated observation."""
     twin = build_twin({**values, "truth": {**values["truth"], **changes}})
-    true, steps = twin.truth_values, len(twin.model.settings.protocol.steps())
-    with SolveBar(f"observation, {name}", steps, 1) as bar:
-        twin.truth_model.on_step = bar.step
-        seen = twin.source(true)
-    data = twin.observe(lambda m: seen, true, np.random.default_rng(values["seed"]))
-    if data.observation is None:
-        return EstimateRecord(case=name, status="failed", reason=data.reason)
-    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
-    with SolveBar(f"estimation, {name}", steps, TYPICAL_SOLVES, problem.parameters) as bar:
-        twin.model.on_step = bar.step
-        found = estimate(problem, data.observation, on_iterate=bar.iterate).against(data.truth)
+    (found,) = estimate_twin(twin, [values["seed"]], name)
     return record_of(found, seed=values["seed"], case=name, simulated=True)
 
 

@@ -42,10 +42,6 @@ class SweptJob(Frozen):
         First digits of the hash of its configuration.
     seed, repeats : int
         It runs with the seeds ``seed``, ``seed + 1``, ..., so many in all.
-    start, truth : (p,) or None
-        Initial guess and true values of the sweep's parameters, as configured.
-    P0, Q, R : number, (p,) or (p, p)
-        Covariances of the filter, as configured.
     record : Record
         Its head, see `head_of`.
     """
@@ -53,11 +49,6 @@ class SweptJob(Frozen):
     hash: str
     seed: int
     repeats: int = 1
-    start: tuple[float | None, ...] | None = None
-    truth: tuple[float | None, ...] | None = None
-    P0: Any = None
-    Q: Any = None
-    R: Any = None
     record: Record
 
     @property
@@ -93,7 +84,7 @@ class Sweep(Frozen):
         At least one.
     """
 
-    version: Literal[3] = 3
+    version: Literal[4] = 4
     name: str
     size: str | None = None
     title: str
@@ -114,10 +105,16 @@ class Sweep(Frozen):
         """Those of all jobs."""
         return [job.record for job in self.jobs]
 
+    @property
+    def has_starts(self) -> bool:
+        """Whether its runs begin at several initial guesses."""
+        runs = (run for record in self.records for run in record.estimates)
+        return len({tuple(one.prior_mean for one in run.unknowns) for run in runs}) > 1
+
     def plain(self) -> dict[str, Any]:
         """Plain data for JSON, sealed; `Sweep.of_plain` reads them."""
-        # Of the ways from several starts, one a job.
-        first = 1 if len({job.start for job in self.jobs}) > 1 else 0
+        # Of the paths from several starts, one a job.
+        first = 1 if self.has_starts else 0
         jobs = []
         for job in self.jobs:
             unshown = dict.fromkeys(range(first, len(job.record.estimates)), PATHS)

@@ -41,6 +41,8 @@ MOST_PANELS, MOST_CELLS = 4, 16
 TICKS, SHORT, LINE = 8, 8, 18
 """Values named at an axis, characters of a name that stands upright, and of a line of another."""
 
+TRUE_LINE = {"color": "black", "linestyle": "--", "linewidth": 1.2}
+
 Values = dict[str, list[Any]]
 
 
@@ -198,7 +200,7 @@ def _paths(sweep: Sweep, values: Values) -> Figure | None:
     part, parts = _parted(values, ())
     factor = next((name for name, (column, _) in factors_of(sweep).items() if column == part), "")
     jobs = [job for job in sweep.jobs if job.record.estimates and job.record.estimates[0].iterates]
-    if len({job.start for job in jobs}) < 2:
+    if not sweep.has_starts:
         return None
     figure, grid = panels(len(sweep.parameters), len(parts), 2.4 * len(sweep.parameters) + 0.8,
                           sharey="row")  # fmt: skip
@@ -212,8 +214,9 @@ def _paths(sweep: Sweep, values: Values) -> Figure | None:
                 path = [iterate[names.index(name)] for iterate in run.iterates]
                 grid[k, column].plot(path, color=colour, linewidth=0.8, alpha=0.7)
                 grid[k, column].plot(len(path) - 1, path[-1], end, color=colour, markersize=4)
-        for axes, truth in zip(grid[:, column], jobs[0].truth or (), strict=False):
-            axes.axhline(truth, color="black", linestyle="--", linewidth=1.2)
+        for axes, name in zip(grid[:, column], sweep.parameters, strict=True):
+            truth = jobs[0].record.estimates[0].unknown(name).truth
+            axes.axhline(np.nan if truth is None else truth, **TRUE_LINE)
             axes.xaxis.get_major_locator().set_params(integer=True)
     for axes, name, short in zip(grid[:, 0], sweep.parameters, _names(sweep), strict=True):
         axes.set_ylabel(f"{short} [{unit_of(name)}]" if unit_of(name) else short)

@@ -131,7 +131,7 @@ def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
     assert words in err
 
 
-def gate_of_made_up(build, m, cases, on_case, on_path):
+def gate_of_made_up(values, cases):
     """What the gate would say; asking it is `tests.closure.test_robustness`'s."""
     rows = [GateRow("reference", 0.0, 0.0, True, 1.0, "converged")]
     rows += [GateRow(case.name, 0.1, 0.7, False, 1.0, "converged") for case in cases]
@@ -152,7 +152,7 @@ def run_heart(monkeypatch, *arguments):
 
 @pytest.mark.slow
 def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.studies.imported.run_gate", gate_of_made_up)
+    monkeypatch.setattr("experiments.studies.imported.ask_gate", gate_of_made_up)
     monkeypatch.setattr("experiments.studies.imported._twin", twin_of_made_up)
     source = heart(tmp_path / "heart")
     monkeypatch.chdir(tmp_path)

@@ -10,6 +10,7 @@ import numpy as np
 
 from experiments.common.records.record import Model
 from experiments.sweeps.collected import Sweep, SweptJob
+from experiments.sweeps.runs import Z95
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from tests.experiments.studies.made_up import NAMES, SOURCE, made_up
 
@@ -22,7 +23,17 @@ def unknowns(estimate: Any, std: Any, bound: Any = None, start: Any = (5.0, 3.0)
         for values in (start, estimate, std, bound, TRUTH)
     ]
     return tuple(
-        Unknown(name=name, unit="MPa", prior_mean=m, estimate=e, std=s, bound=b, truth=t)
+        Unknown(
+            name=name,
+            unit="MPa",
+            prior_mean=m,
+            estimate=e,
+            std=s,
+            bound=b,
+            truth=t,
+            low=None if e is None else e - Z95 * s,
+            high=None if e is None else e + Z95 * s,
+        )
         for name, m, e, s, b, t in zip(NAMES, *columns, strict=True)
     )
 
@@ -91,9 +102,8 @@ def job(
         estimates=tuple(runs),
     )
     first = runs[0].seed if runs else 1
-    whole = {"start": (5.0, 3.0), "P0": 9.0, "Q": 0.0, "R": 0.01, "seed": first, "repeats": 1}
-    whole |= {"hash": digest[:16], "truth": TRUTH.tolist(), "record": record}
-    return SweptJob(**{**whole, "repeats": max(len(runs), 1), **changes})
+    whole = {"hash": digest[:16], "seed": first, "repeats": max(len(runs), 1), "record": record}
+    return SweptJob(**{**whole, **changes})
 
 
 def sweep(name: str, jobs: Iterable[SweptJob], **changes: Any) -> Sweep:
@@ -120,7 +130,7 @@ def starts(name: str = "starts") -> Sweep:
                 good = (a, b) != (9.0, 8.0)
                 runs = [run(1, TRUTH * (1 + error), [0.02, 0.005], start=(a, b))] if good else []
                 factors = {"start_anterior": a, "start_posterior": b, "filter": filter_}
-                jobs.append(job(factors, runs, "killed", start=(a, b)))
+                jobs.append(job(factors, runs, "killed"))
     return sweep(name, jobs)
 
 

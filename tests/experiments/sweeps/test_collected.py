@@ -47,8 +47,10 @@ def test_paths_are_kept_where_starts_differ_of_the_first_seed():
 
     assert kept(starts()) == [True] * 16
     assert not any(kept(noise(2)))
-    two = [run(seed, TRUTH, [0.1, 0.1]) for seed in (1, 2)]
-    jobs = [job({"a": k}, two, start=(float(k), 1.0)) for k in (1, 2)]
+    jobs = [
+        job({"a": k}, [run(seed, TRUTH, [0.1, 0.1], start=(float(k), 1.0)) for seed in (1, 2)])
+        for k in (1, 2)
+    ]
     assert kept(sweep("x", jobs)) == [True, False] * 2
 
 
