@@ -518,7 +518,7 @@ def ranks_figure(scenarios: Mapping[str, Patients]) -> Figure:
     """
     from mvest.reporting.figures import panels
 
-    columns = max(min(5, len(scenarios)), 1)
+    columns = max(min(4, len(scenarios)), 1)
     lines = max(-(-len(scenarios) // columns), 1)
     drawn, grid = panels(lines, columns, 2.0 * lines + 0.6, sharex=True, sharey=True)
     for axes, (name, patients) in zip(grid.flat, scenarios.items(), strict=False):

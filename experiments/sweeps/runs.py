@@ -99,7 +99,8 @@ def factors_of(sweep: Sweep) -> dict[str, tuple[str, str]]:
 def runs_of(sweep: Sweep) -> Table:
     """A row for each parameter of each run (job and seed), failed ones included, factors first.
 
-    Errors are signed, in percent of the truth. Of a lost run only its factors are known.
+    Errors are signed, in percent of the truth. The ends of an interval are those that the record
+    states, or 1.96 standard deviations from the estimate. Of a lost run only its factors are known.
     """
     factors = factors_of(sweep)
     units = {**dict(factors.values()), **COLUMNS}
@@ -127,12 +128,17 @@ def _table(sweep: Sweep, rows: list[dict[str, Any]], about: dict[str, Column]) -
 
 def _cells(row: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Columns of a parameter from its row of a record."""
-    error = row.get("relative_error")
+    low, high, error = row.get("low"), row.get("high"), row.get("relative_error")
+    estimate, std = row.get("estimate"), row.get("std")
+    if low is None and estimate is not None and std is not None:
+        low, high = estimate - Z95 * std, estimate + Z95 * std
     return {
         **row,
         "parameter": name,
         "start": row.get("prior_mean"),
         "true value": row.get("truth"),
+        "low": low,
+        "high": high,
         BOUND: row.get("bound"),
         ERROR: None if error is None else 100.0 * error,
         "distance mean": row.get("distance_mean"),

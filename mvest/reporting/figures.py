@@ -160,8 +160,8 @@ def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
         axes.set(xlabel="iteration", ylabel=unknown.name + unit)
         axes.xaxis.get_major_locator().set_params(integer=True)
     lines, names = grid[0].get_legend_handles_labels()
-    where = "outside upper center"
-    figure.legend(lines, names, loc=where, ncols=3, frameon=False, fontsize=SMALL)
+    where: Any = "outside upper center"
+    figure.legend(lines, names, loc=where, ncols=2, frameon=False, fontsize=SMALL)
     return figure
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from experiments.common.records.record import Model
 from experiments.sweeps.collected import Sweep, SweptJob
-from experiments.sweeps.runs import Z95
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from tests.experiments.studies.made_up import NAMES, SOURCE, made_up
 
@@ -23,17 +22,7 @@ def unknowns(estimate: Any, std: Any, bound: Any = None, start: Any = (5.0, 3.0)
         for values in (start, estimate, std, bound, TRUTH)
     ]
     return tuple(
-        Unknown(
-            name=name,
-            unit="MPa",
-            prior_mean=m,
-            estimate=e,
-            std=s,
-            bound=b,
-            truth=t,
-            low=None if e is None else e - Z95 * s,
-            high=None if e is None else e + Z95 * s,
-        )
+        Unknown(name=name, unit="MPa", prior_mean=m, estimate=e, std=s, bound=b, truth=t)
         for name, m, e, s, b, t in zip(NAMES, *columns, strict=True)
     )
 
