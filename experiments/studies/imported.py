@@ -350,8 +350,8 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():
             raise InputError(f"heart: no file {file}; {WHERE_FROM}/reference_heart.yaml")
-    file = Path(str(heart.source))
-    whole = read_surface(file)
+    source = Path(str(heart.source))
+    whole = read_surface(source)
     whole = whole if heart.leaflets is None else part_of(whole, heart.leaflets)
     known = LeafletsOptions(
         leaflets=heart.leaflets,
@@ -360,7 +360,7 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
         smoothing_mm=heart.smoothing_mm,
         thickness_range_mm=(heart.min_thickness_mm, heart.max_thickness_mm),
     )
-    case = import_leaflets(file, known)
+    case = import_leaflets(source, known)
     surface, tips = case.surface, case.frames[0].papillary_tips
     loops = case.annulus, case.free_edge
     band = LeafletBand.of(surface.vertices, surface.triangles, surface.region, *loops, anterior=0)
