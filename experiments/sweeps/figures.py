@@ -115,8 +115,12 @@ def _panel(
     axes.axhline(0.0, color="black", linewidth=0.8)
     axes.grid(axis="x", visible=False)
     axes.set_xlim(places[0] - 0.6 * gap, places[-1] + 0.6 * gap)
-    step = -(-len(values) // TICKS) if is_number(values) else 1
-    axes.set_xticks(places[::step], [fill(_label(value), LINE) for value in values[::step]])
+    shown: list[int] = []
+    for k, place in enumerate(places):
+        crowded = is_number(values) and shown and place - places[shown[-1]] < np.ptp(places) / TICKS
+        if not crowded:
+            shown.append(k)
+    axes.set_xticks(places[shown], [fill(_label(values[k]), LINE) for k in shown])
     if max(len(_label(value)) for value in values) > SHORT:
         for text in axes.get_xticklabels():
             text.set(rotation=40, rotation_mode="anchor", horizontalalignment="right")
