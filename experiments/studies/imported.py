@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from experiments.common.building.closing import close_valve, draw_closing
+from experiments.common.building.closing import Closing, close_valve, draw_closing
 from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
@@ -67,7 +67,7 @@ from mvest.problem.problem import Problem
 from mvest.problem.record import EstimateRecord, record_of
 from mvest.quantities import Length, Share, Thickness
 from mvest.reporting.skill import estimates_table
-from mvest.reporting.tables import Column, Table, table
+from mvest.reporting.tables import Column, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
@@ -381,21 +381,20 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
 def _heart(job: Job[Settings]) -> Result:
     heart, values = job.settings.heart, job.values
     asked = gate_cases(heart.gate)
-    case, volume = import_heart(heart, heart.closed_depth)
-    own = _on_case(values, case, job.folder / "case")
-    usual = {
-        "annulus_contraction": own["valve"]["annulus_contraction"],
-        "closed_depth": heart.closed_depth,
-    }
-    closing = close_valve(own)
-    ends = closing.ends()
-    rows = _closure_rows("as in gate and twins", usual, ends.steps())
-    for number, (name, changes) in enumerate(heart.closures.items()):
+    contraction = values["valve"]["annulus_contraction"]
+    usual = {"annulus_contraction": contraction, "closed_depth": heart.closed_depth}
+    closures: dict[str, Any] = {"as in gate and twins": {}, **heart.closures}
+    rows, made = list[dict[str, Any]](), list[tuple[ValveCase, float, dict[str, Any], Closing]]()
+    for name, changes in closures.items():
         assumed = usual | changes
-        case_there, _ = import_heart(heart, assumed["closed_depth"])
-        there = _on_case(values, case_there, job.folder / f"case_{number}")
+        case, volume = import_heart(heart, assumed["closed_depth"])
+        there = _on_case(values, case, job.folder / f"case_{len(made)}")
         there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
-        rows += _closure_rows(name, assumed, close_valve(there, name).ends().steps())
+        closing = close_valve(there, name)
+        states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
+        rows += [{"closure": name, **assumed, "state": state, **row} for state, row in states]
+        made.append((case, volume, there, closing))
+    case, volume, own, closing = made[0]
     gate = ask_gate(own, asked)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
     shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
@@ -414,11 +413,11 @@ def _heart(job: Job[Settings]) -> Result:
         },
         estimates=tuple(records),
         numbers={"anatomy": anatomy_digest(own), "passed": gate.passed, "data": heart.citation},
-        arrays=ends.arrays(),
+        arrays=closing.ends().arrays(),
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",
         mesh=Mesh.of(closing.model.mesh),
-        forward_solves=1 + len(heart.closures) + closures_of(gate),
+        forward_solves=len(made) + closures_of(gate),
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
         f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
     )
@@ -431,12 +430,6 @@ def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
     write_case(place, case)
     own = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
     return {**values, "valve": {**values["valve"], **own}}
-
-
-def _closure_rows(name: str, assumed: Values, steps: Table) -> list[dict[str, Any]]:
-    """The open and the last state of a closure."""
-    states = zip(("open", "closed"), steps.rows, strict=True)
-    return [{"closure": name, **assumed, "state": state, **row} for state, row in states]
 
 
 def _sizes(case: ValveCase) -> list[tuple[str, float | None, str]]:
