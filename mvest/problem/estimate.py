@@ -182,14 +182,13 @@ def estimate(
     if filtered.prediction is not None:
         aux = filtered.prediction.aux
         fitted = aux if isinstance(aux, np.ndarray) else None
-        if filtered.prediction.differentiated:
-            # What is estimated near zero has its prior for a size.
-            bound = identifiability(
-                filtered.prediction.jacobian,
-                observation.R if filtered.learned is None else filtered.learned.noise,
-                np.maximum(np.abs(filtered.mean), problem.prior.std),
-                names=problem.parameters,
-            )
+        # What is estimated near zero has its prior for a size.
+        bound = identifiability(
+            filtered.prediction.jacobian,
+            observation.R if filtered.learned is None else filtered.learned.noise,
+            np.maximum(np.abs(filtered.mean), problem.prior.std),
+            names=problem.parameters,
+        )
     return StudyResult(
         parameters=problem.parameters,
         tissue=problem.tissue,
