@@ -105,10 +105,8 @@ STRUCTURED = "personal.mesh.source=structured"
 
 RUNS = {
     # Neither confirming nor measuring the closed valve changes an estimate.
-    "table1": Run(("experiment=table1", "confirm=false", "measure=false")),
-    "table1_independent": Run(
-        ("experiment=table1_independent", "confirm=false", "measure=false"), slow=True
-    ),
+    "table1": Run(("experiment=table1", "confirm=false")),
+    "table1_independent": Run(("experiment=table1_independent", "confirm=false"), slow=True),
     "sweep": Run(
         (
             "sweep=debug",

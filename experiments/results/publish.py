@@ -58,15 +58,10 @@ def publish_run(values: Mapping[str, Any], record: Record, folder: Path, name: s
     InputError
         If a file cannot be written.
     """
-    kept = record.converged or load_study(record.study).keeps_failures
-    if not values["publish"] or values["sweep"] or not kept:
-        return
     results = Path(values["paths"]["results"])
-    if name is None:
+    if name is None and values["publish"] and not values["sweep"]:
         print(f"{results} left as it is: this run has overrides")
-        return
-    publish(load_study(record.study), results, {name: (record, folder)})
-    print(f"Results in {results}")
+    publish_runs([(name, record, folder, results)])
 
 
 def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -> None:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import runpy
 import sys
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,10 +21,7 @@ from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import NOT_HASHED, InputFile, Reads, Values, build, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import ObservationModel, predict
-from mvest.estimation.run import Filter
-from mvest.estimation.transform import Transform
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.exchange.external.contract import (
     Command,
     files_of_command,
@@ -33,13 +29,18 @@ from mvest.exchange.external.contract import (
     write_points,
 )
 from mvest.exchange.external.model import Differences, ProcessModel
-from mvest.problem.estimate import StudyResult
-from mvest.problem.record import EstimateRecord, record_of, spread
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import estimate
+from mvest.problem.problem import Problem
+from mvest.problem.record import EstimateRecord, record_of
 from mvest.reporting.tables import Column, table
 from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+POINTS = ("points",)
+"""The one frame that models predict."""
 
 FITTED = "fitted.csv"
 """Where a single model puts the observed points at its estimate."""
@@ -99,15 +100,24 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What every estimate of a run has in common; the variance is of a coordinate, mm²."""
+    """What every estimate of a run has in common.
+
+    Attributes
+    ----------
+    about : ExternalSettings
+    problem : Problem
+        With a model that predicts nothing.
+    truth : mapping
+        True values by parameter, as far as they are known.
+    variance : float
+        Of a coordinate, mm².
+    folder : Path
+    """
 
     about: ExternalSettings
-    names: tuple[str, ...]
+    problem: Problem
     truth: dict[str, float]
     variance: float
-    filter: Filter
-    transform: Transform
-    prior: Gaussian
     folder: Path
 
 
@@ -138,7 +148,8 @@ def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
     settings = {**values["filter"], "P0": (std**2).tolist()}
     truth = dict(zip(names, map(float, values["truth"]["values"]), strict=False))
     filter_, transform, prior = build_filter(settings, names, positive=True)
-    return Task(about, names, truth, float(noise) ** 2, filter_, transform, prior, folder)
+    problem = Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
+    return Task(about, problem, truth, float(noise) ** 2, folder)
 
 
 def model_of(task: Task, name: str, count: int) -> ObservationModel:
@@ -175,7 +186,7 @@ def model_of(task: Task, name: str, count: int) -> ObservationModel:
     return ProcessModel(
         Command(command, source.environment, source.time_limit_s),
         task.folder / "runs" if about.folder is None else Path(about.folder),
-        task.names,
+        task.problem.parameters,
         count,
         units=about.units or None,
         points=None if about.points is None else _points(about.points, "points"),
@@ -276,33 +287,16 @@ def _apart(value: float | None, own: EstimateRecord | None, k: int) -> float | N
 
 def _estimate(title: str, model: ObservationModel, y: FloatArray, task: Task) -> EstimateRecord:
     """The record of one estimate from positions ``(n, 3)`` mm."""
-    began = time.perf_counter()
-    with SolveBar(title, 0, TYPICAL_SOLVES, task.names) as bar:
-        found = task.filter(
-            model,
-            task.prior,
-            y.ravel(),
-            task.variance,
-            names=task.names,
-            transform=task.transform,
-            on_iterate=bar.iterate,
-        )
-    took = time.perf_counter() - began
-    ended = found.why, found.detail, found.converged, took
-    record = record_of(StudyResult(task.names, {}, None, found, None, *ended), case=title)
-    units = zip(record.unknowns, task.about.units or [""] * len(task.names), strict=True)
-    changes: dict[str, Any] = {
-        "unknowns": tuple(
-            one.model_copy(update={"unit": unit, "truth": task.truth.get(one.name)})
-            for one, unit in units
-        )
-    }
-    if found.prediction is not None:
-        fitted = found.prediction.y.reshape(-1, 3)
-        changes["distance_mm"] = spread(np.linalg.norm(fitted - y, axis=1))
-        if not task.about.models:
-            write_points(task.folder / FITTED, fitted)
-    return record.model_copy(update=changes)
+    names = task.problem.parameters
+    seen = Observation(POINTS, y[None], np.array(task.variance), predicted=POINTS)
+    with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
+        found = estimate(replace(task.problem, model=model), seen, on_iterate=bar.iterate)
+    if found.fitted is not None and not task.about.models:
+        write_points(task.folder / FITTED, found.fitted[-1])
+    record = record_of(found, case=title).with_truth(task.truth)
+    units = zip(record.unknowns, task.about.units or [""] * len(names), strict=True)
+    unknowns = tuple(one.model_copy(update={"unit": unit}) for one, unit in units)
+    return record.model_copy(update={"unknowns": unknowns})
 
 
 def check_external(values: Values, folder: Path) -> str:
@@ -314,7 +308,8 @@ def check_external(values: Values, folder: Path) -> str:
         If a setting or a file is inadmissible, or the program gives no prediction.
     """
     task = task_of(build(ExternalSettings, values["external"]), values, folder)
-    y, m = _points(task.about.observation, "observation"), task.prior.mean
+    y, problem = _points(task.about.observation, "observation"), task.problem
+    m = problem.prior.mean
     model = model_of(task, "model", len(y))
     found = predict(model, m)
     if not found.converged:
@@ -326,7 +321,8 @@ def check_external(values: Values, folder: Path) -> str:
         derivatives = f"derivatives: the model's own; not compared with differences: {by}"
         if not isinstance(by, str):
             off = np.linalg.norm(found.jacobian - by, axis=0) / np.linalg.norm(by, axis=0)
-            shares = ", ".join(f"{n} {100 * d:.2g} %" for n, d in zip(task.names, off, strict=True))
+            each = zip(problem.parameters, off, strict=True)
+            shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in each)
             derivatives = f"derivatives: the program's own; apart from differences by {shares}"
     return (
         f"{len(y)} points; at the initial values they are {distance.mean():.3g} mm (mean) and "
@@ -336,29 +332,9 @@ def check_external(values: Values, folder: Path) -> str:
 
 def figure(results: Results) -> Figure | None:
     """Each parameter, iterate by iterate, with each model."""
-    from mvest.reporting.figures import COLOURS, GREY, MARKERS, SMALL, panels
+    from mvest.reporting.figures import iterates_figure
 
-    drawn = [one for one in results.first.estimates if one.iterates]
-    if not drawn:
-        return None
-    # The colour is the model's, the line the data's.
-    models = list(dict.fromkeys(one.case.rpartition(", from ")[0] for one in drawn))
-    first = drawn[0].case.rpartition(", from ")[2]
-    whole, axes = panels(1, len(drawn[0].unknowns), 4.2)
-    for k, unknown in enumerate(drawn[0].unknowns):
-        for one in drawn:
-            n = models.index(one.case.rpartition(", from ")[0])
-            style = {"color": COLOURS[n % 6], "marker": MARKERS[n % 6], "fillstyle": "none"}
-            line = "-" if one.case.endswith(first) else ":"
-            axes[0, k].plot([at[k] for at in one.iterates], line, label=one.case, **style)
-        if unknown.truth is not None:
-            axes[0, k].axhline(unknown.truth, color=GREY, linestyle="--", label="truth")
-        unit = f" ({unknown.unit})" if unknown.unit else ""
-        axes[0, k].set(xlabel="iteration", ylabel=unknown.name + unit)
-        axes[0, k].xaxis.get_major_locator().set_params(integer=True)
-    lines, names = axes[0, 0].get_legend_handles_labels()
-    whole.legend(lines, names, loc="outside upper center", ncols=2, frameon=False, fontsize=SMALL)
-    return whole
+    return iterates_figure(results.first.estimates)
 
 
 STUDY = Study(

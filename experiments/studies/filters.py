@@ -25,7 +25,6 @@ from mvest.estimation.transform import Log
 from mvest.observation.vertices import observed_frames
 from mvest.quantities import Length, Logarithm, PointsAlong, PointsAround, Value
 from mvest.reporting.tables import Column, table
-from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,7 +85,8 @@ def run(job: Job[Settings]) -> Result:
     meshes, solves = [], 0
     for name, about in settings.problems.items():
         problem = build_problem(job.values, name, about)
-        meshes.append(problem.mesh)
+        meshes.append(Mesh.of(problem.closure.mesh))
+        # All are made before any is run: a wrong setting is refused at once.
         filters = {method: problem.filter(values) for method, values in settings.methods.items()}
         reference = problem.estimate(filter_of(settings.reference), seed)
         if reference.transformed_samples is None:
@@ -134,27 +134,20 @@ class Problem:
     Attributes
     ----------
     name : str
-    parameters : tuple of str, (p,)
+    about : FilterProblem
+        Its truth is that of the one observation that every filter is given. No filter is.
     closure : ClosureModel
     model : ObservationModel
         Predicts the observation ``y (n,)`` mm.
     prior : Gaussian
         Of the parameters; normal in their logarithms.
-    truth : (p,)
-        Of the one observation that every filter is given. No filter is.
-    noise : float
-        Standard deviation of each coordinate, mm.
-    mesh : Mesh
     """
 
     name: str
-    parameters: tuple[str, ...]
+    about: FilterProblem
     closure: ClosureModel
     model: ObservationModel
     prior: Gaussian
-    truth: FloatArray
-    noise: float
-    mesh: Mesh
 
     def filter(self, method: Values) -> Filter:
         """A configured filter; the paper's has process noise as large as the prior."""
@@ -169,19 +162,20 @@ class Problem:
         ConfigurationError
             If the true valve does not close.
         """
+        about = self.about
         self.closure.restart(None)
-        exact = predict(self.model, self.truth)
+        exact = predict(self.model, np.array(about.truth))
         if not exact.converged:
             raise ConfigurationError(f"{self.name}: the true valve fails: {exact.reason}")
-        y = exact.y + self.noise * np.random.default_rng(seed).standard_normal(exact.y.shape)
+        errors = np.random.default_rng(seed).standard_normal(exact.y.shape)
         self.closure.restart(None)
-        with SolveBar(self.name, 0, 0, self.parameters) as bar:
+        with SolveBar(self.name, 0, 0, about.parameters) as bar:
             return filter_(
                 self.model,
                 self.prior,
-                y,
-                self.noise**2,
-                names=self.parameters,
+                exact.y + about.noise_mm * errors,
+                about.noise_mm**2,
+                names=about.parameters,
                 transform=TRANSFORM,
                 on_iterate=bar.iterate,
             )
@@ -199,11 +193,11 @@ class Problem:
                 "problem": self.name,
                 "filter": method,
                 "parameter": name,
-                "truth": self.truth[k],
+                "truth": truth,
                 "estimate": found.mean[k],
                 "low": low[k],
                 "high": high[k],
-                "error": 100 * (found.mean[k] / self.truth[k] - 1),
+                "error": 100 * (found.mean[k] / truth - 1),
                 "width ratio": (own[1, k] - own[0, k]) / width[k],
                 "lower end off": 100 * (own[0, k] - ends[0, k]) / width[k],
                 "upper end off": 100 * (own[1, k] - ends[1, k]) / width[k],
@@ -217,7 +211,9 @@ class Problem:
                 "ended": found.why,
                 "detail": found.detail,
             }
-            for k, name in enumerate(self.parameters)
+            for k, (name, truth) in enumerate(
+                zip(self.about.parameters, self.about.truth, strict=True)
+            )
         ]
 
 
@@ -251,16 +247,8 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
     )
     seen = np.zeros((1, len(twin.valve.surface.vertices)), dtype=np.bool_)
     seen[:, :: about.every] = True
-    return Problem(
-        name,
-        about.parameters,
-        twin.model,
-        observed_frames(twin.model, ("closed",), seen),
-        prior,
-        twin.truth_values,
-        about.noise_mm,
-        Mesh.of(twin.model.mesh),
-    )
+    model = observed_frames(twin.model, ("closed",), seen)
+    return Problem(name, about, twin.model, model, prior)
 
 
 def figure(results: Results) -> Figure:

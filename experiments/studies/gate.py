@@ -6,7 +6,6 @@ The gate closes an anatomy under variations that must not matter and follows it 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +15,17 @@ import numpy as np
 
 from experiments.common.building.closing import close_valve, draw_closing
 from experiments.common.building.closure import closure_model
-from experiments.common.building.gate import anatomy_digest, gate_of, gate_rows
+from experiments.common.building.gate import (
+    anatomy_digest,
+    ask_gate,
+    closures_of,
+    gate_of,
+    gate_rows,
+)
 from experiments.common.records.record import Mesh, Record
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GateReport, run_gate
+from mvest.closure.robustness import GateReport
 from mvest.reporting.tables import Column, Table, joined, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
@@ -51,14 +56,9 @@ def run(job: Job[Settings]) -> Result:
 
 def _gate(job: Job[Settings]) -> Result:
     values = job.values
-    report = run_gate(
-        lambda case: closure_model(values, case),
-        np.array(values["truth"]["values"], dtype=float),
-        on_case=lambda row: _say(f"{row.case}: max {row.max_mm:.3g} mm, {row.reason}"),
-        on_path=lambda path: _say(f"along {path.name}: {path.reason or 'no jump'}"),
-    )
+    report = ask_gate(values)
     model = closure_model(values)
-    closures = len(report.rows) + sum(path.closures for path in report.paths)
+    closures = closures_of(report)
     verdict = {
         "passed": report.passed,
         "gap": None if report.closed is None else _gap(model, report.closed),
@@ -95,10 +95,6 @@ def _gap(model: ClosureModel, vertices: FloatArray) -> float:
     valve, annulus = model.valve, vertices[model.valve.annulus]
     seen = vertices, valve.surface.triangles, annulus, plane_of(valve, annulus)
     return find_gap(*seen, model.contact_reach_mm).area
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _closing(job: Job[Settings]) -> Result:

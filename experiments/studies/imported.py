@@ -2,37 +2,41 @@
 
 A recorded closure (``donor``) is fitted from its closed frame, from several starts. The shape of a
 reference heart (``heart``) is measured, meshed and closed, and moduli that were put in are
-estimated on it. Neither is part of this project; the messages say where they are from.
+estimated on it. Neither is part of this project; ``conf/experiment`` says where they are from.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
-import sys
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from experiments.common.building.closing import close_valve, draw_closing
+from experiments.common.building.closing import Closing, close_valve, draw_closing
 from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
-    closure_model,
     folder_hash,
     mechanics_of,
 )
 from experiments.common.building.filters import build_filter
-from experiments.common.building.gate import anatomy_digest, gate_cases, gate_rows
-from experiments.common.building.twin import build_twin
+from experiments.common.building.gate import (
+    anatomy_digest,
+    ask_gate,
+    closures_of,
+    gate_cases,
+    gate_rows,
+)
+from experiments.common.building.twin import build_twin, estimate_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
-from experiments.common.schema import Reads, Values, contents
+from experiments.common.schema import InputFile, Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import write_case
@@ -45,10 +49,10 @@ from mvest.cases.tissue import (
     lay_out_chordae,
 )
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GATE_CASES, run_gate
+from mvest.closure.robustness import GATE_CASES
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
-from mvest.estimation.prediction import Prediction, Remembered, SharedStart
+from mvest.estimation.prediction import Prediction, Remembered
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.regions import part_of
@@ -57,10 +61,12 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
+from mvest.problem.fields import valve_fields
 from mvest.problem.problem import Problem
 from mvest.problem.record import EstimateRecord, record_of
 from mvest.quantities import Length, Share, Thickness
-from mvest.reporting.tables import Column, Table, table
+from mvest.reporting.skill import estimates_table
+from mvest.reporting.tables import Column, table
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
@@ -76,77 +82,19 @@ from mvest.valve.mesh.structured import layered_wedges
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DATA_VARIABLE = "MVEST_TRIVALVE"
-"""Environment variable that names a checkout of the donor's data."""
-DONOR_CITATION = (
-    "Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w; data: "
-    "https://github.com/SoftTissueBiomechanicsLab/Texas_TriValve_1.1, licence CC BY 4.0"
-)
-
-HEART_VARIABLE = "MVEST_HRA"
-"""Environment variable that names the file of the heart, or a folder with its parts."""
-HEART_PARTS = (
-    "mitral_valve.ply",
-    "papillary_muscle_anterolateral.ply",
-    "papillary_muscle_posteromedial.ply",
-)
-"""In mm: the valve and its muscles."""
-HEART_OBJECTS = (
-    "VH_M_mitral_valve",
-    "VH_M_papillary_muscle_of_heart_anterolateral",
-    "VH_M_papillary_muscle_of_heart_posteromedial",
-)
-"""What the parts are called in the heart's own file, whose lengths are metres."""
-HEART_CITATION = (
-    "Browne K., Schlehlein H., Herr B. W., Quardokus E., Bueckle A., Börner K. 2022, 3D Reference "
-    "Organ for Heart, Male v1.2, doi 10.48539/HBM373.VSTV.568, licence CC BY 4.0; midsurface, "
-    "thickness, tips and chordae derived from it by mvest"
-)
-SHAPE_ALONE = (
-    "One still shape, modelled by illustrators from sections of a male donor (Visible Human): its "
-    "shape is all that is real. Motion, pressure, chordae and moduli are assumed, and nothing "
-    "about the moduli of this donor follows."
-)
-
-
-def heart_files(place: Path | str | None = None) -> tuple[Path, ...]:
-    """The heart's own file (GLB), or those of its parts in a folder; or where ``MVEST_HRA`` says.
-
-    Raises
-    ------
-    InputError
-        They are not there; the message says where to get them.
-    """
-    place = place or os.environ.get(HEART_VARIABLE)
-    if place is not None and Path(place).suffix.lower() == ".glb" and Path(place).is_file():
-        return (Path(place),)
-    files = tuple(Path(place or ".") / name for name in HEART_PARTS)
-    missing = [file.name for file in files if not file.is_file()]
-    if place is None or missing:
-        where = "no folder is named" if place is None else f"{place}: no {', '.join(missing)}"
-        raise InputError(
-            f"{where}. The reference heart is not part of this package: take "
-            "v1.2/models/VH_M_Heart.glb from https://github.com/hubmapconsortium/ccf-releases and "
-            f"name it here or in {HEART_VARIABLE}, or a folder with its parts in mm, "
-            f"{', '.join(HEART_PARTS)}"
-        )
-    return files
-
 
 def recording_folder(recording: str | None, case: str) -> Path:
-    """The folder of a case in a checkout of the donor's data.
+    """The folder of a case in a checkout of a donor's data.
 
     Raises
     ------
     InputError
-        If there is none; the message says where to get it.
+        If there is none.
     """
     folder = Path(recording or "") / case
     if not recording or not folder.is_dir():
         raise InputError(
-            f"donor valve: there is no folder {folder}. It is not part of this package: clone "
-            f"Texas TriValve 1.1 ({DONOR_CITATION}) and name the clone as donor.recording or in "
-            f"the environment variable {DATA_VARIABLE}"
+            f"donor.recording = {recording}: there is no folder {folder}; {WHERE_FROM}/donor.yaml"
         )
     return folder
 
@@ -155,15 +103,11 @@ def _recording(value: str | None, beside: Values) -> Any:
     try:
         return contents(recording_files(recording_folder(value, str(beside.get("case", "")))))
     except InputError:
-        # The study says where to get it.
+        # The study says what is missing.
         return value
 
 
-def _parts(value: str, _: Values) -> Any:
-    try:
-        return contents([str(file) for file in heart_files(value)])
-    except InputError:
-        return value
+WHERE_FROM = "the data are not part of this package, for where to get them see conf/experiment"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,6 +117,7 @@ class DonorSettings:
     # Checkout of the data.
     recording: Annotated[str | None, Reads(_recording)] = None
     case: str = ""  # folder in it, after which its deck and frames are called; empty: no donor
+    citation: str = ""  # of the data
     leaflets: dict[str, str] = field(default_factory=dict)  # name of a leaflet -> element set
     annulus: str = ""  # node set
     free_edge: str = ""  # node set
@@ -185,23 +130,27 @@ class DonorSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeartOptions:
-    """How the heart becomes a case; thickness is kept within bounds, as parts are no leaflet."""
+class HeartSettings:
+    """One still shape of a thick valve between two papillary muscles, and what is done with it.
 
+    Files, names and units are options of `mvest.exchange.importing.leaflets`.
+    """
+
+    source: InputFile = None  # closed surface of both leaflets
+    leaflets: str | None = None  # object in it, if there are others
+    # Papillary muscles, antero-lateral and postero-medial: files, or objects of the source.
+    muscles: Annotated[tuple[str, ...], Reads(contents)] = ()
+    units: str = "mm"
+    name: str = "imported valve"
+    description: str = ""
+    citation: str = ""
+    licence: str = ""
     smoothing_mm: Length = 4.0  # round the valve: a spike is sharper than leaflets are thick
+    # Thickness is kept within bounds, as parts are no leaflet.
     min_thickness_mm: Thickness = 0.3
     max_thickness_mm: Thickness = 3.0
     # Of the free edges below the annulus, closed over open, for which chordae are long enough.
     closed_depth: Share = 0.5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeartSettings:
-    """The shape of a reference heart."""
-
-    # The heart (GLB) or a folder with its parts; null: what the variable MVEST_HRA names.
-    source: Annotated[str | None, Reads(_parts)] = None
-    options: HeartOptions = field(default_factory=HeartOptions)
     # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).
     closures: dict[str, dict[str, Share]] = field(default_factory=dict)
     gate: tuple[str, ...] = ()  # variations of the gate
@@ -349,10 +298,13 @@ def _donor(job: Job[Settings]) -> Result:
     failed = [one for one in records if not one.converged]
     ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
     return Result(
-        tables={"": table(rows, **DISTANCES), "moduli": moduli_table(records)},
+        tables={
+            "": table(rows, **DISTANCES),
+            "moduli": estimates_table("estimation", records),
+        },
         estimates=tuple(records),
         numbers={
-            "data": DONOR_CITATION,
+            "data": donor.citation,
             "pressure_mmHg": valve.settings.protocol.pressure_mmHg,
             "recorded_motion_mm": float(np.linalg.norm(valve.seen - rest, axis=1).mean()),
             "tip_motion_mm": float(np.linalg.norm(tips[-1] - tips[0], axis=1).max()),
@@ -373,39 +325,12 @@ DISTANCES: dict[str, Column | str] = {
 }
 
 
-def moduli_table(records: list[EstimateRecord]) -> Table:
-    """A row for each modulus of each estimate."""
-    keys = ("parameter", "truth", "prior_mean", "estimate", "std", "bound", "relative_error")
-    rows = [
-        {"estimation": one.case} | {key: row.get(key) for key in (*keys, "distance_mean", "reason")}
-        for one in records
-        for row in one.rows()
-        if row.get("kind", "modulus") == "modulus"
-    ]
-    columns: dict[str, Column | str] = {
-        "truth": Column("MPa"),
-        "prior_mean": Column("MPa", hidden=True),
-        "estimate": Column("MPa", std="std"),
-        "bound": Column("MPa", ".2g", label="data alone leave"),
-        "relative_error": Column(digits="+.2%", label="error"),
-        "distance_mean": "mm",
-        "reason": Column(hidden=True),
-    }
-    return table(rows, estimation="", parameter="", **columns)
-
-
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
     """As those of a case (`mvest.problem.fields`)."""
-    surface, tips = valve.coarse.surface, valve.recording.valve.motion.papillary_tips
+    tips = valve.recording.valve.motion.papillary_tips
     away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
     return {
-        "triangles": surface.triangles,
-        "region": surface.region,
-        "annulus": valve.coarse.annulus,
-        "free_edge": valve.coarse.free_edge,
-        "rest": surface.vertices,
-        "frames": np.array(["closed"]),
-        "seen": np.array([True]),
+        **valve_fields(valve.coarse, ["closed"]),
         "tips": tips[[0, -1]],
         "observed": valve.seen[None],
         **{name: points[None] for name, points in shapes.items()},
@@ -413,70 +338,63 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
     }
 
 
-def import_heart(source: str | None, options: HeartOptions) -> tuple[ValveCase, float]:
-    """The reference heart as a case of its open frame, and the volume (mm³) of its tissue.
+def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, float]:
+    """The valve as a case of its open frame, and the volume (mm³) of its tissue.
 
     Raises
     ------
     InputError, GeometryError
         A part is missing or is none of a thick valve with two muscles.
     """
-    files = heart_files(source)
-    whole, unit = read_surface(files[0]), "mm" if len(files) > 1 else "m"
-    valve, *muscles = HEART_OBJECTS if unit == "m" else map(str, files)
-    whole = part_of(whole, valve) if unit == "m" else whole
+    for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
+        if file is None or not Path(file).is_file():
+            raise InputError(f"heart: no file {file}; {WHERE_FROM}/reference_heart.yaml")
+    source = Path(str(heart.source))
+    whole = read_surface(source)
+    whole = whole if heart.leaflets is None else part_of(whole, heart.leaflets)
     known = LeafletsOptions(
-        leaflets=valve if unit == "m" else None,
-        units=unit,
-        muscles=tuple(muscles),
-        smoothing_mm=options.smoothing_mm,
-        thickness_range_mm=(options.min_thickness_mm, options.max_thickness_mm),
+        leaflets=heart.leaflets,
+        units=heart.units,
+        muscles=heart.muscles,
+        smoothing_mm=heart.smoothing_mm,
+        thickness_range_mm=(heart.min_thickness_mm, heart.max_thickness_mm),
     )
-    case = import_leaflets(files[0], known)
+    case = import_leaflets(source, known)
     surface, tips = case.surface, case.frames[0].papillary_tips
     loops = case.annulus, case.free_edge
     band = LeafletBand.of(surface.vertices, surface.triangles, surface.region, *loops, anterior=0)
-    closed = assumed_closure(band, surface.vertices[loops[0]], tips, options.closed_depth)
-    said = f"at {CLOSED_DEPTH:g} of their depth", f"at {options.closed_depth:g} of their depth"
+    closed = assumed_closure(band, surface.vertices[loops[0]], tips, closed_depth)
+    said = f"at {CLOSED_DEPTH:g} of their depth", f"at {closed_depth:g} of their depth"
     case = replace(
         case,
-        name="mitral valve of a reference heart",
-        description=SHAPE_ALONE,
-        source=HEART_CITATION,
-        licence="CC BY 4.0",
+        name=heart.name,
+        description=heart.description,
+        source=heart.citation,
+        licence=heart.licence,
         chordae=lay_out_chordae(band, tips, closed, tips, ChordLayout()),
         derived=tuple(line.replace(*said) for line in case.derived),
     )
-    return case, MM_PER[unit] ** 3 * abs(enclosed_volume(whole.vertices, whole.triangles))
+    return case, MM_PER[heart.units] ** 3 * abs(enclosed_volume(whole.vertices, whole.triangles))
 
 
 def _heart(job: Job[Settings]) -> Result:
     heart, values = job.settings.heart, job.values
     asked = gate_cases(heart.gate)
-    case, volume = import_heart(heart.source, heart.options)
-    own = _on_case(values, case, job.folder / "case")
-    usual = {
-        "annulus_contraction": own["valve"]["annulus_contraction"],
-        "closed_depth": heart.options.closed_depth,
-    }
-    closing = close_valve(own)
-    ends = closing.ends()
-    rows = _closure_rows("as in gate and twins", usual, ends.steps())
-    for number, (name, changes) in enumerate(heart.closures.items()):
+    contraction = values["valve"]["annulus_contraction"]
+    usual = {"annulus_contraction": contraction, "closed_depth": heart.closed_depth}
+    closures: dict[str, Any] = {"as in gate and twins": {}, **heart.closures}
+    rows, made = list[dict[str, Any]](), list[tuple[ValveCase, float, dict[str, Any], Closing]]()
+    for name, changes in closures.items():
         assumed = usual | changes
-        options = replace(heart.options, closed_depth=assumed["closed_depth"])
-        place = job.folder / f"case_{number}"
-        there = _on_case(values, import_heart(heart.source, options)[0], place)
+        case, volume = import_heart(heart, assumed["closed_depth"])
+        there = _on_case(values, case, job.folder / f"case_{len(made)}")
         there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
-        rows += _closure_rows(name, assumed, close_valve(there, name).ends().steps())
-    truth = np.array(own["truth"]["values"], dtype=float)
-    gate = run_gate(
-        lambda each: closure_model(own, each),
-        truth,
-        asked,
-        on_case=lambda row: _say(f"gate, {row.case}: max {row.max_mm:.2g} mm, {row.reason}"),
-        on_path=lambda path: _say(f"gate, along {path.name}: {path.reason or 'no jump'}"),
-    )
+        closing = close_valve(there, name)
+        states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
+        rows += [{"closure": name, **assumed, "state": state, **row} for state, row in states]
+        made.append((case, volume, there, closing))
+    case, volume, own, closing = made[0]
+    gate = ask_gate(own, asked)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
     shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
     failed = [one.reason for one in records if not one.converged]
@@ -489,26 +407,19 @@ def _heart(job: Job[Settings]) -> Result:
             "shape": table([dict(zip(("name", "value", "unit"), r, strict=True)) for r in shape]),
             "meshes": table(_meshes(own), volume="mm³:.0f"),
             "gate": gate_rows(gate),
-            "moduli": moduli_table(records),
+            "moduli": estimates_table("estimation", records),
             "derived": table([{"what follows from the source": text} for text in case.derived]),
         },
         estimates=tuple(records),
-        numbers={"anatomy": anatomy_digest(own), "passed": gate.passed, "data": HEART_CITATION},
-        arrays=ends.arrays(),
+        numbers={"anatomy": anatomy_digest(own), "passed": gate.passed, "data": heart.citation},
+        arrays=closing.ends().arrays(),
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",
         mesh=Mesh.of(closing.model.mesh),
-        forward_solves=1
-        + len(heart.closures)
-        + len(gate.rows)
-        + sum(path.closures for path in gate.paths),
+        forward_solves=len(made) + closures_of(gate),
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
         f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
     )
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
@@ -518,12 +429,6 @@ def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
     write_case(place, case)
     own = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
     return {**values, "valve": {**values["valve"], **own}}
-
-
-def _closure_rows(name: str, assumed: Values, steps: Table) -> list[dict[str, Any]]:
-    """The open and the last state of a closure."""
-    states = zip(("open", "closed"), steps.rows, strict=True)
-    return [{"closure": name, **assumed, "state": state, **row} for state, row in states]
 
 
 def _sizes(case: ValveCase) -> list[tuple[str, float | None, str]]:
@@ -584,17 +489,7 @@ def _meshes(values: Values) -> list[dict[str, Any]]:
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
     """Moduli from one simulated observation."""
     twin = build_twin({**values, "truth": {**values["truth"], **changes}})
-    true, steps = twin.truth_values, len(twin.model.settings.protocol.steps())
-    with SolveBar(f"observation, {name}", steps, 1) as bar:
-        twin.truth_model.on_step = bar.step
-        seen = twin.source(true)
-    data = twin.observe(lambda m: seen, true, np.random.default_rng(values["seed"]))
-    if data.observation is None:
-        return EstimateRecord(case=name, status="failed", reason=data.reason)
-    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
-    with SolveBar(f"estimation, {name}", steps, TYPICAL_SOLVES, problem.parameters) as bar:
-        twin.model.on_step = bar.step
-        found = estimate(problem, data.observation, on_iterate=bar.iterate).against(data.truth)
+    (found,) = estimate_twin(twin, [values["seed"]], name)
     return record_of(found, seed=values["seed"], case=name, simulated=True)
 
 
@@ -612,11 +507,8 @@ def figure(results: Results) -> Figure | None:
     drawn = Figure(figsize=(8.0, 7.4), layout="constrained")
     titles = {0: "open, as modelled", 1: "closed (simulated)"}
     draw_closing(drawn, results.arrays[name], titles, ("anterior", "posterior"))
-    drawn.suptitle(
-        "Mitral valve of the HRA reference heart (male, v1.2): only its shape is real\n"
-        "Browne et al. 2022, doi 10.48539/HBM373.VSTV.568, CC BY 4.0; adapted",
-        fontsize=10,
-    )
+    title = f"{record.title}: only its shape is real"
+    drawn.suptitle(f"{title}\n{fill(str(record.numbers['data']), 110)}", fontsize=9)
     return drawn
 
 

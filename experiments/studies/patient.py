@@ -189,7 +189,6 @@ def summary(results: Results) -> dict[str, Table]:
             "verdicts": verdict_table(estimates),
             "moduli": skill_table("scenario, modulus", _by_name(grouped)),
             "grounds": _grounds(estimates),
-            "estimates": _estimates(patients),
         }
     distances = _distance_rows(patients)
     moduli = {name: [own for own in each if own.is_modulus] for name, each in groups.items()}
@@ -199,7 +198,6 @@ def summary(results: Results) -> dict[str, Table]:
             "moduli": skill_table("estimation", moduli),
             "verdicts": verdict_table(estimates),
             "distances": _distances(distances),
-            "estimates": _estimates(patients),
         }
     return {
         "table_2": _table2(patients),
@@ -422,40 +420,6 @@ def _grounds(estimates: Sequence[EstimateRecord]) -> Table:
     return table(rows, against=Column(label="what spoke against estimates"), estimates="")
 
 
-def _estimates(patients: Patients) -> Table:
-    """A row for each patient, way to estimate and unknown: the tidy table for programs."""
-    rows = []
-    for record, estimate in patients:
-        innovation, verdict = estimate.innovation, estimate.verdict
-        grounds = () if verdict is None else verdict.grounds
-        for way_name, way in _ways(estimate):
-            for own in way.parameters:
-                z = score(own)
-                rows.append(
-                    {
-                        "patient": estimate.case,
-                        "scenario": _scenario(record),
-                        "seed": record.provenance.seed,
-                        "estimation": way_name,
-                        "status": way.status,
-                        "verdict": trust_of(estimate),
-                        "unknown": own.name,
-                        "unit": own.unit,
-                        "truth": own.truth,
-                        "std": own.std,
-                        **interval("estimate", own),
-                        **interval(PRIOR, prior_alone(own)),
-                        "off by SD": z,
-                        "truth in posterior": None if z is None else float(norm.cdf(z)),
-                        "NEES": record.numbers.get("nees"),
-                        "NIS": innovation and innovation.nis / innovation.size,
-                        "grounds": "; ".join(f"{one.check}: {one.text}" for one in grounds),
-                        "ended": way.reason,
-                    }
-                )
-    return table(rows)
-
-
 # -- figures --------------------------------------------------------------------------------------
 def figure(results: Results) -> dict[str, Figure]:
     """Figure 3, or the figure of the population or of the scenarios."""
@@ -554,15 +518,14 @@ def ranks_figure(scenarios: Mapping[str, Patients]) -> Figure:
     distribution, with a band that 95 % of samples do not leave anywhere (Säilynoja, Bürkner and
     Vehtari 2022, Stat. Comput. 32:32). Above zero on the left: truths lie too low in the posterior.
     """
-    from matplotlib.figure import Figure
+    from mvest.reporting.figures import panels
 
-    columns = max(min(5, len(scenarios)), 1)
+    columns = max(min(4, len(scenarios)), 1)
     lines = max(-(-len(scenarios) // columns), 1)
-    drawn = Figure(figsize=(2.6 * columns, 2.3 * lines + 0.6), layout="constrained")
-    grid = drawn.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
-    for axes, (name, patients) in zip(grid.ravel(), scenarios.items(), strict=False):
+    drawn, grid = panels(lines, columns, 2.0 * lines + 0.6, sharex=True, sharey=True)
+    for axes, (name, patients) in zip(grid.flat, scenarios.items(), strict=False):
         _draw_ranks(axes, name, [estimate for _, estimate in patients])
-    for axes in grid.ravel()[len(scenarios) :]:
+    for axes in grid.flat[len(scenarios) :]:
         axes.set_axis_off()
     for axes in grid[-1]:
         axes.set_xlabel("truth in posterior", fontsize=8)
@@ -575,8 +538,6 @@ def _draw_ranks(axes: Axes, name: str, estimates: Sequence[EstimateRecord]) -> N
     trusted = sum(trust_of(estimate) == TRUSTWORTHY for estimate in estimates)
     axes.set_title(f"{name}\n{trusted} of {len(estimates)} trustworthy", fontsize=8)
     axes.axhline(0.0, color="0.5", lw=0.6)
-    axes.tick_params(labelsize=7)
-    axes.spines[["top", "right"]].set_visible(False)
     moduli = [own for estimate in estimates for own in estimate.moduli]
     for modulus, colour in zip(_names(moduli), ("#2b6ca3", "#c8452f"), strict=False):
         scores = [score(own) for own in moduli if own.name == modulus]

@@ -26,9 +26,10 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.fields import valve_fields
-from mvest.problem.record import EstimateRecord, record_of
+from mvest.problem.record import record_of
 from mvest.quantities import AxisCount, Count, Logarithm, within
 from mvest.reading.npz import read_npz
+from mvest.reporting.skill import estimates_table
 from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.predict import (
     PredictedScenario,
@@ -45,6 +46,7 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
+    from pandas import DataFrame
 
 Row = Mapping[str, Any]
 
@@ -77,8 +79,6 @@ PRESCRIBED = {
 
 DRAWN = ("gap_mm2", "coaptation_length_mm", "coaptation_area_mm2", "tenting_height_mm",
          "stress_p99_anterior_mpa", "stress_p99_posterior_mpa")  # fmt: skip
-OTHER = "0.55"
-
 KINDS = {
     "with_mesh_error": ("wide_low", "wide_high", "truth_own_mesh", "inside_wide"),
     "without_mesh_error": ("low", "high", "truth_own_mesh", "inside_own_mesh"),
@@ -152,7 +152,7 @@ def run_prediction(job: Job[Settings]) -> Result:
     attempted = sum(len(one.samples) for one in every)
     tables = {
         "": table(rows, **dict.fromkeys(rows[0], "")) if rows else table([]),
-        "parameters": parameters_table(records),
+        "parameters": estimates_table("patient", records),
         "first_patient": first_patient_table(rows),
         "coverage": coverage_table(rows),
         "stress_by_mesh": table(stress),
@@ -259,18 +259,6 @@ def _fields(valve: Valve, compared: Mapping[str, Compared]) -> dict[str, NDArray
 
 
 # -- tables ---------------------------------------------------------------------------------------
-def parameters_table(records: Sequence[EstimateRecord]) -> Table:
-    """What was estimated of each patient, with its truth."""
-    shown = ("parameter", "estimate", "std", "truth")
-    rows = [
-        {"patient": record.seed} | {name: row[name] for name in shown}
-        for record in records
-        for row in record.rows()
-        if row.get("kind") in ("modulus", "nuisance")
-    ]
-    return table(rows, patient="", estimate=Column("", ".4g", std="std"), truth=":.4g")
-
-
 def first_patient_table(rows: Sequence[Row]) -> Table:
     """Measures of the first patient by condition, with 95 % intervals; a cross marks a miss.
 
@@ -344,21 +332,86 @@ def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]
     return out
 
 
+# -- figure ---------------------------------------------------------------------------------------
 def figure(results: Results) -> Figure | None:
-    """Closed valves by condition above their measures; None without a prediction."""
-    from mvest.reporting.scenarios import scenarios_figure
+    """The first patient's closed valve by condition, seen from the atrium, above its measures.
+
+    Leaflets are midsurfaces, which lie a thickness apart where they touch; the slit between them is
+    drawn as tissue, and what is left open in the colour of blood. None without a prediction.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    from mvest.problem.fields import read_case_fields
+    from mvest.reporting.case import drawing
+    from mvest.reporting.figures import ATRIUM, SMALL, TEXT
 
     name, record = next(iter(results.records.items()))
     if name not in results.arrays:
         return None
-    labels = {name: (PREDICTED | PRESCRIBED)[name] for name in DRAWN}
     reach = float(record.numbers["contact_reach_mm"])  # type: ignore[arg-type]
-    failed = {
-        row["scenario"]: row["reason"]
-        for row in record.table_of("not_closed").rows
-        if row["valve"] == "at the estimate"
-    }
-    return scenarios_figure(results.arrays[name], record.table_of().rows, labels, reach, failed)
+    valve = replace(read_case_fields(results.arrays[name], turned=False), reach_mm=reach)
+    assert valve.fitted is not None
+    rows, failed = record.table_of().frame, record.table_of("not_closed").frame
+    drawn = Figure(figsize=(max(2.7 * len(valve.frames), 8.0), 8.6), layout="constrained")
+    parts: Any = drawn.subfigures(2, 1, height_ratios=[1.0, 1.75])
+    upper, lower = parts
+    panels = upper.subplots(1, len(valve.frames), squeeze=False)[0]
+    colours = drawing.leaflet_colours(valve.region)
+    first = rows[(rows["patient"] == rows["patient"].iloc[0]) & (rows["measure"] == "gap_mm2")]
+    gaps = first.set_index("scenario")["estimate"]
+    known = [valve.rest]
+    for axes, title, shape in zip(panels, valve.frames, valve.fitted, strict=True):
+        if not np.isfinite(shape).all():
+            why = failed[(failed["scenario"] == title) & (failed["valve"] == "at the estimate")]
+            axes.set_axis_off()
+            axes.set_title(f"{title}\nnot closed: {''.join(why['reason'])}", fontsize=SMALL)
+            continue
+        known.append(shape)
+        drawing.draw_valve(axes, valve, shape, colours, ATRIUM, 0)
+        drawing.paint_leak(axes, valve, shape, 0)
+        axes.set_title(f"{title}\ngap {gaps[title]:.1f} mm²", fontsize=TEXT)
+    drawing.name_leaflets(panels[0], valve, ("anterior", "posterior"))
+    drawing.same_scale(panels, known, ATRIUM)
+    names = {"gap": drawing.BLOOD, "leaflets touch (between midsurfaces)": drawing.TISSUE}
+    handles = [Patch(color=colour, label=label) for label, colour in names.items()]
+    upper.legend(handles=handles, loc="lower right", fontsize=SMALL, frameon=False, ncols=2)
+    grid = lower.subplots(2, 3)
+    for axes, measure in zip(grid.flat, DRAWN, strict=True):
+        _draw_measure(axes, rows[rows["measure"] == measure], valve.frames)
+        axes.set_title(PREDICTED[measure], fontsize=SMALL, loc="left")
+    keys, where = grid[0, 0].get_legend_handles_labels(), "outside lower center"
+    lower.legend(*keys, loc=where, fontsize=SMALL, frameon=False, ncols=4)
+    title = "An estimated valve as observed and under changed conditions (simulated)"
+    drawn.suptitle(f"{title}\n", fontsize=TEXT + 2)
+    return drawn
+
+
+def _draw_measure(axes: Any, rows: DataFrame, titles: Sequence[str]) -> None:
+    """Draw one measure of all patients; matplotlib leaves out what is missing."""
+    from mvest.reporting.figures import COLOURS, SMALL, plain_axes
+
+    plain_axes(axes)
+    further = rows["patient"].map(list(rows["patient"].unique()).index)
+    x = rows["scenario"].map(titles.index) - 0.12 + (0.14 + 0.13 * further) * (further > 0)
+    numbers = rows.filter(regex="low|high|estimate|truth").astype(float)
+    of_first = "estimate (drawn above), 95 %: thick samples, thin with the mesh"
+    for own, colour, label in (
+        (further == 0, COLOURS[0], of_first),
+        (further > 0, "0.55", "further simulated patients"),
+    ):
+        at, of = x[own], numbers[own]
+        axes.vlines(at, of["wide_low"], of["wide_high"], color=colour, lw=0.8)
+        axes.vlines(at, of["low"], of["high"], color=colour, lw=2.5)
+        axes.plot(at, of["estimate"], "o", color=colour, ms=5)
+        axes.errorbar([], [], yerr=[], fmt="o", color=colour, label=label)
+    for truth, label, marker, colour, size in (
+        ("truth_own_mesh", "true valve (its own mesh)", "x", COLOURS[1], 6),
+        ("truth_same_mesh", "true valve (same mesh)", "_", "black", 9),
+    ):
+        axes.plot(x, numbers[truth], marker, color=colour, ms=size, zorder=4, label=label)
+    axes.set_xticks(range(len(titles)), titles, fontsize=SMALL, rotation=20, ha="right")
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
 
 
 STUDY = Study(

@@ -7,7 +7,6 @@ exports: VTK (through PyVista) cuts and writes surfaces, pandas tables, nibabel 
 
 from __future__ import annotations
 
-import resource
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -70,10 +69,8 @@ def run_surfaces(job: Job[Settings]) -> Result:
     registration = np.array([hidden["values"][name] for name in REGISTRATION])
     arrived = arrive(patient, positions["closed"], registration, door, folder / "door")
     case = write_case(folder / "case", arrived.case)
-    before = _cpu_of_children()
     found = estimated_or_reason(job.values, folder, case, place.hidden)
     numbers: dict[str, Number] = {"kind": door.kind, "geometry": door.label}
-    numbers |= {"cpu_s": _cpu_of_children() - before}
     if isinstance(found, str):
         unknowns = _believed(job.settings.personal)
         estimate = EstimateRecord(status="failed", reason=found, unknowns=unknowns)
@@ -131,12 +128,6 @@ def _believed(personal: PersonalSettings) -> tuple[Unknown, ...]:
         for name, about in personal.unknowns.items()
         if name.startswith("E_f.")
     )
-
-
-def _cpu_of_children() -> float:
-    """S of all processes that were started from here and have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 # -- tables ---------------------------------------------------------------------------------------

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,22 +12,18 @@ from numpy.typing import NDArray
 
 from experiments.common.building.filters import build_filter, observation_variance
 from experiments.common.building.gate import gate_of
-from experiments.common.building.twin import Twin, TwinExpectation, build_twin
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.records.record import Mesh, Number, model_of_values
+from experiments.common.building.twin import Twin, TwinExpectation, build_twin, estimate_twin
+from experiments.common.progress import SolveBar
+from experiments.common.records.record import Mesh, model_of_values
 from experiments.common.study import Job, Result, Results, Study
-from mvest.closure.model import ClosureModel
-from mvest.errors import ConfigurationError, MvestError
-from mvest.estimation.prediction import SharedStart
+from mvest.errors import ConfigurationError
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import valve_fields
-from mvest.problem.record import EstimateRecord, Unknown, record_of
+from mvest.problem.record import EstimateRecord, record_of
 from mvest.problem.registration import unit_of
 from mvest.problem.stored import Extrapolated
 from mvest.reporting.tables import Column, Table, table
-from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.clinical import Numbers, closure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,30 +45,20 @@ def run_twin(job: Job[Settings]) -> Result:
     twin = build_twin(values)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
-    began = time.perf_counter()
     seeds = range(values["seed"], values["seed"] + values["repeats"])
-    results = _estimate_twin(twin, seeds)
+    results = estimate_twin(twin, seeds)
     result = results[0]
     confirmed = _confirm(twin, result) if values["confirm"] else None
-    computing = time.perf_counter() - began
     estimates = tuple(
-        _known(record_of(one, seed=seed, simulated=True), twin)
-        for seed, one in zip(seeds, results, strict=True)
+        record_of(one, seed=seed, simulated=True) for seed, one in zip(seeds, results, strict=True)
     )
     solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
-    closed = _measured(twin, result) if values["measure"] else {}
-    band = _truth_band(twin, result)
-    row = _row(values, estimates[0], closed, band)
+    row = _row(values, estimates[0], _truth_band(twin, result))
     row |= {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}
     paper = [_paper_row(values, estimates[0])] if values["paper"] else []
-    numbers: dict[str, Number] = {
-        "confirmed_mm": confirmed,
-        "seconds_computing": computing,
-        "truth_store": "hit" if twin.source.counts.hits else "miss",
-    }
     return Result(
         tables={"": _table([*paper, row])},
-        numbers=numbers,
+        numbers={"confirmed_mm": confirmed},
         estimates=estimates,
         arrays=_fields(twin, result) if values["figures"] and result.fitted is not None else {},
         status=estimates[0].status,
@@ -83,37 +68,6 @@ def run_twin(job: Job[Settings]) -> Result:
         forward_solves=solves,
         gate=gate_of(values),
     )
-
-
-def _known(record: EstimateRecord, twin: Twin) -> EstimateRecord:
-    """A record with truth and start, also where nothing was estimated."""
-    if record.unknowns:
-        return record
-    start = twin.problem.start
-    unknowns = tuple(
-        Unknown(name=name, unit=unit_of(name), prior_mean=float(m), truth=float(true))
-        for name, m, true in zip(twin.problem.parameters, start, twin.truth_values, strict=True)
-    )
-    return record.model_copy(update={"unknowns": unknowns})
-
-
-def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
-    """One estimate for each seed; simulation and first closure are common to all."""
-    with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
-        twin.truth_model.on_step = bar.step
-        truth = twin.source(twin.truth_values)
-    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
-    results = []
-    steps, solves = len(_steps(twin.model)), TYPICAL_SOLVES * len(seeds)
-    with SolveBar("estimation", steps, solves, problem.parameters) as bar:
-        twin.model.on_step = bar.step
-        for seed in seeds:
-            data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
-            if data.observation is None:
-                return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
-            result = estimate(problem, data.observation, on_iterate=bar.iterate)
-            results.append(result.against(data.truth))
-    return results
 
 
 def _confirm(twin: Twin, result: StudyResult) -> float | None:
@@ -129,7 +83,7 @@ def _confirm(twin: Twin, result: StudyResult) -> float | None:
     if fitted is None:
         return None
     twin.model.continuation, twin.model.guide = False, None
-    with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
+    with SolveBar("confirmation", len(twin.model.settings.protocol.steps()), 1) as bar:
         twin.model.on_step = bar.step
         anew = twin.model.close(result.estimate, sensitivities=False).simulation
     twin.model.continuation, twin.model.guide = usual
@@ -148,29 +102,6 @@ def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:
     return list(100 * np.abs(shift / twin.truth_values))
 
 
-def _measured(twin: Twin, result: StudyResult) -> Numbers:
-    """Measurements of the fitted closed frame; none where there is none, or its shape defies them.
-
-    An estimate is not lost because of that.
-    """
-    if result.observation is None or result.fitted is None:
-        return {}
-    points = dict(zip(result.observation.frames, result.fitted, strict=True)).get("closed")
-    if points is None:
-        return {}
-    valve, surface = twin.valve, twin.valve.surface
-    reach = twin.model.settings.contact.activation_distance * float(surface.thickness.mean())
-    first = np.unique(surface.triangles[surface.region == 0])
-    annulus = points[valve.annulus]
-    anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
-    pair = [surface.triangles[surface.region == k] for k in (0, 1)]
-    try:
-        plane = annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior)
-        return closure(points, surface.triangles, annulus, plane, pair, reach)
-    except MvestError:
-        return {}
-
-
 def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
     """The last observed and fitted frame, as those of a case (`mvest.problem.fields`)."""
     assert isinstance(result.observation, Observation)
@@ -182,10 +113,6 @@ def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
         "distance_fitted": np.asarray(result.distance, dtype=np.float64)[None],
         "reach_mm": np.array(twin.model.contact_reach_mm),
     }
-
-
-def _steps(model: ClosureModel) -> Sequence[object]:
-    return model.settings.protocol.steps()
 
 
 def require_twin(values: Mapping[str, Any]) -> None:
@@ -206,7 +133,6 @@ def require_twin(values: Mapping[str, Any]) -> None:
 def _row(
     values: Mapping[str, Any],
     record: EstimateRecord,
-    closed: Numbers,
     band: Sequence[float] | None,
 ) -> dict[str, Any]:
     """What tables say of one run: plain numbers, errors without sign."""
@@ -231,8 +157,6 @@ def _row(
         "distance mean": distance and distance.mean,
         "distance SD": distance and distance.std,
         "distance max": distance and distance.max,
-        "orifice, closed": closed.get("orifice_mm2"),
-        "coaptation": closed.get("coaptation_length_mm"),
         "element": model.element,
         "cells": " x ".join(str(n) for n in model.cells),
         "filter": model.filter,
@@ -251,11 +175,8 @@ def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, A
     for k, name in enumerate(values["parameters"]):
         row |= {
             f"truth {name}": record.unknown(name).truth,
-            f"start {name}": None,
             f"estimate {name}": _at(paper["estimate"], k),
-            f"std {name}": None,
             f"error {name}": _at(paper["error_percent"], k),
-            f"truth of {name} known to": None,
         }
     return row | {
         "moduli error mean": _at(paper["moduli_error_percent"], 0),
@@ -269,20 +190,17 @@ def _at(values: Sequence[float] | None, k: int) -> float | None:
     return None if values is None or k >= len(values) else values[k]
 
 
-UNITS = {
-    "distance max": "mm",
-    "orifice, closed": "mm²",
-    "coaptation": "mm",
-    "noise": "mm",
+HIDDEN = {
+    **dict.fromkeys(("source", "nodes", "iterations", "status", "filter", "reason"), ""),
+    **dict.fromkeys(("distance max", "noise"), "mm"),
 }
-HIDDEN = ("source", "nodes", "iterations", "status", "filter", "reason", *UNITS)
-"""Columns that only programs see."""
+"""Columns that only programs see, and their units."""
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Rows of runs with the meaning of their columns."""
     about: dict[str, Column] = {"run": Column()}
-    for name in (key.removeprefix("start ") for key in rows[0] if key.startswith("start ")):
+    for name in (key.removeprefix("estimate ") for key in rows[0] if key.startswith("estimate ")):
         unit, std, band = unit_of(name), f"std {name}", f"truth of {name} known to"
         about |= {
             f"truth {name}": Column(unit, hidden=True),
@@ -296,9 +214,8 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     about["moduli error SD"] = Column("%")
     about["distance mean"] = Column("mm", std="distance SD", label="distance")
     about["distance SD"] = Column("mm")
-    about |= {name: Column(UNITS.get(name, ""), hidden=True) for name in HIDDEN}
-    names = list(dict.fromkeys([*about, *(name for row in rows for name in row)]))
-    return table([{name: row.get(name) for name in names} for row in rows], **about)
+    about |= {name: Column(unit, hidden=True) for name, unit in HIDDEN.items()}
+    return table(rows, **about)
 
 
 def summary(results: Results) -> dict[str, Table]:
@@ -319,16 +236,8 @@ def figure(results: Results) -> dict[str, Figure]:
     if len(results.records) > 1 and name != record.table:
         # No run stands for the others.
         return drawn
-    first = record.estimates[0] if record.estimates else None
-    if first is not None and first.iterates:
-        unknowns = first.unknowns[: len(first.iterates[0])]
-        drawn[""] = iterates_figure(
-            f"{record.title}: {record.row}",
-            [one.name for one in unknowns],
-            first.iterates,
-            first.iterate_std,
-            [one.truth for one in unknowns],
-        )
+    if (iterates := iterates_figure(record.estimates[:1])) is not None:
+        drawn[""] = iterates
     if name in results.arrays:
         drawn["valve"] = fitted_figure(results.arrays[name])
     return drawn

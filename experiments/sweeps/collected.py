@@ -1,13 +1,12 @@
 """A collected sweep: ``sweep.json`` of the runner, ``results/sweeps/NAME.json`` when published.
 
-A job is its record, without tables, and what the runner knows of it besides. In the file, what all
-jobs have alike stands once (``common``), and each job adds what is its own.
+A job is its record, without tables, and what the runner knows of it besides.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,11 +23,10 @@ from mvest.reading.text import one_line
 SWEEPS = "sweeps"
 """Folder of the published sweeps within the results."""
 
-PATHS = {"iterates", "iterate_std"}
-
 NOT_KEPT: dict[str, Any] = {
     "detail": "", "correlation": (), "frames": (), "condition_number": None, "flat": (),
     "confounded": (), "objective": (), "details": {}, "distance_to_truth_mm": None,
+    "iterates": (), "iterate_std": (),
 }  # fmt: skip
 """Parts of an estimate that no table or figure of a sweep shows; the job's own record has them."""
 
@@ -42,10 +40,6 @@ class SweptJob(Frozen):
         First digits of the hash of its configuration.
     seed, repeats : int
         It runs with the seeds ``seed``, ``seed + 1``, ..., so many in all.
-    start, truth : (p,) or None
-        Initial guess and true values of the sweep's parameters, as configured.
-    P0, Q, R : number, (p,) or (p, p)
-        Covariances of the filter, as configured.
     record : Record
         Its head, see `head_of`.
     """
@@ -53,11 +47,6 @@ class SweptJob(Frozen):
     hash: str
     seed: int
     repeats: int = 1
-    start: tuple[float | None, ...] | None = None
-    truth: tuple[float | None, ...] | None = None
-    P0: Any = None
-    Q: Any = None
-    R: Any = None
     record: Record
 
     @property
@@ -93,7 +82,7 @@ class Sweep(Frozen):
         At least one.
     """
 
-    version: Literal[3] = 3
+    version: Literal[4] = 4
     name: str
     size: str | None = None
     title: str
@@ -116,16 +105,8 @@ class Sweep(Frozen):
 
     def plain(self) -> dict[str, Any]:
         """Plain data for JSON, sealed; `Sweep.of_plain` reads them."""
-        # Of the ways from several starts, one a job.
-        first = 1 if len({job.start for job in self.jobs}) > 1 else 0
-        jobs = []
-        for job in self.jobs:
-            unshown = dict.fromkeys(range(first, len(job.record.estimates)), PATHS)
-            left_out: Any = {"record": {"estimates": unshown}}
-            jobs.append(job.model_dump(mode="json", exclude_defaults=True, exclude=left_out))
-        common = _common(jobs)
-        header = self.model_dump(mode="json", exclude={"jobs"})
-        return sealed({**header, "common": common, "jobs": [_beyond(job, common) for job in jobs]})
+        jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in self.jobs]
+        return sealed({**self.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
 
     @classmethod
     def of_plain(cls, data: Any, where: str) -> Sweep:
@@ -139,12 +120,7 @@ class Sweep(Frozen):
         if not isinstance(data, Mapping):
             raise InputError(f"{where} is no collected sweep but a {type(data).__name__}")
         try:
-            common = data["common"]
-            jobs = [_joined(common, job) for job in data["jobs"]]
-            rest = {k: v for k, v in data.items() if k not in ("sha256", "common")}
-            sweep = cls.model_validate({**rest, "jobs": jobs})
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{where} is no collected sweep: {error}") from error
+            sweep = cls.model_validate({k: v for k, v in data.items() if k != "sha256"})
         except ValidationError as error:
             first = error.errors()[0]
             place = one_line(".".join(map(str, first["loc"])), 80)
@@ -203,37 +179,3 @@ def read_sweep(path: Path) -> Sweep:
 def read_sweeps(results: Path) -> list[Sweep]:
     """Every published sweep in the order of file names."""
     return [read_sweep(path) for path in sorted((results / SWEEPS).glob("*.json"))]
-
-
-def _common(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Entries that all of several nested mappings have alike."""
-    found: dict[str, Any] = {}
-    for key, value in parts[0].items():
-        others = [part[key] for part in parts if key in part]
-        if len(others) < len(parts):
-            continue
-        if all(isinstance(other, dict) for other in others):
-            found[key] = _common(others)
-        elif all(other == value and type(other) is type(value) for other in others):
-            found[key] = value
-    return found
-
-
-def _beyond(part: Mapping[str, Any], common: Mapping[str, Any]) -> dict[str, Any]:
-    """What a mapping says beyond the common entries."""
-    found = {}
-    for key, value in part.items():
-        if key not in common:
-            found[key] = value
-        elif isinstance(value, dict) and (own := _beyond(value, common[key])):
-            found[key] = own
-    return found
-
-
-def _joined(common: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
-    """The mapping of which `_beyond` gave a part."""
-    own = {
-        key: _joined(common[key], value) if isinstance(common.get(key), dict) else value
-        for key, value in part.items()
-    }
-    return {**common, **own}

@@ -1,4 +1,4 @@
-"""Figures of any sweep: errors along each factor, errors over two factors, paths of estimates."""
+"""Figures of any sweep: errors along each factor, and errors over two factors."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from matplotlib.figure import Figure
 
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.runs import Z95, factors_of, good_of, is_number, runs_of, values_of
-from mvest.problem.registration import unit_of
 from mvest.reporting.figures import (
     BAD,
     COLOURS,
-    GOOD,
     SEQUENTIAL,
     SMALL,
     TEXT,
@@ -47,14 +45,13 @@ Values = dict[str, list[Any]]
 def figures_of(sweep: Sweep) -> dict[str, Figure]:
     """The figures of a sweep by the end of their file names; those without data are left out.
 
-    ``""`` shows errors and intervals along each factor, ``matrix`` errors over two factors and
-    ``paths`` the estimates after each iteration, where there are several starts.
+    ``""`` shows errors and intervals along each factor, ``matrix`` errors over two factors.
     """
     runs = runs_of(sweep).frame
     values = values_of(sweep, runs)
-    drawn = {"paths": _paths(sweep, values)}
-    if good_of(runs)["signed error"].notna().any():
-        drawn |= {"": _along(sweep, runs, values), "matrix": _matrix(sweep, runs, values)}
+    if good_of(runs)["signed error"].isna().all():
+        return {}
+    drawn = {"": _along(sweep, runs, values), "matrix": _matrix(sweep, runs, values)}
     return {name: figure for name, figure in drawn.items() if figure is not None}
 
 
@@ -190,34 +187,6 @@ def _matrix(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
     others = [name for name in values if name not in (up, across, part)]
     pooled = f", over all values of {', '.join(others)}" if others else ""
     note = f"Root mean square error [%] of the worst parameter{pooled}. ×: all runs failed."
-    return _titled(figure, sweep, note)
-
-
-def _paths(sweep: Sweep, values: Values) -> Figure | None:
-    """Estimates after each iteration: a row for each parameter, columns for values of a factor."""
-    part, parts = _parted(values, ())
-    factor = next((name for name, (column, _) in factors_of(sweep).items() if column == part), "")
-    jobs = [job for job in sweep.jobs if job.record.estimates and job.record.estimates[0].iterates]
-    if len({job.start for job in jobs}) < 2:
-        return None
-    figure, grid = panels(len(sweep.parameters), len(parts), 2.4 * len(sweep.parameters) + 0.8,
-                          sharey="row")  # fmt: skip
-    for column, value in enumerate(parts):
-        grid[0, column].set_title(f"{part}: {_label(value)}" if part else "", fontsize=TEXT)
-        grid[-1, column].set_xlabel("iteration")
-        for job in (job for job in jobs if job.record.factors.get(factor) == value):
-            run, names = job.record.estimates[0], [u.name for u in job.record.estimates[0].unknowns]
-            colour, end = (GOOD, "o") if run.converged else (BAD, "x")
-            for k, name in enumerate(sweep.parameters):
-                path = [iterate[names.index(name)] for iterate in run.iterates]
-                grid[k, column].plot(path, color=colour, linewidth=0.8, alpha=0.7)
-                grid[k, column].plot(len(path) - 1, path[-1], end, color=colour, markersize=4)
-        for axes, truth in zip(grid[:, column], jobs[0].truth or (), strict=False):
-            axes.axhline(truth, color="black", linestyle="--", linewidth=1.2)
-            axes.xaxis.get_major_locator().set_params(integer=True)
-    for axes, name, short in zip(grid[:, 0], sweep.parameters, _names(sweep), strict=True):
-        axes.set_ylabel(f"{short} [{unit_of(name)}]" if unit_of(name) else short)
-    note = "Estimates after each iteration. Dashed: the truth; orange, ×: runs that failed."
     return _titled(figure, sweep, note)
 
 

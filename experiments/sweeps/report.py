@@ -18,7 +18,6 @@ from mvest.errors import InputError
 CAPTIONS = {
     "": "Errors and intervals along each factor.",
     "matrix": "Errors over two factors.",
-    "paths": "Estimates after each iteration, from every start.",
 }
 """End of the file name of a figure -> its caption."""
 

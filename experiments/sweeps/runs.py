@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.sweeps.collected import Sweep, SweptJob
+from experiments.sweeps.collected import Sweep
 from mvest.estimation.estimate import NOT_THE_POSTERIOR
 from mvest.problem.registration import unit_of
 from mvest.reporting.tables import Column, Table, table
@@ -40,18 +40,16 @@ COVARIANCE = "filter coordinates²"
 UNIT, BOUND, ERROR = "unit of the parameter", "Cramér–Rao bound", "signed error"
 """A unit that differs from row to row where parameters do, and two columns."""
 
+COVARIANCES = {"P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²"}
+"""Factors whose unit no ending says."""
+
 COLUMNS = {
-    **dict.fromkeys(("job", "seed", "status", "filter", "element"), ""),
-    "noise": "mm", "parameter": "", "true value": UNIT, "start": UNIT,
-    "P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²", "estimate": UNIT, "std": UNIT,
-    "low": UNIT, "high": UNIT, BOUND: UNIT, ERROR: "%",
+    **dict.fromkeys(("job", "seed", "status", "parameter"), ""), "true value": UNIT, "start": UNIT,
+    "estimate": UNIT, "std": UNIT, "low": UNIT, "high": UNIT, BOUND: UNIT, ERROR: "%",
     "distance mean": "mm", "distance SD": "mm", "distance max": "mm", "iterations": "",
     "forward solves": "", "reason": "",
 }  # fmt: skip
 """Columns of the tidy table after the factors, and their units."""
-
-SAME = ("filter", "element", "noise_mm", "P0", "Q", "R", SEED)
-"""Factors whose column says what the column of that name says anyway."""
 
 STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
     "estimate": (
@@ -92,9 +90,9 @@ def factors_of(sweep: Sweep) -> dict[str, tuple[str, str]]:
         unit = ENDINGS.get(ending.lower(), "") if stem else ""
         label = (stem if unit else name).replace("_", " ")
         unit = "MPa" if name.startswith("start_") else unit
-        if label in COLUMNS and name not in SAME:
+        if label in COLUMNS and name != SEED:
             label = f"{label} (factor)"
-        found[name] = (label, COLUMNS[name] if name in ("P0", "Q", "R") else unit)
+        found[name] = (label, COVARIANCES.get(name, unit))
     return found
 
 
@@ -102,26 +100,20 @@ def runs_of(sweep: Sweep) -> Table:
     """A row for each parameter of each run (job and seed), failed ones included, factors first.
 
     Errors are signed, in percent of the truth. The ends of an interval are those that the record
-    states, or 1.96 standard deviations from the estimate.
+    states, or 1.96 standard deviations from the estimate. Of a lost run only its factors are known.
     """
     factors = factors_of(sweep)
     units = {**dict(factors.values()), **COLUMNS}
     rows = []
     for job in sweep.jobs:
-        record = job.record
-        varied = {column: record.factors.get(name) for name, (column, _) in factors.items()}
-        of_job = {
-            "job": job.hash,
-            "filter": record.model and record.model.filter,
-            "element": record.model and record.model.element,
-            "noise": record.model and record.model.noise_mm,
-            "R": _diagonal(job.R, 0),
-        }
+        varied = {column: job.record.factors.get(name) for name, (column, _) in factors.items()}
         for run in job.runs:
             found = {row.get("parameter"): row for row in run.rows()}
-            for k, name in enumerate(sweep.parameters):
-                row = {**next(iter(found.values())), **found.get(name, {}), "parameter": name}
-                rows.append({**of_job, **_cells(job, row, k), **varied})
+            whole = next(iter(found.values()))
+            rows += [
+                {"job": job.hash, **_cells(found.get(name, whole), name), **varied}
+                for name in sweep.parameters
+            ]
     return _table(sweep, rows, {name: Column(unit) for name, unit in units.items()})
 
 
@@ -134,19 +126,17 @@ def _table(sweep: Sweep, rows: list[dict[str, Any]], about: dict[str, Column]) -
     return table([{name: row.get(name) for name in about} for row in rows], **about)
 
 
-def _cells(job: SweptJob, row: Mapping[str, Any], k: int) -> dict[str, Any]:
-    """Columns of parameter k from its row of a record; of a lost run what is configured."""
+def _cells(row: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Columns of a parameter from its row of a record."""
     low, high, error = row.get("low"), row.get("high"), row.get("relative_error")
     estimate, std = row.get("estimate"), row.get("std")
     if low is None and estimate is not None and std is not None:
         low, high = estimate - Z95 * std, estimate + Z95 * std
-    start, truth = row.get("prior_mean"), row.get("truth")
     return {
         **row,
-        "start": job.start[k] if start is None and job.start else start,
-        "true value": job.truth[k] if truth is None and job.truth else truth,
-        "P0": _diagonal(job.P0, k),
-        "Q": _diagonal(job.Q, k),
+        "parameter": name,
+        "start": row.get("prior_mean"),
+        "true value": row.get("truth"),
         "low": low,
         "high": high,
         BOUND: row.get("bound"),
@@ -155,16 +145,8 @@ def _cells(job: SweptJob, row: Mapping[str, Any], k: int) -> dict[str, Any]:
         "distance SD": row.get("distance_std"),
         "distance max": row.get("distance_max"),
         "forward solves": row["forward_solves"],
-        "reason": "" if row["status"] == CONVERGED else row["reason"] or job.record.reason,
+        "reason": "" if row["status"] == CONVERGED else row["reason"],
     }
-
-
-def _diagonal(value: Any, k: int) -> Any:
-    """Entry k of a covariance's diagonal, given as one number, a diagonal or a matrix."""
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        entry = value[k] if k < len(value) else None
-        return entry[k] if isinstance(entry, Sequence) else entry
-    return value
 
 
 def shortened(whole: Table) -> Table:

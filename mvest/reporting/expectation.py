@@ -6,23 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mvest.estimation.information.identifiability import Identifiability
 from mvest.problem.expectation import Expectation
 from mvest.problem.record import Confounded, confounded
 from mvest.problem.registration import unit_of
 from mvest.reporting.markup import MISSING, listed, number
-
-MEASURED = {
-    "pressure_scale": (0.02, "2 % (2.4 mmHg of 120)"),
-    "chord_rest_length": (0.005, "0.5 %"),
-    "chord_stiffness": (0.05, "5 %"),
-    "shift": (0.2, "0.2 mm"),
-    "turn": (0.5, "0.5 degrees"),
-}
-"""Kind of parameter -> how well it might be measured, in its unit and in words."""
-
-GAIN = 0.1
-"""Least part of a modulus' standard deviation that a measurement worth naming takes away."""
 
 ALL_APART, UNTOLD = "The data tell all parameters apart.", "not determined"
 
@@ -73,7 +60,6 @@ def expectation_text(title: str, expected: Expectation, noise: str) -> str:
         + " (1: all parameters, in parts of their size, are told equally well)",
         *([alike_words(group) for group in confounded(data)] or [ALL_APART]),
         *(f"Known badly from the data alone: {words}" for words in data.flat()),
-        *measurement_words(data if informed is None else informed),
         "No estimation was run.",
     ]
     return "\n".join(lines)
@@ -85,27 +71,6 @@ def unknown_text(title: str, reason: str) -> str:
         f"{title}: what the data will tell is not known, the model has no prediction at the "
         f"assumed parameters ({reason})"
     )
-
-
-def measurement_words(data: Identifiability) -> list[str]:
-    """What to measure besides, how well, and what that gains; the largest gain first."""
-    moduli = np.array([k for k, name in enumerate(data.names) if unit_of(name) == "MPa"], dtype=int)
-    found = []
-    for name in data.names:
-        accuracy, words = MEASURED.get(name.partition(".")[0], (0.0, ""))
-        if not accuracy or not moduli.size:
-            continue
-        now, then = data.std[moduli], data.measured(name, accuracy)[moduli]
-        left = np.divide(then, now, out=np.zeros(len(moduli)), where=np.isfinite(now))
-        best = int(np.argmin(left))
-        k = int(moduli[best])
-        if left[best] <= 1 - GAIN and np.isfinite(then[best]):
-            before, after = (
-                _percent(float(std[best]), float(data.scale[k])) for std in (now, then)
-            )
-            known = f"{data.names[k]} would be known to {after} (now {before})"
-            found.append((left[best], f"Measure {name} to {words}: {known}."))
-    return [words for _, words in sorted(found)]
 
 
 def alike_words(group: Confounded, labels: Mapping[str, str] | None = None) -> str:
@@ -139,7 +104,3 @@ def _change(name: str, change: float, relative: float) -> str:
 
 def _width(std: float) -> str:
     return number(std, 2) if np.isfinite(std) else UNTOLD
-
-
-def _percent(std: float, size: float) -> str:
-    return f"{number(100.0 * std / size, 2)} %" if np.isfinite(std) else UNTOLD

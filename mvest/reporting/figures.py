@@ -14,7 +14,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -24,10 +24,12 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray
+
+if TYPE_CHECKING:
+    from mvest.problem.record import EstimateRecord
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008)."""
@@ -131,51 +133,35 @@ def levels(n: int) -> Any:
     return colormaps["viridis"](np.linspace(0.0, 0.85, n))
 
 
-def iterates_figure(
-    title: str,
-    parameters: Sequence[str],
-    iterates: Sequence[Sequence[float | None]],
-    std: Sequence[Sequence[float | None]],
-    truth: Sequence[float | None],
-) -> Figure:
-    """Each parameter against the iteration, with its band of two standard deviations and the truth.
+def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
+    """Each parameter against the iteration, a panel each; None if no estimate has iterates.
 
-    Parameters
-    ----------
-    title : str
-    parameters : sequence of str, (p,)
-    iterates, std : (i, p)
-        At least one.
-    truth : (p,)
-        None where it is not known.
-
-    Raises
-    ------
-    InputError
-        If there is no iterate.
+    A band shows two standard deviations, which of several estimates are left out. The dashed line
+    is the truth.
     """
-    if not iterates:
-        raise InputError(f"{title}: a run without iterates has nothing to draw")
-    m, s, known = (np.array(values, dtype=np.float64) for values in (iterates, std, truth))
-    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
-    axes = figure.subplots()
-    rounds = np.arange(len(m))
-    for k, name in enumerate(parameters):
-        colour = COLOURS[k % len(COLOURS)]
-        low, high = m[:, k] - 2 * s[:, k], m[:, k] + 2 * s[:, k]
-        axes.fill_between(rounds, low, high, color=colour, alpha=0.2, linewidth=0)
-        axes.plot(rounds, m[:, k], color=colour, marker=MARKERS[k % len(MARKERS)], label=name)
-        axes.axhline(known[k], color=colour, linestyle="--", linewidth=1)
-    axes.set_xlabel("iteration")
-    is_modulus = any(name.startswith("E_f.") for name in parameters)
-    axes.set_ylabel("modulus [MPa]" if is_modulus else "parameter")
-    axes.set_xticks(rounds if len(rounds) <= 12 else rounds[:: len(rounds) // 8])
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.plot([], [], color="grey", linestyle="--", linewidth=1, label="truth")
-    axes.fill_between([], [], color="grey", alpha=0.2, linewidth=0, label="± 2 SD")
-    axes.legend(frameon=False, fontsize=8)
-    axes.set_title(title, fontsize=10)
+    drawn = [one for one in estimates if one.iterates]
+    if not drawn:
+        return None
+    unknowns = drawn[0].unknowns[: len(drawn[0].iterates[0])]
+    figure, (grid,) = panels(1, len(unknowns), 4.2 if drawn[1:] else 3.4)
+    for k, (axes, unknown) in enumerate(zip(grid, unknowns, strict=True)):
+        for n, one in enumerate(drawn):
+            turn, place = divmod(n, len(COLOURS))
+            style = {"color": COLOURS[place], "marker": MARKERS[place], "fillstyle": "none"}
+            m = np.array([at[k] for at in one.iterates], dtype=np.float64)
+            axes.plot(m, ("-", ":")[turn % 2], label=one.case or "estimate", **style)
+            if not drawn[1:] and one.iterate_std:
+                s = 2.0 * np.array([at[k] for at in one.iterate_std], dtype=np.float64)
+                band = {"color": COLOURS[place], "alpha": 0.2, "linewidth": 0}
+                axes.fill_between(np.arange(len(m)), m - s, m + s, label="± 2 SD", **band)
+        if unknown.truth is not None:
+            axes.axhline(unknown.truth, color=GREY, linestyle="--", label="truth")
+        unit = f" ({unknown.unit})" if unknown.unit else ""
+        axes.set(xlabel="iteration", ylabel=unknown.name + unit)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    lines, names = grid[0].get_legend_handles_labels()
+    where: Any = "outside upper center"
+    figure.legend(lines, names, loc=where, ncols=2, frameon=False, fontsize=SMALL)
     return figure
 
 

@@ -69,6 +69,38 @@ def interval_columns(label: str, *, hidden: bool = False) -> dict[str, Column]:
     }
 
 
+def estimates_table(by: str, estimates: Sequence[EstimateRecord]) -> Table:
+    """A row for each unknown of each estimate, beside its truth.
+
+    Parameters
+    ----------
+    by : str
+        Name of the first column: the case of an estimate, or its seed where it has none.
+    estimates : sequence of EstimateRecord
+    """
+    keys = ("parameter", "truth", "prior_mean", "estimate", "std", "bound", "relative_error")
+    rows = [
+        {by: one.case or one.seed}
+        | {key: row.get(key) for key in (*keys, "distance_mean", "reason")}
+        for one in estimates
+        for row in one.rows()
+        if row.get("kind") != "derived"
+    ]
+    mpa = "MPa" if all(u.unit == "MPa" for one in estimates for u in one.unknowns) else ""
+    about = {
+        by: Column(),
+        "parameter": Column(),
+        "truth": Column(mpa),
+        "prior_mean": Column(mpa, hidden=True),
+        "estimate": Column(mpa, std="std"),
+        "bound": Column(mpa, ".2g", label="data alone leave"),
+        "relative_error": Column(digits="+.2%", label="error"),
+        "distance_mean": Column("mm"),
+        "reason": Column(hidden=True),
+    }
+    return table(rows, **about)
+
+
 def skill_table(by: str, groups: Mapping[str, Sequence[Unknown]]) -> Table:
     """A row for each group of unknowns, see `mvest.problem.skill.skill`; none for empty ones.
 
@@ -102,14 +134,13 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure
     groups : mapping
         Name -> moduli whose truths are known, each with the verdict in a word.
     """
-    from matplotlib.figure import Figure
+    from mvest.reporting.figures import panels
 
     names = list(dict.fromkeys(own.name for each in groups.values() for own, _ in each))
     most = max((len(each) for each in groups.values()), default=0) / max(len(names), 1)
     height = len(groups) * max(0.6, 0.11 * most) + 1.2
-    drawn = Figure(figsize=(4.2 * max(len(names), 1) + 1.6, height), layout="constrained")
-    panels = drawn.subplots(1, max(len(names), 1), sharey=True, squeeze=False)[0]
-    for axes, name in zip(panels, names, strict=False):
+    drawn, (grid,) = panels(1, max(len(names), 1), height, sharey=True)
+    for axes, name in zip(grid, names, strict=False):
         for k, each in enumerate(groups.values()):
             rows = [(own, trust) for own, trust in each if own.name == name]
             rows.sort(key=lambda row: row[0].truth or 0.0)
@@ -120,13 +151,12 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure
         axes.set_xticks([0.5, 0.7, 1.0, 1.5, 2.0], labels=["0.5", "0.7", "1", "1.5", "2"])
         axes.minorticks_off()
         axes.set_xlabel(f"{name.replace('.', ' ')}, estimate / truth")
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_yticks(range(len(groups)), labels=list(groups))
-    panels[0].invert_yaxis()
+    grid[0].set_yticks(range(len(groups)), labels=list(groups))
+    grid[0].invert_yaxis()
     for trust in VERDICTS:
-        panels[-1].plot([], [], "o-", color=COLOURS[trust], ms=4, lw=1.3, label=trust)
-    panels[-1].plot([], [], "|", color="0.5", ms=8, label=GENERIC)
-    panels[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        grid[-1].plot([], [], "o-", color=COLOURS[trust], ms=4, lw=1.3, label=trust)
+    grid[-1].plot([], [], "|", color="0.5", ms=8, label=GENERIC)
+    grid[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     return drawn
 
 

@@ -3,36 +3,41 @@ from matplotlib.figure import Figure
 
 from mvest.errors import InputError
 from mvest.reporting.figures import iterates_figure, save_figure_with
+from tests.experiments.studies.made_up import made_up_estimate
 
 LINE = "table1: mvest 0.1.0, commit 0123456789ab, configuration cdcdcdcdcdcd, seed 1"
 
 
-def drawn(iterates=((5.0, 3.0), (6.1, 2.3), (6.22, 2.1), (6.2296, 2.0901))):
-    """A figure of four iterates with standard deviations of 0.1."""
-    names, std = ("E_f.anterior", "E_f.posterior"), [(0.1, 0.1)] * len(iterates)
-    return iterates_figure("Moduli: same model", names, iterates, std, (6.23, 2.09))
+def drawn() -> Figure:
+    """The iterates of one estimate."""
+    figure = iterates_figure([made_up_estimate()])
+    assert figure is not None
+    return figure
 
 
 def test_iterates_band_and_truth_are_drawn() -> None:
-    axes = drawn().axes[0]
-    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
-    assert list(lines["E_f.anterior"]) == [5.0, 6.1, 6.22, 6.2296]
-    band = axes.collections[0].get_paths()[0].vertices
-    # First iterate 5.0 with two standard deviations of 0.1.
-    at_start = band[band[:, 0] == 0, 1]
-    assert at_start.min() == pytest.approx(4.8)
-    assert at_start.max() == pytest.approx(5.2)
-    levels = [
-        line.get_ydata()[0]
-        for line in axes.lines
-        if line.get_linestyle() == "--" and len(line.get_ydata())
-    ]
-    assert levels == [6.23, 2.09]
+    for axes, start, end, std, truth in zip(
+        drawn().axes, (5.0, 3.0), (6.2296, 2.0901), (0.02, 0.005), (6.23, 2.09), strict=True
+    ):
+        lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+        assert list(lines["estimate"]) == [start, end]
+        assert lines["truth"][0] == truth
+        (band,) = (each.get_paths()[0].vertices for each in axes.collections)
+        # Two standard deviations: 2.0 at first.
+        at_start, at_end = (band[band[:, 0] == k, 1] for k in (0, 1))
+        assert (at_start.min(), at_start.max()) == pytest.approx((start - 4.0, start + 4.0))
+        assert (at_end.min(), at_end.max()) == pytest.approx((end - 2 * std, end + 2 * std))
 
 
-def test_a_run_without_iterates_is_refused() -> None:
-    with pytest.raises(InputError, match="nothing to draw"):
-        drawn(())
+def test_several_estimates_are_lines_without_bands() -> None:
+    cases = [made_up_estimate(case=name) for name in ("one", "other")]
+    axes, _ = iterates_figure([*cases, made_up_estimate(None)]).axes
+    assert [line.get_label() for line in axes.lines] == ["one", "other", "truth"]
+    assert not axes.collections
+
+
+def test_without_iterates_nothing_is_drawn() -> None:
+    assert iterates_figure([made_up_estimate(None)]) is None
 
 
 def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:

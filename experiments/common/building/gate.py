@@ -8,11 +8,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from experiments.common.building.closure import closure_model
 from experiments.common.places import GATE_RECORDS
+from experiments.common.progress import say
 from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
-from experiments.common.schema import build
+from experiments.common.schema import Values, build
 from mvest.closure.anchors import content_digest
-from mvest.closure.robustness import GATE_CASES, GateCase, GateReport
+from mvest.closure.robustness import GATE_CASES, GateCase, GateReport, run_gate
 from mvest.errors import ConfigurationError
 from mvest.reporting.tables import Table, table
 from mvest.valve.anatomy.dimensions import TemplateParameters
@@ -31,6 +35,25 @@ def gate_cases(names: Sequence[str]) -> tuple[GateCase, ...]:
         if name not in known:
             raise ConfigurationError(f"gate has {name!r}, expected some of {', '.join(known)}")
     return tuple(known[name] for name in names)
+
+
+def ask_gate(values: Values, cases: Sequence[GateCase] = GATE_CASES) -> GateReport:
+    """Close the configured anatomy with its true moduli under variations that must not matter.
+
+    Each result is printed to standard error as soon as it is known.
+    """
+    return run_gate(
+        lambda case: closure_model(values, case),
+        np.array(values["truth"]["values"], dtype=float),
+        cases,
+        on_case=lambda row: say(f"{row.case}: max {row.max_mm:.3g} mm, {row.reason}"),
+        on_path=lambda path: say(f"along {path.name}: {path.reason or 'no jump'}"),
+    )
+
+
+def closures_of(report: GateReport) -> int:
+    """How many closures a report took."""
+    return len(report.rows) + sum(path.closures for path in report.paths)
 
 
 def gate_rows(report: GateReport) -> Table:

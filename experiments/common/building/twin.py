@@ -23,7 +23,7 @@ from experiments.common.building.closure import (
     mesh_store,
 )
 from experiments.common.building.filters import build_filter, observation_variance, require_one_each
-from experiments.common.progress import SolveBar
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import Values
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
@@ -43,6 +43,7 @@ from mvest.observation.errors import (
     WhiteNoise,
 )
 from mvest.observation.vertices import require_frames
+from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
 from mvest.problem.stored import Extrapolated, Store, StoredModel
@@ -314,6 +315,36 @@ def build_twin(config: Values) -> Twin:
         frames,
         errors,
     )
+
+
+def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[StudyResult]:
+    """One estimate for each seed of the errors; simulation and first closure are shared.
+
+    Parameters
+    ----------
+    twin : Twin
+    seeds : sequence of int
+    name : str
+        Shown with the progress.
+    """
+    of_name = f", {name}" if name else ""
+    with SolveBar(
+        f"observation{of_name}", len(twin.truth_model.settings.protocol.steps()), 1
+    ) as bar:
+        twin.truth_model.on_step = bar.step
+        truth = twin.source(twin.truth_values)
+    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
+    results = []
+    steps, solves = len(twin.model.settings.protocol.steps()), TYPICAL_SOLVES * len(seeds)
+    with SolveBar(f"estimation{of_name}", steps, solves, problem.parameters) as bar:
+        twin.model.on_step = bar.step
+        for seed in seeds:
+            data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
+            if data.observation is None:
+                return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
+            result = estimate(problem, data.observation, on_iterate=bar.iterate)
+            results.append(result.against(data.truth))
+    return results
 
 
 def _require_tissue(

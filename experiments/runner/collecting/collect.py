@@ -50,7 +50,6 @@ def collect(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
 
 def _swept(job: PlannedJob, record: Record | None) -> SweptJob:
     values: dict[str, Any] = job.values
-    settings = values["filter"]
     if record is None:
         result = Result(status="failed", reason=NOT_RUN)
         record = stamp(values, job.request.config_hash, result, time.time())
@@ -58,11 +57,6 @@ def _swept(job: PlannedJob, record: Record | None) -> SweptJob:
         hash=job.short_hash,
         seed=values["seed"],
         repeats=values["repeats"],
-        start=settings["initial"],
-        truth=values["truth"]["values"],
-        P0=settings["P0"],
-        Q=settings["method"].get("Q", 0.0),
-        R=settings["R"],
         # One that was computed for another sweep has the factors of that.
         record=record.model_copy(update={"factors": values["factors"]}),
     )

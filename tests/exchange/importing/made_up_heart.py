@@ -5,11 +5,16 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from experiments.studies.imported import HEART_PARTS
+from experiments.studies.imported import HeartSettings
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.segmented import HEAD_MM
 from mvest.valve.geometry.thickening import thicken
 
+PARTS = (
+    "mitral_valve.ply",
+    "papillary_muscle_anterolateral.ply",
+    "papillary_muscle_posteromedial.ply",
+)
 TEMPLATE = Template()
 # Seen from the atrium the antero-lateral tip is on the left of the anterior leaflet.
 TIPS = TEMPLATE.valve(64, 20).papillary_tips[::-1]
@@ -44,6 +49,12 @@ def parts():
 def heart(folder: Path) -> Path:
     """Write the parts of the template's heart."""
     folder.mkdir()
-    for name, (points, triangles) in zip(HEART_PARTS, parts(), strict=True):
+    for name, (points, triangles) in zip(PARTS, parts(), strict=True):
         meshio.Mesh(points, [("triangle", triangles.astype(np.int32))]).write(folder / name)
     return folder
+
+
+def settings_of(folder: Path, **changes: object) -> HeartSettings:
+    """Settings of the study that name the parts in a folder."""
+    valve, *muscles = (str(folder / name) for name in PARTS)
+    return HeartSettings(**{"source": valve, "muscles": tuple(muscles), **changes})  # type: ignore[arg-type]

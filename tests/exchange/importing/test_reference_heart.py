@@ -11,24 +11,36 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from experiments.studies.imported import (
-    HEART_CITATION,
-    HEART_OBJECTS,
-    HEART_PARTS,
-    HEART_VARIABLE,
-    HeartOptions,
-    heart_files,
-    import_heart,
-)
+from experiments.studies.imported import import_heart
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import doubts
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.segmented import HEAD_MM, papillary_tip
-from tests.exchange.importing.made_up_heart import SHIFT, TEMPLATE, TIPS, heart, parts
+from tests.exchange.importing.made_up_heart import (
+    PARTS,
+    SHIFT,
+    TEMPLATE,
+    TIPS,
+    heart,
+    parts,
+    settings_of,
+)
 from tests.exchange.surfaces.glb import write_parts
 from tests.places import ROOT
+
+OBJECTS = (
+    "VH_M_mitral_valve",
+    "VH_M_papillary_muscle_of_heart_anterolateral",
+    "VH_M_papillary_muscle_of_heart_posteromedial",
+)
+"""Names of the parts in the file as it is distributed."""
+HEART = Path(os.environ.get("MVEST_HRA") or ROOT.parent / "shared" / "data" / "hra_mitral")
+
+
+def imported(folder: Path, closed_depth: float = 0.5, **changes: object):
+    return import_heart(settings_of(folder, **changes), closed_depth)[0]
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +50,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def case(folder):
-    return import_heart(folder, HeartOptions())[0]
+    return imported(folder, citation="whose heart", description="its shape is all that is real")
 
 
 def test_the_valve_that_was_thickened_comes_back(folder):
-    case = import_heart(folder, HeartOptions(smoothing_mm=0.0))[0]
+    case = imported(folder, smoothing_mm=0.0)
     valve = TEMPLATE.valve(112, 29)
     near = closest_points(
         case.surface.vertices - SHIFT, valve.surface.vertices, valve.surface.triangles
@@ -66,7 +78,7 @@ def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_pa
     assert not doubts(case)
     back = read_case(write_case(tmp_path / "case", case))
     np.testing.assert_array_equal(back.surface.vertices, case.surface.vertices)
-    assert back.source == HEART_CITATION
+    assert back.source == "whose heart"
     assert "shape is all that is real" in back.description
     said = " ".join(back.derived)
     for word in ("papillary tips", "thickness: kept between", "assumed closure", "smoothed"):
@@ -74,54 +86,50 @@ def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_pa
 
 
 def test_chordae_are_shorter_for_edges_that_stay_deeper(folder, case):
-    deeper = import_heart(folder, HeartOptions(closed_depth=1.0))[0]
+    deeper = imported(folder, 1.0)
     assert deeper.chordae.rest_length.sum() < case.chordae.rest_length.sum() - 10.0
 
 
-def test_what_is_missing_is_asked_for_in_one_line(folder, tmp_path, monkeypatch):
-    monkeypatch.delenv(HEART_VARIABLE, raising=False)
-    for place in (None, tmp_path):
-        with pytest.raises(InputError, match="not part of this package: take ") as raised:
-            heart_files(place)
+def test_what_is_missing_is_asked_for_in_one_line(folder, tmp_path):
+    for place in (tmp_path, folder):
+        changes = {"muscles": (str(folder / PARTS[1]), str(tmp_path / "none.ply"))}
+        with pytest.raises(InputError, match="not part of this package") as raised:
+            imported(place, **(changes if place == folder else {}))
         assert "\n" not in str(raised.value)
-    monkeypatch.setenv(HEART_VARIABLE, str(folder))
-    assert [file.name for file in heart_files()] == list(HEART_PARTS)
 
 
 def test_the_file_as_it_is_distributed_is_the_same_heart(case, tmp_path):
     # In metres, all parts of the heart in one file.
+    named = {"units": "m", "leaflets": OBJECTS[0], "muscles": OBJECTS[1:]}
     objects = {"VH_M_aortic_valve": (np.eye(3), np.array([[0, 1, 2]]))}
-    for name, (points, triangles) in zip(HEART_OBJECTS, parts(), strict=True):
+    for name, (points, triangles) in zip(OBJECTS, parts(), strict=True):
         objects[name] = (1e-3 * points, triangles)
     path = write_parts(tmp_path / "heart.glb", objects)
-    found = import_heart(path, HeartOptions())[0]
+    found = imported(tmp_path, source=str(path), **named)
     # Single precision at half a metre.
     assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=2e-3)
     assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-3)
-    del objects[HEART_OBJECTS[2]]
+    del objects[OBJECTS[2]]
     write_parts(path, objects)
-    with pytest.raises(InputError, match=f"name or number {HEART_OBJECTS[2]}"):
-        import_heart(path, HeartOptions())
+    with pytest.raises(InputError, match=f"name or number {OBJECTS[2]}"):
+        imported(tmp_path, source=str(path), **named)
 
 
 def test_any_heart_is_a_source_like_others(folder, case):
-    muscles = tuple(str(folder / name) for name in HEART_PARTS[1:])
+    muscles = tuple(str(folder / name) for name in PARTS[1:])
     known = LeafletsOptions(units="mm", muscles=muscles, smoothing_mm=4.0)
-    found = import_leaflets(folder / HEART_PARTS[0], known)
+    found = import_leaflets(folder / PARTS[0], known)
     assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=1e-9)
     assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-9)
     assert any("the middle of the last 5 mm of each muscle" in line for line in found.derived)
     with pytest.raises(InputError, match="as in a mirror"):
-        import_leaflets(folder / HEART_PARTS[0], replace(known, muscles=muscles[::-1]))
+        import_leaflets(folder / PARTS[0], replace(known, muscles=muscles[::-1]))
 
 
 def test_the_heart_itself_is_a_plausible_valve():
-    place = Path(os.environ.get(HEART_VARIABLE) or ROOT.parent / "shared" / "data" / "hra_mitral")
-    if not (place / HEART_PARTS[0]).is_file():
-        pytest.skip(
-            f"needs the reference heart: {HEART_CITATION}; name its folder in {HEART_VARIABLE}"
-        )
-    case = import_heart(place, HeartOptions())[0]
+    if not (HEART / PARTS[0]).is_file():
+        pytest.skip("needs the reference heart (conf/experiment); name its folder in MVEST_HRA")
+    case = imported(HEART)
     assert not doubts(case)
     tips = case.frames[0].papillary_tips
     assert np.linalg.norm(tips[0] - tips[1]) == pytest.approx(24.1, abs=0.5)

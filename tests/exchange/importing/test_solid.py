@@ -10,7 +10,6 @@ import meshio
 import numpy as np
 import pytest
 
-from experiments.studies.imported import HEART_VARIABLE
 from mvest.errors import InputError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.exchange.surfaces import read_surface
@@ -23,7 +22,7 @@ from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.thickening import thicken
 from tests.exchange.surfaces.glb import write_parts
 
-HRA = Path(os.environ.get(HEART_VARIABLE, "../shared/data/hra_mitral"))
+HRA = Path(os.environ.get("MVEST_HRA", "../shared/data/hra_mitral"))
 """Folder with the mitral valve of the HRA reference heart, three PLY files in mm."""
 
 
@@ -131,7 +130,7 @@ def test_what_is_missing_is_asked_for_by_name(
     assert str(whole) in str(caught.value)
 
 
-@pytest.mark.skipif(not HRA.is_dir(), reason=f"no HRA valve; {HEART_VARIABLE} names its folder")
+@pytest.mark.skipif(not HRA.is_dir(), reason="no HRA valve; MVEST_HRA names its folder")
 def test_a_real_anatomy() -> None:
     valve = read_surface(HRA / "mitral_valve.ply")
     tips = []

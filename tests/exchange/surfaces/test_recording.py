@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.studies.imported import DATA_VARIABLE, DONOR_CITATION
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
 from mvest.exchange.abaqus.recording import Recording, deck_sets, read_recording
@@ -326,9 +325,9 @@ REAL = ({name: f"{name}_Leaflet_Elements" for name in OGDEN}, "Annular_Nodes", "
 
 
 def real_case(name: str) -> Recording:
-    place = Path(os.environ.get(DATA_VARIABLE) or ROOT.parent / "shared" / "data" / "trivalve")
+    place = Path(os.environ.get("MVEST_TRIVALVE") or ROOT.parent / "shared" / "data" / "trivalve")
     if not (place / name).is_dir():
-        pytest.skip(f"needs the donor valve: {DONOR_CITATION}; name its folder in {DATA_VARIABLE}")
+        pytest.skip("needs the donor valve (conf/experiment); name its folder in MVEST_TRIVALVE")
     return read_recording(place / name, *REAL)
 
 

@@ -16,7 +16,7 @@ from experiments.common.config import hash_of
 from experiments.common.schema import Reads, build
 from experiments.common.study import load_settings, study_names
 from experiments.run import main
-from experiments.studies.imported import HEART_PARTS, DonorSettings, recorded_valve
+from experiments.studies.imported import DonorSettings, recorded_valve
 from mvest.cases.folder import write_case
 from mvest.exchange.external.contract import write_points
 from mvest.exchange.segmentations import write_sequence_nrrd
@@ -92,11 +92,8 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
             file = folder / f"{folder.name}{ending}"
             file.write_text("1")
         return str(folder), file
-    if name == "heart.source":
-        for part in HEART_PARTS:
-            (folder / part).write_text("1")
-        return str(folder), folder / HEART_PARTS[0]
-    listed = {"imaged.landmarks": [[2, str(file)]], "external.inputs": [str(file)]}
+    listed = {"imaged.landmarks": [[2, str(file)]]}
+    listed |= {"external.inputs": [str(file)], "heart.muscles": [str(file)]}
     listed["external.command"] = [sys.executable, f"--mesh={file}"]
     listed["external.python"] = f"{file}:function"
     return listed.get(name.replace(".models", ""), str(file)), file

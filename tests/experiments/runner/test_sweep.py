@@ -87,7 +87,7 @@ def test_a_sweep_is_planned_run_and_collected(run):
     assert [record.status for record in found.records] == ["converged"] * 4
     assert [record.estimates[0].seed for record in found.records] == [1, 2, 1, 2]
     assert found.records[1].estimates[0].unknown("E_f.anterior").estimate == 6.2
-    assert found.jobs[2].start == (4.0, 2.0)
+    assert found.records[2].factors["start_anterior"] == 4.0
     assert "sweep_debug: 4 of 4 jobs done, 0 without an estimate" in out
     assert re.search(r"start anterior 5 MPa, start posterior 3 MPa +E_f.anterior +2 +0 ", out)
     assert "Written to outputs/sweep_debug/sweep_debug.png" in out

@@ -99,7 +99,7 @@ def made_up_twin(values: tuple[float, ...] | None = (6.2296, 2.0901), **header: 
         "filter": {"mode": "paper"},
         "observation": {"noise_mm": 0.0},
     }
-    row = _row(config, estimate, None, None)
+    row = _row(config, estimate, None)
     return made_up(
         **{
             "study": "twin",
@@ -110,7 +110,7 @@ def made_up_twin(values: tuple[float, ...] | None = (6.2296, 2.0901), **header: 
             "status": estimate.status,
             "reason": estimate.reason,
             "estimates": (estimate,),
-            "tables": {"": _table([row | {"forward solves": 5}]).plain()},
+            "tables": {"": _table([row | {"nodes": 1, "forward solves": 5}]).plain()},
             **given,
         }
     )

@@ -10,8 +10,6 @@ from experiments.common.records.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
 from experiments.studies.imported import (
-    DATA_VARIABLE,
-    HEART_VARIABLE,
     DonorSettings,
     recorded_valve,
 )
@@ -47,8 +45,8 @@ SMALL_HEART = [
     "mesh.edge_length=4.0",
     "mechanics.contact_points.columns=72",
     "mechanics.contact_points.rows=16",
-    "heart.options.closed_depth=0.75",  # the template's
-    "heart.options.smoothing_mm=1.0",
+    "heart.closed_depth=0.75",  # the template's
+    "heart.smoothing_mm=1.0",
     "mesh=coarse",
     "observation.columns=40",
     "observation.rows=10",
@@ -100,13 +98,13 @@ def test_a_recorded_valve_end_to_end(run, tmp_path: Path) -> None:
 
 
 def test_an_absent_recording_is_one_clear_line(run, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path / "nowhere"))
+    monkeypatch.setenv("MVEST_TRIVALVE", str(tmp_path / "nowhere"))
     status, out, err = run("experiment=donor")
     assert (status, out) == (2, "")
     assert len(err.strip().splitlines()) == 1
-    assert err.startswith("error: donor valve: there is no folder")
-    assert DATA_VARIABLE in err
-    assert "Texas TriValve" in err
+    assert err.startswith("error: donor.recording = ")
+    assert "there is no folder" in err
+    assert "conf/experiment/donor.yaml" in err
 
 
 @pytest.mark.parametrize(
@@ -131,7 +129,7 @@ def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
     assert words in err
 
 
-def gate_of_made_up(build, m, cases, on_case, on_path):
+def gate_of_made_up(values, cases):
     """What the gate would say; asking it is `tests.closure.test_robustness`'s."""
     rows = [GateRow("reference", 0.0, 0.0, True, 1.0, "converged")]
     rows += [GateRow(case.name, 0.1, 0.7, False, 1.0, "converged") for case in cases]
@@ -152,11 +150,11 @@ def run_heart(monkeypatch, *arguments):
 
 @pytest.mark.slow
 def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.studies.imported.run_gate", gate_of_made_up)
+    monkeypatch.setattr("experiments.studies.imported.ask_gate", gate_of_made_up)
     monkeypatch.setattr("experiments.studies.imported._twin", twin_of_made_up)
-    source = heart(tmp_path / "heart")
+    monkeypatch.setenv("MVEST_HRA", str(heart(tmp_path / "heart")))
     monkeypatch.chdir(tmp_path)
-    assert run_heart(monkeypatch, *SMALL_HEART, f"heart.source={source}") == 0
+    assert run_heart(monkeypatch, *SMALL_HEART) == 0
     (file,) = tmp_path.glob("outputs/reference_heart/*/result.json")
     record = read_record(file)
     sizes = {row["name"]: row["value"] for row in record.table_of("shape").rows}
@@ -180,17 +178,17 @@ def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
 
 
 def test_without_the_heart_it_says_where_to_get_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv(HEART_VARIABLE, str(tmp_path / "nowhere"))
+    monkeypatch.setenv("MVEST_HRA", str(tmp_path / "nowhere"))
     monkeypatch.chdir(tmp_path)
     assert run_heart(monkeypatch, "experiment=reference_heart", "tracking.enabled=false") == 2
     said = capsys.readouterr().err
-    assert "The reference heart is not part of this package" in said
+    assert "the data are not part of this package" in said
+    assert "conf/experiment/reference_heart.yaml" in said
     assert "Traceback" not in said
 
 
 def test_an_unknown_variation_of_the_gate_is_refused(tmp_path, monkeypatch, capsys):
-    source = heart(tmp_path / "heart")
+    monkeypatch.setenv("MVEST_HRA", str(heart(tmp_path / "heart")))
     monkeypatch.chdir(tmp_path)
-    arguments = [*SMALL_HEART, f"heart.source={source}", "heart.gate=[nothing]"]
-    assert run_heart(monkeypatch, *arguments) == 2
+    assert run_heart(monkeypatch, *SMALL_HEART, "heart.gate=[nothing]") == 2
     assert "'nothing', expected some of" in capsys.readouterr().err

@@ -91,9 +91,8 @@ def job(
         estimates=tuple(runs),
     )
     first = runs[0].seed if runs else 1
-    whole = {"start": (5.0, 3.0), "P0": 9.0, "Q": 0.0, "R": 0.01, "seed": first, "repeats": 1}
-    whole |= {"hash": digest[:16], "truth": TRUTH.tolist(), "record": record}
-    return SweptJob(**{**whole, "repeats": max(len(runs), 1), **changes})
+    whole = {"hash": digest[:16], "seed": first, "repeats": max(len(runs), 1), "record": record}
+    return SweptJob(**{**whole, **changes})
 
 
 def sweep(name: str, jobs: Iterable[SweptJob], **changes: Any) -> Sweep:
@@ -120,7 +119,7 @@ def starts(name: str = "starts") -> Sweep:
                 good = (a, b) != (9.0, 8.0)
                 runs = [run(1, TRUTH * (1 + error), [0.02, 0.005], start=(a, b))] if good else []
                 factors = {"start_anterior": a, "start_posterior": b, "filter": filter_}
-                jobs.append(job(factors, runs, "killed", start=(a, b)))
+                jobs.append(job(factors, runs, "killed"))
     return sweep(name, jobs)
 
 

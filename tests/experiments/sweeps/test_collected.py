@@ -1,14 +1,12 @@
 """Collected sweeps: their file, what is published of them, and what is refused."""
 
-import json
-
 import pytest
 
 from experiments.sweeps.collected import Sweep, head_of, read_sweep, read_sweeps, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import SOURCE, made_up_twin
-from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, noise, run, starts, sweep
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, lost, noise, run, sweep
 
 HOSTILE = r"<b>x</b> | 5 % & $y$ \input{z}_1"
 
@@ -40,27 +38,6 @@ def test_a_sweep_comes_back_from_its_file(tmp_path, whole):
     assert back.plain() == whole.plain()
 
 
-def test_paths_are_kept_where_starts_differ_of_the_first_seed():
-    def kept(whole: Sweep) -> list[bool]:
-        back = Sweep.of_plain(whole.plain(), "there")
-        return [bool(one.iterates) for record in back.records for one in record.estimates]
-
-    assert kept(starts()) == [True] * 16
-    assert not any(kept(noise(2)))
-    two = [run(seed, TRUTH, [0.1, 0.1]) for seed in (1, 2)]
-    jobs = [job({"a": k}, two, start=(float(k), 1.0)) for k in (1, 2)]
-    assert kept(sweep("x", jobs)) == [True, False] * 2
-
-
-def test_what_jobs_have_alike_is_stored_once():
-    many = [job({"a": k, "b": 1}, [run(1, TRUTH, [0.1, 0.1])]) for k in range(50)]
-    data = sweep("x", many).plain()
-    assert data["common"]["record"]["factors"] == {"b": 1}
-    assert data["jobs"][3]["record"]["factors"] == {"a": 3}
-    assert data["common"]["record"]["provenance"]["versions"] == {"mvest": "0.1.0"}
-    assert len(json.dumps(data["jobs"][3])) < 1000
-
-
 def test_a_record_is_kept_without_what_no_table_shows():
     whole = made_up_twin()
     head = head_of(whole)
@@ -72,10 +49,10 @@ def test_a_record_is_kept_without_what_no_table_shows():
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda s: s.pop("jobs"), "'jobs'"),
+        (lambda s: s.pop("jobs"), "jobs: Field required"),
         (lambda s: s.update(version=2), "version"),
         (lambda s: s.update(jobs=[]), "jobs"),
-        (lambda s: s["common"]["record"].pop("title"), r"jobs\.0\.record\.title"),
+        (lambda s: s["jobs"][0]["record"].pop("title"), r"jobs\.0\.record\.title"),
         (lambda s: s.update(jobs=[3]), "is no collected sweep"),
         (lambda s: s.update(title="Better"), "content is not what was written"),
     ],

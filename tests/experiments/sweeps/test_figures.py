@@ -80,18 +80,8 @@ def test_the_matrix_shows_the_worst_parameters_root_mean_square():
     assert {t.get_text() for t in figures_of(sweep("x", jobs))["matrix"].axes[0].texts} == {"5"}
 
 
-def test_paths_are_drawn_where_starts_differ():
-    figure = figures_of(starts())["paths"]
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["filter: iterated", "filter: paper"]
-    for k, axes in enumerate(figure.axes):
-        paths = [line for line in axes.lines if len(line.get_xdata()) == 3]
-        assert len(paths) == 8, "one start of nine killed its job"
-        (truth,) = [line for line in axes.lines if line.get_linestyle() == "--"]
-        assert truth.get_ydata()[0] == TRUTH[k // 2]
-
-
 def test_nothing_to_draw_gives_no_figure():
-    assert set(figures_of(starts())) == {"", "matrix", "paths"}
+    assert set(figures_of(starts())) == {"", "matrix"}
     assert set(figures_of(noise(3))) == {"", "matrix"}
     one_factor = sweep("x", [job({"a": k}, [run(1, TRUTH, [0.1, 0.1])]) for k in (1, 2)])
     assert set(figures_of(one_factor)) == {""}

@@ -88,10 +88,9 @@ def test_an_interval_that_the_record_states_counts():
 def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
     good = run(1, [6.43, 2.0], [0.1, 0.05], bound=[0.09, 0.03])
     jobs = [
-        job({"kind": "white", "noise_mm": 0.5}, [good, failed_run(2, "went wrong")],
-            P0=[[9.0, 0.1], [0.1, 4.0]], Q=[0.1, 0.2]),
+        job({"kind": "white", "noise_mm": 0.5}, [good, failed_run(2, "went wrong")]),
         job({"kind": "white", "noise_mm": 1.0}, [], "out of memory", seed=4, repeats=3),
-    ]  # fmt: skip
+    ]
     rows = runs_of(sweep("noise", jobs)).rows
     assert list(rows[0])[:4] == ["kind", "noise", "job", "seed"]
     # A row for each parameter; a dead job counts as a failed run for each planned seed.
@@ -104,9 +103,9 @@ def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
     # 6.43 is 0.2 above the truth of 6.23, 2.0 is 0.09 below 2.09.
     assert anterior["signed error"] == pytest.approx(100 * 0.2 / 6.23)
     assert posterior["signed error"] == pytest.approx(-100 * 0.09 / 2.09)
-    assert (posterior["P0"], posterior["Q"], posterior["R"]) == (4.0, 0.2, 0.01)
-    # What is configured is known of a lost run, too.
-    assert (rows[-1]["true value"], rows[-1]["start"], rows[-1]["estimate"]) == (2.09, 3.0, None)
+    assert (posterior["true value"], posterior["start"]) == (2.09, 3.0)
+    # Of a lost run only its factors are known.
+    assert (rows[-1]["noise"], rows[-1]["true value"], rows[-1]["estimate"]) == (1.0, None, None)
 
 
 def test_seeds_of_a_killed_job_are_counted_where_some_left_an_estimate():
