@@ -40,7 +40,6 @@ VALUE_OBJECTS = (
 
 FILES = (
     "mvest.exchange.surfaces",
-    "mvest.exchange.regions",
     "mvest.exchange.volumes",
     "mvest.exchange.segmentations",
     "mvest.exchange.markups",

@@ -22,7 +22,7 @@ from mvest.exchange.external.contract import (
 from mvest.exchange.febio.document import read_positions
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.exchange.markups import read_markups
-from mvest.exchange.regions import read_regions
+from mvest.exchange.surfaces import read_regions
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality
 from tests.cases import folders

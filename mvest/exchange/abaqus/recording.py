@@ -152,7 +152,7 @@ def read_recording(
     nodes, vertices, held = found["nodes"], found["vertices"], found["held"]
     frames = []
     for k, file in enumerate(files):
-        points = read_mesh(file).points
+        points = read_mesh(file).vertices
         if points.shape != nodes.shape:
             raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
         if k == 0 and not np.abs(points - nodes).max() <= TOLERANCE_MM:

@@ -24,7 +24,7 @@ from mvest.exchange.importing.joining import (
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.exchange.markups import TO_LPS
-from mvest.exchange.regions import RegionSurface
+from mvest.exchange.surfaces import Surface
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 
@@ -118,7 +118,7 @@ class _Phase:
     seen: SeenPhase
     role: Role
     name: str
-    surface: RegionSurface
+    surface: Surface
     tips: FloatArray
 
 
@@ -242,7 +242,7 @@ def _join(
     options: SlicerheartOptions,
     how: Joining,
     notes: list[str],
-) -> tuple[RegionSurface, FloatArray]:
+) -> tuple[Surface, FloatArray]:
     leaflets = []
     for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
         try:

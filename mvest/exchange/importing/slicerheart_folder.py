@@ -20,7 +20,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, Mesh, read_mesh
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, Surface, read_mesh
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -248,15 +248,15 @@ def _leaflet(
     surface = _model(fitting[0], notes)
     if not len(surface.triangles):
         raise GeometryError(f"{fitting[0].path}: no triangles; expected a surface")
-    return surface.points, surface.triangles
+    return surface.vertices, surface.triangles
 
 
-def _model(file: _File, notes: list[str]) -> Mesh:
+def _model(file: _File, notes: list[str]) -> Surface:
     """A model with its points in LPS."""
     model = read_mesh(file.path)
     if model.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return replace(model, points=model.points * TO_LPS[model.space or "RAS"])
+    return replace(model, vertices=model.vertices * TO_LPS[model.space or "RAS"])
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
@@ -312,7 +312,7 @@ def _chords(files: Sequence[_File], notes: list[str]) -> tuple[FloatArray, Float
         model = _model(file, notes)
         if any(len(line) != 2 for line in model.lines):
             raise InputError(f"{file.path}: lines of other than two points, expected one a chord")
-        found.append(model.points[np.array(model.lines, dtype=np.int64).reshape(-1, 2)])
+        found.append(model.vertices[np.array(model.lines, dtype=np.int64).reshape(-1, 2)])
     segments = np.concatenate(found)
     joints, number = np.unique(np.round(segments.reshape(-1, 3), 3), axis=0, return_inverse=True)
     begin, end = number.reshape(-1, 2).T
@@ -333,7 +333,7 @@ def _chords(files: Sequence[_File], notes: list[str]) -> tuple[FloatArray, Float
 
 def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
     """The curve in the middle of a tube whose points are rings one after another."""
-    points = _model(file, notes).points
+    points = _model(file, notes).vertices
     for sides in range(3, 101):
         if len(points) % sides or len(points) // sides < 8:
             continue

@@ -16,8 +16,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES
 from mvest.errors import MvestError
-from mvest.exchange.regions import RegionSurface
-from mvest.exchange.surfaces import write_surface
+from mvest.exchange.surfaces import Surface, write_surface
 from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
@@ -31,7 +30,7 @@ class FoundFrame:
     role: Role
     time: float
     pressure: float
-    surface: Midsurface | RegionSurface
+    surface: Midsurface | Surface
     tips: FloatArray
     thickness: FloatArray | None = None
 

@@ -6,7 +6,7 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 from mvest.errors import InputError
 from mvest.exchange.surfaces import (
-    SurfaceFile,
+    Surface,
     read_mesh,
     read_surface,
     write_surface,
@@ -53,13 +53,13 @@ def test_data_come_back_exactly(shapes, tmp_path, suffix):
 
 def test_a_series_is_an_index_of_files_that_name_their_axes(shapes, tmp_path):
     vertices, triangles = shapes.box()
-    states = [SurfaceFile(vertices + k, triangles, {"x": vertices[:, 0]}) for k in range(3)]
+    states = [Surface(vertices + k, triangles, {"x": vertices[:, 0]}) for k in range(3)]
     index = write_surface_series(tmp_path / "valve.pvd", [0.0, 0.5, 1.0], states)
     assert index.read_text().count("DataSet ") == 3
     assert 'timestep="0.5" file="valve_0001.vtp"' in index.read_text()
     mesh = read_mesh(tmp_path / "valve_0001.vtp")
     assert mesh.space == "LPS"
-    np.testing.assert_array_equal(mesh.points, vertices + 1)
+    np.testing.assert_array_equal(mesh.vertices, vertices + 1)
     reader = vtkXMLPolyDataReader()
     reader.SetFileName(str(tmp_path / "valve_0002.vtp"))
     reader.Update()
