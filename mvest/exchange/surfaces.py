@@ -60,8 +60,6 @@ class Surface:
         Name of the group of each triangle, or of its object (OBJ, GLB); empty without any.
     region
         ``(m,)`` index into the regions of a case; None where nothing labels them.
-    lines
-        Points ``(k,)`` of each line.
     others
         How many cells there are of each other type, by its name in VTK ("tetra", "wedge");
         vertices by themselves are left out.
@@ -76,13 +74,12 @@ class Surface:
     cell_data: Data = field(default_factory=dict)
     groups: Sequence[str] = ()
     region: IntArray | None = None
-    lines: Sequence[IntArray] = ()
     others: Mapping[str, int] = field(default_factory=dict)
     space: str | None = None
 
 
 def read_mesh(path: Path | str) -> Surface:
-    """Read the points, triangles and lines of a file, in the child.
+    """Read the points and triangles of a file, in the child.
 
     Raises
     ------

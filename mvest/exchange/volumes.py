@@ -40,10 +40,8 @@ from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 
 MAX_BYTES = 4 * 2**30
-"""Of all frames, decoded, if the caller states no other number.
-
-Twenty frames of CT, 512 x 512 x 300 voxels of two bytes, have 2.9 GiB.
-"""
+"""Of all frames, decoded: twenty of CT, 512 x 512 x 300 voxels of two bytes, have 2.9 GiB. Reading
+takes up to three times as much memory for a while."""
 MAX_UNASKED, MAX_RATIO = 2**28, 1000
 """Bytes that any compressed file may hold, and how many times its own size beyond that: images of
 the heart have 1.5 to 20 times, label maps some hundred."""
@@ -122,7 +120,6 @@ def read_volume(
     modality: Modality | None = None,
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
-    max_bytes: int = MAX_BYTES,
 ) -> VolumeSequence:
     """Read a volume over time. Directions stay as the file has them, left-handed ones included.
 
@@ -139,8 +136,6 @@ def read_volume(
         Seconds between frames, for files that state no times in a unit of time.
     time_unit
         ``"s"`` or ``"ms"``, for files that state times without a unit.
-    max_bytes
-        Of all frames, decoded; reading them takes up to three times as much memory for a while.
 
     Raises
     ------
@@ -154,13 +149,13 @@ def read_volume(
         convert = "convert a DICOM series with 3D Slicer, to .nrrd or .seq.nrrd"
         raise InputError(f"{source}: a folder, expected one file: {READABLE}; {convert}")
     name = None if modality is None else modality.value
-    found = _read(source, False, max_bytes, name, frame_interval_s, time_unit)
+    found = _read(source, False, name, frame_interval_s, time_unit)
     return VolumeSequence(
         **found | {"modality": Modality(found["modality"]), "source": source.name}
     )
 
 
-def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
+def read_labels(path: Path | str) -> LabelMap:
     """Read a label map or segmentation: NRRD, MetaImage or NIfTI of three or four axes.
 
     Frames and layers may be empty, and need no times.
@@ -170,7 +165,7 @@ def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
     InputError
         As `read_volume`; an image, no label at all, or values that are no whole numbers.
     """
-    found = _read(Path(path), True, max_bytes)
+    found = _read(Path(path), True)
     segments = tuple(Segment(*segment) for segment in found["segments"])
     return LabelMap(**found | {"segments": segments})
 
@@ -212,7 +207,6 @@ def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
 def about(
     path: Path,
     labels: bool,
-    max_bytes: int,
     modality: str | None = None,
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
@@ -228,7 +222,7 @@ def about(
         As `read_volume` and `read_labels`.
     """
     stated, _ = _opened(path)
-    result = _common(stated, labels, max_bytes)
+    result = _common(stated, labels)
     if not labels:
         check(not stated.labels, stated.labels, "a segmentation or label map", "an image")
         result["times"] = _times(stated, frame_interval_s, time_unit)
@@ -305,7 +299,7 @@ def _opened(path: Path) -> Opened:
     raise fault("content", f"{head[:8]!r}", READABLE)
 
 
-def _common(stated: Stated, labels: bool, max_bytes: int) -> dict[str, Any]:
+def _common(stated: Stated, labels: bool) -> dict[str, Any]:
     """Place of a volume that is plausible, the bytes of its voxels, and its data file's name.
 
     A left-handed system stays one.
@@ -320,8 +314,8 @@ def _common(stated: Stated, labels: bool, max_bytes: int) -> dict[str, Any]:
     check(plain, values, f"type {dtype}", "one real number, no colour or vector")
     total = int(np.prod(shape, dtype=object)) * dtype.itemsize
     found = f"{counted} of {dtype.itemsize} bytes, together {total / 2**30:.1f} GiB"
-    expected = f"at most {max_bytes / 2**30:g} GiB; crop it, or take fewer frames"
-    check(total <= max_bytes, size, found, expected)
+    expected = f"at most {MAX_BYTES / 2**30:g} GiB; crop it, or take fewer frames"
+    check(total <= MAX_BYTES, size, found, expected)
     spacing = np.linalg.norm(stated.steps, axis=0)
     expected = "{:g} to {:g} mm along each axis"
     fits = ((spacing >= SPACING_MM[0]) & (spacing <= SPACING_MM[1])).all()

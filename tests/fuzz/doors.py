@@ -31,7 +31,10 @@ from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
 from tests.experiments.studies.made_up import made_up, made_up_estimate
 from tests.fuzz.trial import Enter, Makers
 
-REQUEST = RunRequest(("E", "nu, local"), ("MPa", ""), (1.5, 0.3), 2)
+REQUEST = RunRequest(
+    parameters=[{"name": "E", "value": 1.5, "unit": "MPa"}, {"name": "nu, local", "value": 0.3}],
+    points=2,
+)
 
 
 def of(*names: str) -> Makers:

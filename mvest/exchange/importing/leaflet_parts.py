@@ -11,8 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
+from mvest.exchange._images import Segment
 from mvest.exchange.surfaces import Surface, merged, part_of
-from mvest.exchange.volumes import LabelMap, Segment
+from mvest.exchange.volumes import LabelMap
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import STEP_MM, inside_surfaces

@@ -219,7 +219,7 @@ def test_inadmissible_differences_are_refused(settings, message):
 
 def test_an_inadmissible_model_is_refused_before_anything_runs(tmp_path):
     command = Command((sys.executable,))
-    with pytest.raises(InputError, match="2 names, 1 units"):
+    with pytest.raises(InputError, match="k1, k2 in MPa; expected different"):
         ProcessModel(command, tmp_path, NAMES, 2, units=("MPa",))
     with pytest.raises(ConfigurationError, match="points"):
         ProcessModel(command, tmp_path, NAMES, 2, points=np.zeros((3, 3)))
