@@ -111,9 +111,7 @@ def checked_path(path: Path | str, suffix: str) -> Path:
     return target
 
 
-def write_sequence_nrrd(
-    path: Path | str, sequence: VolumeSequence, *, compressed: bool = True
-) -> Path:
+def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
     """Write a volume over time with its times, evenly spaced or not, and its modality.
 
     The axis of frames comes first, as all versions of Slicer read it; times are s. `read_volume`
@@ -125,8 +123,6 @@ def write_sequence_nrrd(
         Ends in ``.seq.nrrd``.
     sequence
         Of uint8, int16 or float32.
-    compressed
-        With gzip; quick rather than small.
 
     Raises
     ------
@@ -139,7 +135,7 @@ def write_sequence_nrrd(
     fields = {
         "labels": ["time", "", "", ""],
         "units": ["s", "", "", ""],
-        "encoding": "gzip" if compressed else "raw",
+        "encoding": "gzip",
         "DataNodeClassName": "vtkMRMLScalarVolumeNode",
         "axis 0 index type": "numeric",
         "axis 0 index values": " ".join(repr(float(time)) for time in sequence.times),

@@ -32,8 +32,7 @@ from mvest.typing import FloatArray, IntArray
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 
-WRITTEN_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
-SURFACE_SUFFIXES = (*WRITTEN_SUFFIXES, ".vtk", ".glb")
+SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply", ".vtk", ".glb")
 """That are read."""
 REGION_PREFIX = "region."
 MERGE_TOLERANCE = 1e-5
@@ -299,18 +298,18 @@ def write_surface(
     cell_data: Data | None = None,
     space: str = "",
 ) -> Path:
-    """Write a triangulated surface; the extension chooses the format.
+    """Write a triangulated surface as a ``.vtp`` file.
 
-    ``space`` ("LPS") names the axes of a ``.vtp`` file, where 3D Slicer finds it.
+    ``space`` ("LPS") names the axes where 3D Slicer finds it.
 
     Raises
     ------
     InputError, GeometryError
-        Unknown extension, no triangles, points that are not finite, data of another number of rows
-        or for a format that holds none here (STL, OBJ, PLY), or a file that cannot be written.
+        Another extension, no triangles, points that are not finite, data of another number of rows,
+        or a file that cannot be written.
     """
     target = Path(path)
-    _check_suffix(target, WRITTEN_SUFFIXES)
+    _check_suffix(target, (".vtp",))
     points = np.ascontiguousarray(vertices, dtype=np.float64)
     faces = np.ascontiguousarray(triangles, dtype=np.int64)
     if not np.isfinite(points).all():
@@ -330,17 +329,8 @@ def write_surface(
                     f"{target}: data {name!r} of shape {values.shape} and type {values.dtype}, "
                     f"expected {rows} rows of numbers"
                 )
-    if target.suffix.lower() == ".vtp":
-        surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
-        return write_atomically(target, lambda file: _write_vtp(file, surface, space))
-    if any(data) and target.suffix.lower() != ".vtu":
-        raise InputError(f"{target}: {target.suffix[1:].upper()} holds no data; write .vtu or .vtp")
-    import meshio
-
-    # PLY knows no 64-bit integers.
-    cells = [("triangle", faces.astype(np.int32))]
-    mesh = meshio.Mesh(points, cells, data[0], {name: [v] for name, v in data[1].items()})
-    return write_atomically(target, lambda file: mesh.write(file))
+    surface = polydata(points, faces.ravel(), np.full(len(faces), 3), *data)
+    return write_atomically(target, lambda file: _write_vtp(file, surface, space))
 
 
 def _write_vtp(path: Path, surface: Any, space: str) -> None:
