@@ -58,28 +58,15 @@ ORDER = '{"format": "mvest-external", "version": 1, "status": "converged", "reas
     ("file", "content", "message"),
     [
         ("response.json", None, "response.json is missing"),
-        ("response.json", "", "is not JSON"),
-        ("response.json", ORDER[:-20], "is not JSON"),
         ("response.json", "[1]", "holds a list"),
-        ("response.json", "[" * 100_000, "is not JSON"),
-        ("response.json", ORDER.replace('""', "NaN"), "NaN is no number"),
         ("response.json", ORDER.replace("1,", "2,"), "version: 2, expected"),
         ("response.json", ORDER.replace("converged", "ok"), "status: 'ok', expected"),
         ("response.json", ORDER + " " * 1_000_001, "expected at most 1000000"),
         ("observation.csv", None, "observation.csv is missing"),
-        ("observation.csv", "", "columns none, expected x,y,z"),
         ("observation.csv", "1,2,3\n4,5,6\n", "columns 1,2,3"),
         ("observation.csv", "x,y,z\n1,2,3\n", "1 rows, expected 2"),
         ("observation.csv", "x,y,z\n" + "1,2,3\n" * 3, "3 rows, expected 2"),
-        ("observation.csv", "x,y,z\n1,2,3\n4,5\n", "row 1 has 2 cells"),
         ("observation.csv", "x,y,z\n1,2,3\n4,nan,6\n", "y of row 1 is 'nan'"),
-        ("observation.csv", "x,y,z\n1,2,3\n4,5,inf\n", "z of row 1 is 'inf'"),
-        ("observation.csv", "x,y,z\n1,2,3\n1e999,5,6\n", "x of row 1 is '1e999'"),
-        ("observation.csv", "x,y,z\n1,2,3\n1_0,5,6\n", "x of row 1 is '1_0'"),
-        ("observation.csv", "x,y,z\n1,2,3\n,5,6\n", "x of row 1 is ''"),
-        ("observation.csv", "x;y;z\n1;2;3\n4;5;6\n", "columns x;y;z"),
-        ("observation.csv", b"x,y,z\n1,2,3\n4,5,\xff\n", "no UTF-8"),
-        ("observation.csv", 'x,y,z\n1,2,3\n4,5,"6\n', "no comma-separated text"),
         ("jacobian.csv", "E,nu\n" + "1,2\n" * 6, "columns E,nu, expected E,nu, local"),
         ("jacobian.csv", 'E,"nu, local"\n' + "1,2\n" * 5, "5 rows, expected 6"),
         ("jacobian.csv", 'E,"nu, local"\n' + "1,-inf\n" * 6, "nu, local of row 0"),
@@ -91,19 +78,11 @@ def test_a_damaged_answer_is_refused(tmp_path, file, content, message):
     if content is None:
         (tmp_path / file).unlink()
     else:
-        (tmp_path / file).write_bytes(content if isinstance(content, bytes) else content.encode())
+        (tmp_path / file).write_text(content)
     with pytest.raises(InputError) as error:
         read_answer(tmp_path, REQUEST)
     assert message in str(error.value)
     assert len(str(error.value)) < 300
-
-
-def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path):
-    write_answer(tmp_path, Prediction(Y, JACOBIAN))
-    (tmp_path / "observation.csv").unlink()
-    (tmp_path / "observation.csv").mkdir()
-    with pytest.raises(InputError, match=r"observation\.csv cannot be read"):
-        read_answer(tmp_path, REQUEST)
 
 
 @pytest.mark.parametrize(

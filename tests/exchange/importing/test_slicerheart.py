@@ -24,10 +24,8 @@ from tests.exchange.importing.slicerheart_exports import (
     fem_export,
     in_lps,
     vtk,
-    vtk_to_numpy,
     write_model,
 )
-from tests.places import field_input
 
 OPTIONS = SlicerheartOptions(pressure_mmHg=120.0)
 TRUTH = template_case(64, 16)
@@ -215,21 +213,6 @@ def test_points_that_are_not_used_are_said(folder, case):
     assert "MD: Fiducial of 1 points (chord 1) not used" in found.derived
     assert "MS: points chord 1 not placed, so not used" in found.derived
     assert "MS: landmarks APEX not used" in found.derived
-
-
-def test_a_folder_of_april_2026_is_read_as_vtk_reads_it():
-    folder = field_input("slicerheart_apr2026")
-    found = import_slicerheart(folder, SlicerheartOptions())
-    assert [frame.name for frame in found.frames] == ["mid-diastole", "mid-systole"]
-    for frame, phase in zip(found.frames, ("MD", "MS"), strict=True):
-        for leaflet, half_thickness in (("anterior", 0.66), ("posterior", 0.63)):
-            (file,) = folder.glob(f"*_{phase}_mitral_{leaflet}_leaflet.vtk")
-            reader = vtk.vtkPolyDataReader()
-            reader.SetFileName(str(file))
-            reader.Update()
-            points = vtk_to_numpy(reader.GetOutput().GetPoints().GetData()).astype(float)
-            off = closest_points(points, frame.vertices, frame.triangles).distance
-            assert np.median(off) == pytest.approx(half_thickness, abs=0.05)
 
 
 def refused(folder, words, kind=InputError, **options):
