@@ -173,7 +173,7 @@ def read_labels(path: Path | str) -> LabelMap:
 def files_of_volume(path: Path) -> dict[str, Path]:
     """Name -> file of all that reading a volume opens: itself, and its data file if it has one."""
     try:
-        files = _files(path, in_child(data_file, path))
+        files = _files(path, in_child(data_file_of, path))
     except InputError:
         files = [path]
     return {file.name: file for file in files if file.is_file()}
@@ -185,7 +185,7 @@ def _files(path: Path, data_file: str) -> list[Path]:
 
 def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
     """What a file states, its voxels, and the SHA-256 of all of its bytes."""
-    found: dict[str, Any] = in_child(about, path, labels, *options)
+    found: dict[str, Any] = in_child(describe, path, labels, *options)
     size, files = found.pop("bytes"), _files(path, found.pop("data_file"))
     stored = sum(file.stat().st_size for file in files)
     if size > max(MAX_UNASKED, MAX_RATIO * stored):
@@ -200,11 +200,11 @@ def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
         with source.open("rb") as file:
             while chunk := file.read(2**20):
                 digest.update(chunk)
-    frames = in_child(values, path, labels, **limits)
+    frames = in_child(read_voxels, path, labels, **limits)
     return found | {"frames": frames, "sha256": digest.hexdigest()}
 
 
-def about(
+def describe(
     path: Path,
     labels: bool,
     modality: str | None = None,
@@ -236,7 +236,7 @@ def about(
     return result
 
 
-def values(path: Path, labels: bool) -> Voxels:
+def read_voxels(path: Path, labels: bool) -> Voxels:
     """Voxels ``(F, I, J, K)``: integers of labels; uint8, int16 or float32 of an image.
 
     Raises
@@ -269,7 +269,7 @@ def values(path: Path, labels: bool) -> Voxels:
     return frames.astype(np.float32, copy=False)
 
 
-def data_file(path: Path) -> str:
+def data_file_of(path: Path) -> str:
     """Name of the file beside a header that holds its voxels; empty if there is none."""
     return _opened(path)[0].data_file
 
