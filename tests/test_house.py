@@ -39,7 +39,6 @@ VALUE_OBJECTS = (
 
 FILES = (
     "mvest.exchange.surfaces",
-    "mvest.exchange.regions",
     "mvest.exchange.volumes",
     "mvest.exchange.segmentations",
     "mvest.exchange.markups",

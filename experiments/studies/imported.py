@@ -55,8 +55,7 @@ from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction, Remembered
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
-from mvest.exchange.regions import part_of
-from mvest.exchange.surfaces import read_surface
+from mvest.exchange.surfaces import part_of, read_surface
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation

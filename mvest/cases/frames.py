@@ -21,7 +21,7 @@ from mvest.cases.checks import (
 from mvest.cases.rims import find_rims, match_annulus, two_loops, without_ears
 from mvest.cases.schema import CaseFolder, FrameEntry
 from mvest.errors import InputError
-from mvest.exchange.regions import RegionSurface, read_regions
+from mvest.exchange.surfaces import Surface, read_regions
 from mvest.reading.text import read_numbers, read_vertices
 from mvest.typing import FloatArray, IntArray
 
@@ -92,7 +92,7 @@ def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
     )
 
 
-def _read_surface(folder: CaseFolder, entry: FrameEntry, where: str) -> RegionSurface:
+def _read_surface(folder: CaseFolder, entry: FrameEntry, where: str) -> Surface:
     files: Path | dict[str, Path]
     if isinstance(entry.surface, str):
         files = folder.file(entry.surface, where)

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,15 @@ def check(holds: object, where: str, found: object, expected: str) -> None:
         raise fault(where, found, expected)
 
 
+class Segment(NamedTuple):
+    """A segment of a ``.seg.nrrd`` file: the value of its voxels, and the frame that holds them."""
+
+    name: str
+    tags: str
+    label: int
+    layer: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stated:
     """What a file states of its volumes; nothing is checked for plausibility.
@@ -49,8 +58,8 @@ class Stated:
     columns of ``steps`` (3, 3) lead from one voxel to the next along i, j and k; ``origin`` is the
     centre of voxel (0, 0, 0). ``names`` is what the format calls size, place, origin, values and
     times. ``times`` (F,) are in ``unit``. ``labels`` is the field that says that the voxels are
-    labels, ``data_file`` the file beside a header that holds them. A segment has a name, tags, a
-    label and a layer. What is empty or None the file does not state.
+    labels, ``data_file`` the file beside a header that holds them. What is empty or None the file
+    does not state.
     """
 
     shape: tuple[int, ...]
@@ -63,7 +72,7 @@ class Stated:
     modality: str = ""
     labels: str = ""
     data_file: str = ""
-    segments: tuple[tuple[str, str, int, int], ...] = ()
+    segments: tuple[Segment, ...] = ()
     is_layers: bool = False
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from mvest.exchange._images import (
     MM_PER_UNIT,
     Opened,
+    Segment,
     Stated,
     Voxels,
     beside,
@@ -174,7 +175,7 @@ def _times(fields: Mapping[str, Any], axis: int, count: int) -> tuple[str, Float
     return f"axis {axis} index values", None, unit
 
 
-def _segments(fields: Mapping[str, Any], layers: int) -> tuple[tuple[str, str, int, int], ...]:
+def _segments(fields: Mapping[str, Any], layers: int) -> tuple[Segment, ...]:
     """The segments that 3D Slicer names.
 
     Before 4.11 Slicer wrote neither layer nor label: each segment had a layer of its own, and the
@@ -193,5 +194,6 @@ def _segments(fields: Mapping[str, Any], layers: int) -> tuple[tuple[str, str, i
             fits = re.fullmatch(r"\d{1,10}", word, re.ASCII) and int(word) < end
             check(fits, f"Segment{n}_{key}", repr(word), f"a number from 0 to {end - 1}")
             whole.append(int(word))
-        segments.append((own["Name"] or own["ID"] or f"Segment_{n}", own["Tags"], *whole))
+        name = own["Name"] or own["ID"] or f"Segment_{n}"
+        segments.append(Segment(name, own["Tags"], *whole))
     return tuple(segments)

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
+from mvest.reading.documents import validated
 from mvest.reading.text import MAX_NUMBER, number, one_line, read_bytes
 from mvest.typing import FloatArray
 
@@ -127,11 +128,7 @@ def read_markups(path: Path | str) -> dict[str, PointList]:
     if source.suffix.lower() == ".fcsv":
         return {source.stem: _read_fcsv(source)}
     try:
-        content = _File.model_validate(json.loads(read_bytes(source, MAX_BYTES)))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field, found = ".".join(map(str, first["loc"])), one_line(repr(first["input"]), 60)
-        raise InputError(f"{source}: {field}: {found}, expected: {first['msg']}") from error
+        content = validated(_File, json.loads(read_bytes(source, MAX_BYTES)), str(source))
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise

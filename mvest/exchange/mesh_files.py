@@ -23,13 +23,13 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-LINES, STRIPS, POLYGONS = (3, 4), (6,), (5, 7, 9)
-FLAT = (1, 2, *LINES, *STRIPS, *POLYGONS)
-"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves."""
+STRIPS, POLYGONS = (6,), (5, 7, 9)
+FLAT = (1, 2, 3, 4, *STRIPS, *POLYGONS)
+"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves, 3 and 4 lines."""
 
 
 def read_cells(path: Path, suffix: str) -> dict[str, Any]:
-    """The fields of `mvest.exchange.surfaces.Mesh` for a file of this kind.
+    """The fields of `mvest.exchange.surfaces.Surface` for a file of this kind.
 
     Raises
     ------
@@ -52,23 +52,18 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
         for name, values in arrays.items():
             if len(values) != count:
                 raise InputError(f"data {name!r} has {len(values)} rows, expected {count} {what}")
-    line = np.isin(types, LINES)
-    line_ends = np.cumsum(sizes[line])[:-1]
     numbers, counts = np.unique(types[~np.isin(types, FLAT)], return_counts=True)
     name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
     names = [name_of(number).removeprefix("vtk").lower() for number in numbers.tolist()]
-    field_data = _arrays(data.GetFieldData())
     with path.open("rb") as stream:  # 3D Slicer names the axes in a title or comment
         words = re.search(rb"SPACE=(LPS|RAS)\b", stream.read(4096))
-    space = words[1].decode() if words else str(field_data.get("SPACE"))
+    space = words[1].decode() if words else _arrays(data.GetFieldData()).get("SPACE")
     return {
-        "points": points,
+        "vertices": points,
         "triangles": triangles,
-        "lines": np.split(corners[np.repeat(line, sizes)], line_ends) if line.any() else [],
         "others": dict(zip(names, counts.tolist(), strict=True)),
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},
-        "field_data": field_data,
         "space": space if space in ("LPS", "RAS") else None,
         "groups": [groups[row] for row in rows.tolist()] if groups else [],
     }

@@ -13,12 +13,14 @@ from typing import Any
 import nrrd
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
 from mvest.exchange._nrrd import MODALITY_KEY
 from mvest.files import write_atomically
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.proximity import closest_points
 
 
 def voxelise_leaflets(
@@ -32,8 +34,8 @@ def voxelise_leaflets(
 
     A leaflet thinner than the largest spacing between voxels is drawn that thick, so that no path
     over the faces of voxels leads through it (J. Huang et al., An accurate method for voxelizing
-    polygon meshes, IEEE Symposium on Volume Visualization, 1998). Where leaflets touch, a voxel
-    belongs to the one that it lies deeper in.
+    polygon meshes, IEEE Symposium on Volume Visualization, 1998). A voxel that is
+    within the reach of several leaflets belongs to the nearest one.
 
     Parameters
     ----------
@@ -53,44 +55,26 @@ def voxelise_leaflets(
     labels
         ``(I, J, K)`` integers: 0 outside, else 1 + region.
     """
-    points, shape = np.asarray(vertices, dtype=np.float64), np.array(volume.frames.shape[1:])
     # In mm along the axes of the volume, where a voxel's centre is its index times the spacing.
-    local = (points - volume.origin) @ volume.direction
-    reach = np.maximum(thickness, volume.spacing.max()) / 2
-    depth, labels = np.ones(shape), np.zeros(shape, dtype=np.int64)
-    for triangle, leaflet in zip(triangles, region, strict=True):
-        corners, reaches = local[triangle], reach[triangle]
-        low = np.ceil((corners.min(axis=0) - reaches.max()) / volume.spacing).astype(int)
-        high = np.floor((corners.max(axis=0) + reaches.max()) / volume.spacing).astype(int) + 1
-        low, high = np.maximum(low, 0), np.minimum(high, shape)
-        if (low >= high).any():
-            continue
-        box = tuple(slice(first, end) for first, end in zip(low, high, strict=True))
-        centres = np.moveaxis(np.mgrid[box], 0, -1) * volume.spacing
-        weights, gap = _closest(centres.reshape(-1, 3), corners)
-        ratio = (gap / (weights @ reaches)).reshape(centres.shape[:3])
-        nearer = ratio < depth[box]
-        depth[box][nearer] = ratio[nearer]
-        labels[box][nearer] = 1 + leaflet
+    local = (np.asarray(vertices, dtype=np.float64) - volume.origin) @ volume.direction
+    reach, spacing = np.maximum(thickness, volume.spacing.max()) / 2, volume.spacing
+    labels = np.zeros(volume.frames.shape[1:], dtype=np.int64)
+    low = np.ceil((local.min(axis=0) - reach.max()) / spacing).astype(int)
+    high = np.floor((local.max(axis=0) + reach.max()) / spacing).astype(int) + 1
+    low = np.maximum(low, 0)
+    high = np.maximum(low, np.minimum(high, labels.shape))
+    box = tuple(slice(first, end) for first, end in zip(low, high, strict=True))
+    index = np.moveaxis(np.mgrid[box], 0, -1).reshape(-1, 3)
+    corners = local[triangles]
+    middle = corners.mean(axis=1)
+    around = np.linalg.norm(corners - middle[:, np.newaxis], axis=2).max()
+    bound = reach.max() + around
+    gap, _ = cKDTree(middle).query(index * spacing, distance_upper_bound=bound)
+    index = index[np.isfinite(gap)]
+    found = closest_points(index * spacing, local, triangles)
+    inside = found.distance < found.interpolate(reach, triangles)
+    labels[tuple(index[inside].T)] = 1 + region[found.triangle[inside]]
     return labels
-
-
-def _closest(points: FloatArray, corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights ``(p, 3)`` of a triangle's corners where it is closest to points, and the distances.
-
-    That is the projection to its plane if it falls inside, else a point of an edge.
-    """
-    edges, following = np.roll(corners, -1, axis=0) - corners, np.roll(np.eye(3), -1, axis=0)
-    square = np.maximum((edges**2).sum(axis=1), np.finfo(float).tiny)
-    along = np.clip(((points[:, np.newaxis] - corners) * edges).sum(axis=2) / square, 0, 1)
-    on_edges = np.eye(3) + along[..., np.newaxis] * (following - np.eye(3))
-    inside = (points - corners[0]) @ np.linalg.pinv(corners[1:] - corners[0])
-    inside = np.concatenate([1 - inside.sum(axis=1, keepdims=True), inside], axis=1)
-    weights = np.concatenate([inside[:, np.newaxis], on_edges], axis=1)
-    gaps = np.linalg.norm(points[:, np.newaxis] - weights @ corners, axis=2)
-    gaps[(inside < 0).any(axis=1), 0] = np.inf
-    every, best = np.arange(len(points)), gaps.argmin(axis=1)
-    return weights[every, best], gaps[every, best]
 
 
 TYPES = ("uint8", "int16", "float32")
@@ -127,9 +111,7 @@ def checked_path(path: Path | str, suffix: str) -> Path:
     return target
 
 
-def write_sequence_nrrd(
-    path: Path | str, sequence: VolumeSequence, *, compressed: bool = True
-) -> Path:
+def write_sequence_nrrd(path: Path | str, sequence: VolumeSequence) -> Path:
     """Write a volume over time with its times, evenly spaced or not, and its modality.
 
     The axis of frames comes first, as all versions of Slicer read it; times are s. `read_volume`
@@ -141,8 +123,6 @@ def write_sequence_nrrd(
         Ends in ``.seq.nrrd``.
     sequence
         Of uint8, int16 or float32.
-    compressed
-        With gzip; quick rather than small.
 
     Raises
     ------
@@ -155,7 +135,7 @@ def write_sequence_nrrd(
     fields = {
         "labels": ["time", "", "", ""],
         "units": ["s", "", "", ""],
-        "encoding": "gzip" if compressed else "raw",
+        "encoding": "gzip",
         "DataNodeClassName": "vtkMRMLScalarVolumeNode",
         "axis 0 index type": "numeric",
         "axis 0 index values": " ".join(repr(float(time)) for time in sequence.times),

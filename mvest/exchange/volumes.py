@@ -3,11 +3,18 @@
 A file's content counts, not its name. Nothing is guessed: what the file does not state must be
 given, and what it states must not be contradicted. All of a file is read in the child process:
 first what it states, then its voxels within a limit of memory that follows from their number.
+
+The bounds leave room for any 4D image of a heart. They catch what is no such image: pixels read in
+the wrong order, centimetres taken for millimetres, a mask, a localiser. A label map may be smaller
+and emptier than an image.
 """
 
 from __future__ import annotations
 
+import gzip
 import hashlib
+import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,16 +23,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
-from mvest.exchange import _plausible
+from mvest.exchange._images import (
+    Opened,
+    Segment,
+    Stated,
+    Voxels,
+    check,
+    fault,
+    metaimage,
+    nifti,
+    philips,
+)
+from mvest.exchange._nrrd import MODALITY_KEY, nrrd_file
 from mvest.exchange.child import in_child
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 
 MAX_BYTES = 4 * 2**30
-"""Of all frames, decoded, if the caller states no other number.
-
-Twenty frames of CT, 512 x 512 x 300 voxels of two bytes, have 2.9 GiB.
-"""
+"""Of all frames, decoded: twenty of CT, 512 x 512 x 300 voxels of two bytes, have 2.9 GiB. Reading
+takes up to three times as much memory for a while."""
 MAX_UNASKED, MAX_RATIO = 2**28, 1000
 """Bytes that any compressed file may hold, and how many times its own size beyond that: images of
 the heart have 1.5 to 20 times, label maps some hundred."""
@@ -34,24 +50,35 @@ COPIES = 3
 BYTES_PER_SECOND = 2**25
 """Decoded by a slow machine; reading may take that long and a minute."""
 
+READABLE = "NRRD, MetaImage, NIfTI or Philips Cartesian DICOM"
+MAX_HEADER = 2**20
+"""Bytes within which a header ends."""
 
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """A segment of a ``.seg.nrrd`` file.
+SECONDS_PER_UNIT = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "usec", "microsecond", "microseconds"), 1e-6),
+}
+"""Units of time by the names that files give them."""
 
-    Attributes
-    ----------
-    name, tags : str
-    label : int
-        Value of its voxels.
-    layer : int
-        Number of the frame that holds them.
-    """
+MIN_INTERVAL_S, MAX_INTERVAL_S = 0.002, 1.0
+"""Bounds of the interval between two frames of a beating heart, the upper one excluded.
 
-    name: str
-    tags: str
-    label: int
-    layer: int
+No scanner takes 500 volumes per second; a second between frames leaves one to a beat, and is what
+many programs write where they know nothing. So milliseconds taken for seconds are seen, and seconds
+taken for milliseconds.
+"""
+SPACING_MM = (0.05, 5.0)
+"""Between neighbouring voxels; 3D echo has 0.3 to 1.5, CT 0.2 to 1, MR up to 5."""
+EXTENT_MM, LABELS_MM = (20.0, 500.0), (2.0, 500.0)
+"""Of an image along each axis: from an annulus to a whole chest; and of a label map, whose box may
+be cropped to the leaflets of a child."""
+MIN_VOXELS, MIN_LABELS = 16, 2
+"""Voxels along each axis of an image, and of a label map."""
+MAX_OFFSET_MM = 1e4
+"""Of the origin from the world's zero."""
+ORTHOGONAL = 1e-3
+"""Largest cosine between axes, which files give with three digits or more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +120,6 @@ def read_volume(
     modality: Modality | None = None,
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
-    max_bytes: int = MAX_BYTES,
 ) -> VolumeSequence:
     """Read a volume over time. Directions stay as the file has them, left-handed ones included.
 
@@ -110,28 +136,26 @@ def read_volume(
         Seconds between frames, for files that state no times in a unit of time.
     time_unit
         ``"s"`` or ``"ms"``, for files that state times without a unit.
-    max_bytes
-        Of all frames, decoded; reading them takes up to three times as much memory for a while.
 
     Raises
     ------
     InputError
         In one line the file, the field, what was found and what was expected: a file that is
         damaged or of another kind, something that it does not state or the caller contradicts, or
-        what no image of a heart has (the bounds of `mvest.exchange._plausible`).
+        what no image of a heart has.
     """
     source = Path(path)
     if source.is_dir():
         convert = "convert a DICOM series with 3D Slicer, to .nrrd or .seq.nrrd"
-        raise InputError(f"{source}: a folder, expected one file: {_plausible.READABLE}; {convert}")
+        raise InputError(f"{source}: a folder, expected one file: {READABLE}; {convert}")
     name = None if modality is None else modality.value
-    found = _read(source, False, max_bytes, name, frame_interval_s, time_unit)
+    found = _read(source, False, name, frame_interval_s, time_unit)
     return VolumeSequence(
         **found | {"modality": Modality(found["modality"]), "source": source.name}
     )
 
 
-def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
+def read_labels(path: Path | str) -> LabelMap:
     """Read a label map or segmentation: NRRD, MetaImage or NIfTI of three or four axes.
 
     Frames and layers may be empty, and need no times.
@@ -141,7 +165,7 @@ def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
     InputError
         As `read_volume`; an image, no label at all, or values that are no whole numbers.
     """
-    found = _read(Path(path), True, max_bytes)
+    found = _read(Path(path), True)
     segments = tuple(Segment(*segment) for segment in found["segments"])
     return LabelMap(**found | {"segments": segments})
 
@@ -149,7 +173,7 @@ def read_labels(path: Path | str, *, max_bytes: int = MAX_BYTES) -> LabelMap:
 def files_of_volume(path: Path) -> dict[str, Path]:
     """Name -> file of all that reading a volume opens: itself, and its data file if it has one."""
     try:
-        files = _files(path, in_child(_plausible.data_file, path))
+        files = _files(path, in_child(data_file_of, path))
     except InputError:
         files = [path]
     return {file.name: file for file in files if file.is_file()}
@@ -161,7 +185,7 @@ def _files(path: Path, data_file: str) -> list[Path]:
 
 def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
     """What a file states, its voxels, and the SHA-256 of all of its bytes."""
-    found: dict[str, Any] = in_child(_plausible.about, path, labels, *options)
+    found: dict[str, Any] = in_child(describe, path, labels, *options)
     size, files = found.pop("bytes"), _files(path, found.pop("data_file"))
     stored = sum(file.stat().st_size for file in files)
     if size > max(MAX_UNASKED, MAX_RATIO * stored):
@@ -176,5 +200,188 @@ def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
         with source.open("rb") as file:
             while chunk := file.read(2**20):
                 digest.update(chunk)
-    frames = in_child(_plausible.values, path, labels, **limits)
+    frames = in_child(read_voxels, path, labels, **limits)
     return found | {"frames": frames, "sha256": digest.hexdigest()}
+
+
+def describe(
+    path: Path,
+    labels: bool,
+    modality: str | None = None,
+    frame_interval_s: float | None = None,
+    time_unit: str | None = None,
+) -> dict[str, Any]:
+    """What a file and its user state of an image or of labels, once all of it is plausible.
+
+    That is its spacing, direction, origin and times, the bytes of its voxels and the name of its
+    data file; the modality of an image; segments of labels, and whether their frames are layers.
+
+    Raises
+    ------
+    InputError
+        As `read_volume` and `read_labels`.
+    """
+    stated, _ = _opened(path)
+    result = _common(stated, labels)
+    if not labels:
+        check(not stated.labels, stated.labels, "a segmentation or label map", "an image")
+        result["times"] = _times(stated, frame_interval_s, time_unit)
+        return result | {"modality": _modality(stated.modality, modality)}
+    check(not stated.modality, "modality", stated.modality, "a label map, no image")
+    result |= {"times": None, "segments": stated.segments, "is_layers": stated.is_layers}
+    # Many programs write times that no heart has where they know none.
+    with suppress(InputError):
+        if stated.times is not None and not stated.is_layers:
+            result["times"] = _times(stated, None, None)
+    return result
+
+
+def read_voxels(path: Path, labels: bool) -> Voxels:
+    """Voxels ``(F, I, J, K)``: integers of labels; uint8, int16 or float32 of an image.
+
+    Raises
+    ------
+    InputError
+        Damaged data; of an image a frame without contrast, or values that are no numbers; no label
+        at all, or labels that are no whole numbers.
+    """
+    stated, load = _opened(path)
+    field, frames = stated.names[3], np.ascontiguousarray(load())
+    if labels:
+        with np.errstate(invalid="ignore"):
+            whole = frames.astype(np.int32) if frames.dtype.kind == "f" else frames
+        check((whole == frames).all(), field, "other numbers", "whole numbers, the labels")
+        check(whole.any(), field, "all voxels are 0", "labels from 1 on")
+        return whole.astype(whole.dtype.newbyteorder("="), copy=False)
+    lows, highs = (f(frames, axis=(1, 2, 3)).astype(np.float64) for f in (np.min, np.max))
+    for number, (low, high) in enumerate(zip(lows, highs, strict=True)):
+        finite = np.isfinite(low) and np.isfinite(high)
+        check(finite, field, f"voxels of frame {number} that are no numbers", "numbers")
+        found = f"all voxels of frame {number} are {low:g}"
+        check(low < high, field, found, "an image in every frame")
+    limits, largest = np.iinfo(np.int16), max(-lows.min(), highs.max())
+    if frames.dtype == np.uint8:
+        return frames
+    if frames.dtype.kind in "iu" and lows.min() >= limits.min and highs.max() <= limits.max:
+        return frames.astype(np.int16, copy=False)
+    fits = largest <= np.finfo(np.float32).max
+    check(fits, field, f"{largest:g}", "numbers in the range of 4 bytes")
+    return frames.astype(np.float32, copy=False)
+
+
+def data_file_of(path: Path) -> str:
+    """Name of the file beside a header that holds its voxels; empty if there is none."""
+    return _opened(path)[0].data_file
+
+
+def _opened(path: Path) -> Opened:
+    """What a file states and how its voxels are read; its content counts, not its name.
+
+    Raises
+    ------
+    InputError
+        A format that is not read, or a field that is missing, damaged or not supported. The
+        function that reads voxels raises it if there are fewer or more than the header says.
+    """
+    with path.open("rb") as file:
+        head = begin = file.read(MAX_HEADER)
+    if head[:2] == b"\x1f\x8b":
+        with gzip.open(path) as stream:
+            begin = stream.read(540)
+    if head.startswith(b"NRRD"):
+        return nrrd_file(path, head)
+    if begin[344:347] in (b"n+1", b"ni1") or begin[4:7] in (b"n+2", b"ni2"):
+        return nifti(path, begin)
+    if head[128:132] == b"DICM" or head[:2] in (b"\x08\x00", b"\x02\x00"):
+        return philips(path)
+    if re.match(rb"\s*(ObjectType|NDims|Comment)\s*=", head) and b"ElementDataFile" in head:
+        return metaimage(path, head)
+    raise fault("content", f"{head[:8]!r}", READABLE)
+
+
+def _common(stated: Stated, labels: bool) -> dict[str, Any]:
+    """Place of a volume that is plausible, the bytes of its voxels, and its data file's name.
+
+    A left-handed system stays one.
+    """
+    min_voxels, extent_mm = (MIN_LABELS, LABELS_MM) if labels else (MIN_VOXELS, EXTENT_MM)
+    (size, place, origin, values, _), shape = stated.names, stated.shape
+    counted = f"{' x '.join(map(str, shape))} frames and voxels"
+    enough = shape[0] >= 1 and min(shape[1:]) >= min_voxels
+    check(enough, size, counted, f"at least one frame, and at least {min_voxels} along each axis")
+    dtype = np.dtype(stated.dtype)
+    plain = dtype.kind in "iuf"
+    check(plain, values, f"type {dtype}", "one real number, no colour or vector")
+    total = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    found = f"{counted} of {dtype.itemsize} bytes, together {total / 2**30:.1f} GiB"
+    expected = f"at most {MAX_BYTES / 2**30:g} GiB; crop it, or take fewer frames"
+    check(total <= MAX_BYTES, size, found, expected)
+    spacing = np.linalg.norm(stated.steps, axis=0)
+    expected = "{:g} to {:g} mm along each axis"
+    fits = ((spacing >= SPACING_MM[0]) & (spacing <= SPACING_MM[1])).all()
+    check(fits, place, f"{_words(spacing)} mm between voxels", expected.format(*SPACING_MM))
+    axes = stated.steps / spacing
+    square = np.abs(axes.T @ axes - np.eye(3)).max() <= ORTHOGONAL
+    check(square, place, f"axes {_words(axes.T)}", "axes at right angles")
+    extent = spacing * shape[1:]
+    fits = (extent >= extent_mm[0]).all() and (extent <= extent_mm[1]).all()
+    check(fits, place, f"a volume of {_words(extent)} mm", expected.format(*extent_mm))
+    near = (np.abs(stated.origin) <= MAX_OFFSET_MM).all()
+    check(near, origin, _words(stated.origin), f"coordinates in mm within {MAX_OFFSET_MM:g}")
+    # The closest orthonormal axes take away what rounding in the file left; none is turned round.
+    left, _, right = np.linalg.svd(axes)
+    return {
+        "spacing": spacing,
+        "direction": left @ right,
+        "origin": stated.origin,
+        "bytes": total,
+        "data_file": stated.data_file,
+    }
+
+
+def _words(values: FloatArray) -> str:
+    return " ".join(f"{value:.4g}" for value in np.ravel(values))
+
+
+def _times(stated: Stated, frame_interval_s: float | None, time_unit: str | None) -> FloatArray:
+    """Times ``(F,)`` s of the frames; a single frame without a time is at 0."""
+    field, count, given = stated.names[4], stated.shape[0], stated.times
+    unit = SECONDS_PER_UNIT.get(stated.unit.lower())
+    if frame_interval_s is not None:
+        known = given is not None and unit is not None
+        check(not known, "frame_interval_s", frame_interval_s, f"none: {field} states the times")
+        check(time_unit is None, "frame_interval_s", "beside time_unit", "one of the two")
+        positive = np.isfinite(frame_interval_s) and frame_interval_s > 0
+        check(positive, "frame_interval_s", frame_interval_s, "a positive number")
+        given, unit = np.arange(count, dtype=np.float64), frame_interval_s
+    if time_unit is not None:
+        check(time_unit in SECONDS_PER_UNIT, "time_unit", repr(time_unit), "'s' or 'ms'")
+        same = unit in (None, SECONDS_PER_UNIT[time_unit])
+        check(same, "time_unit", repr(time_unit), f"{stated.unit!r}, as the file states")
+        unit = SECONDS_PER_UNIT[time_unit]
+    if given is None or unit is None:
+        if count == 1:
+            return np.zeros(1)
+        found = f"times in the unit {stated.unit!r}" if stated.unit else "times without a unit"
+        found, options = (
+            ("no times of frames", "frame_interval_s")
+            if given is None
+            else (found, "time_unit or frame_interval_s")
+        )
+        raise fault(field, found, f"times in s or ms; else give {options}")
+    times, low, high = given * unit, MIN_INTERVAL_S, MAX_INTERVAL_S
+    complete = times.shape == (count,) and np.isfinite(times).all()
+    check(complete, field, _words(times), f"a time of each of {count} frames")
+    steps = np.diff(times)
+    expected = f"increasing times, by at least {low:g} s and less than {high:g} s"
+    check(((steps >= low) & (steps < high)).all(), field, f"{_words(times)} s", expected)
+    return np.asarray(times)
+
+
+def _modality(stated: str, given: str | None) -> str:
+    names = [m.value for m in Modality]
+    check(not stated or stated in names, MODALITY_KEY, repr(stated), ", ".join(names))
+    check(not stated or given in (None, stated), "modality", given, f"{stated}, as the file states")
+    expected = f"as a setting: {', '.join(names)}"
+    check(stated or given, "modality", "not stated by the file", expected)
+    return stated or str(given)

@@ -12,13 +12,15 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import yaml
+from pydantic import BaseModel, ValidationError
 
 from mvest.errors import InputError
 from mvest.reading.text import MAX_TEXT, check_words, number, one_line, read_bytes, read_text
 
+M = TypeVar("M", bound=BaseModel)
 MAX_INTEGER = 2**64
 """Beyond any seed, count or size; no array of NumPy holds a larger one."""
 MAX_REAL = 1.8e308
@@ -37,6 +39,22 @@ def read_mapping(path: Path, max_size: int = MAX_TEXT, where: str = "") -> dict[
     if not isinstance(data, dict):
         raise InputError(f"{where or path}: holds a {type(data).__name__}, expected a mapping")
     return data
+
+
+def validated(schema: type[M], data: Any, where: str) -> M:
+    """Plain data as an instance of a schema; ``where`` names them in an error.
+
+    Raises
+    ------
+    InputError
+        If a field is missing, or is not what the schema says.
+    """
+    try:
+        return schema.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field, found = ".".join(map(str, first["loc"])), one_line(repr(first["input"]), 60)
+        raise InputError(f"{where}: {field}: {found}, expected: {first['msg']}") from error
 
 
 def parse_json(content: bytes | str, where: str) -> Any:

@@ -133,6 +133,22 @@ def refusing(path: Path, what: str) -> Iterator[None]:
         raise kind(f"{path}: {one_line(words, MAX_LINE - len(path.name) - 2)}") from error
 
 
+@contextmanager
+def named(*places: object) -> Iterator[None]:
+    """Put the first place before what an error of this package says, unless it begins with one.
+
+    Raises
+    ------
+    MvestError
+        As raised within.
+    """
+    try:
+        yield
+    except MvestError as fault:
+        known = any(str(fault).startswith(str(place)) for place in places)
+        raise type(fault)(str(fault) if known else f"{places[0]}: {fault}") from fault
+
+
 def read_columns(file: Path, names: Sequence[str], where: str = "") -> dict[str, list[str]]:
     """Columns of a table by their names, as text; they come in any order.
 

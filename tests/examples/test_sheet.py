@@ -193,7 +193,8 @@ def test_what_the_program_is_asked_wrongly_it_says(tmp_path, capsys):
 
 def test_the_program_passes_on_a_failure(tmp_path):
     settings = {"length": 24.0, "cells": [2, 2], "observed": [2, 3], "law": "biot"}
-    request = RunRequest(PARAMETERS, ("MPa", "MPa"), (-1.0, 1.0), 6, settings=settings)
+    parameters = [{"name": n, "value": v} for n, v in zip(PARAMETERS, (-1.0, 1.0), strict=True)]
+    request = RunRequest(parameters=parameters, points=6, settings=settings)
     write_request(tmp_path, request)
     assert EXAMPLE.main([str(tmp_path / "request.json"), str(tmp_path)]) == 0
     assert "expected positive moduli" in read_answer(tmp_path, request).reason

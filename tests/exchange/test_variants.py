@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.exchange.markups import read_markups
-from mvest.exchange.regions import read_regions
-from mvest.exchange.surfaces import read_surface
+from mvest.exchange.surfaces import read_regions, read_surface
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange import markup_variants, surface_variants, volume_variants

@@ -22,7 +22,7 @@ from mvest.exchange.external.contract import (
 from mvest.exchange.febio.document import read_positions
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.exchange.markups import read_markups
-from mvest.exchange.regions import read_regions
+from mvest.exchange.surfaces import read_regions
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality
 from tests.cases import folders
@@ -31,7 +31,10 @@ from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
 from tests.experiments.studies.made_up import made_up, made_up_estimate
 from tests.fuzz.trial import Enter, Makers
 
-REQUEST = RunRequest(("E", "nu, local"), ("MPa", ""), (1.5, 0.3), 2)
+REQUEST = RunRequest(
+    parameters=[{"name": "E", "value": 1.5, "unit": "MPa"}, {"name": "nu, local", "value": 0.3}],
+    points=2,
+)
 
 
 def of(*names: str) -> Makers:

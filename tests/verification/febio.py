@@ -25,9 +25,14 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import Log
+from mvest.exchange.exporting.febio import (
+    CONTACTS,
+    FebioOptions,
+    differences,
+    valve_document,
+)
 from mvest.exchange.febio.document import Control, FebDocument
 from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh
-from mvest.exchange.febio.valve import CONTACTS, FebioOptions, differences, valve_document
 from mvest.files import write_atomically
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate

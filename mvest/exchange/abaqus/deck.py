@@ -88,7 +88,7 @@ class Deck:
         Elements, material, and thickness of shells (mm) or cross section of trusses (mm^2), NaN
         where none is given. Of two sections of an element the later one counts.
     laws : dict
-        Material -> ELASTIC or HYPERELASTIC -> its ``options``, ``values`` and line (``at``).
+        Material -> ELASTIC or HYPERELASTIC -> its ``options`` and ``values``.
     pressures : list of tuple
         Elements, pressure against their normals at a share of 1, and its amplitude.
     period : float
@@ -239,7 +239,7 @@ class Deck:
                 self._law = self.laws.setdefault(block.option("NAME"), {})
             case "ELASTIC" | "HYPERELASTIC":
                 values = _numbers(block.words)
-                self._law[key] = {"at": str(block), "options": block.options, "values": values}
+                self._law[key] = {"options": block.options, "values": values}
             case "AMPLITUDE":
                 self._add_amplitude(block)
             case "STEP":

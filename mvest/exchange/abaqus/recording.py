@@ -24,7 +24,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import InputError
-from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
+from mvest.exchange.abaqus.chordae import TOE_STRAIN, trace_cables, truss_stiffness
 from mvest.exchange.abaqus.deck import Deck, lookup, some
 from mvest.exchange.child import in_child
 from mvest.exchange.surfaces import read_mesh
@@ -124,7 +124,6 @@ def read_recording(
     leaflets: Mapping[str, str],
     annulus: str,
     free_edge: str,
-    toe_strain: float = 0.01,
 ) -> Recording:
     """Read a recorded closure.
 
@@ -135,10 +134,6 @@ def read_recording(
         Region -> element set. Names of sets are given with or without their instance, in any case.
     annulus, free_edge : str
         Node sets.
-    toe_strain : float
-        Of the chordae, at which their secant stiffness is taken. At 1 %, chordae act as strings
-        that hardly lengthen; the far higher stiffness of exponential ones at several percent would
-        describe a state that no recorded closure reaches.
 
     Raises
     ------
@@ -148,11 +143,11 @@ def read_recording(
     """
     path, *files = recording_files(folder)
     sets = [list(leaflets.values()), annulus, free_edge]
-    found = in_child(recorded, path, *sets, toe_strain, len(files), seconds=600.0)
+    found = in_child(recorded, path, *sets, len(files), seconds=600.0)
     nodes, vertices, held = found["nodes"], found["vertices"], found["held"]
     frames = []
     for k, file in enumerate(files):
-        points = read_mesh(file).points
+        points = read_mesh(file).vertices
         if points.shape != nodes.shape:
             raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
         if k == 0 and not np.abs(points - nodes).max() <= TOLERANCE_MM:
@@ -170,7 +165,7 @@ def read_recording(
         annulus=found["annulus"],
         free_edge=found["free_edge"],
         papillary_tips=found["motion"]["papillary_tips"][0],
-        chordae=Chordae(**found["chordae"], family_names=names, toe_strain=toe_strain),
+        chordae=Chordae(**found["chordae"], family_names=names, toe_strain=TOE_STRAIN),
         motion=Motion(**found["motion"]),
     )
     rest = {name: found[name] for name in ("times", "pressure", "pressure_share")}
@@ -188,7 +183,6 @@ def recorded(
     leaflets: Sequence[str],
     annulus: str,
     free_edge: str,
-    toe_strain: float,
     count: int,
 ) -> dict[str, Any]:
     """What a deck says of a recording of so many frames; called in the child.
@@ -228,9 +222,7 @@ def recorded(
     used, of_truss = np.unique(section, return_inverse=True)
     family = of_truss[first // 2][np.searchsorted(ends, insertion)]
     materials = [deck.sections[k][1:] for k in used]
-    stiffness = [
-        truss_stiffness(name, area, deck.laws.get(name, {}), toe_strain) for name, area in materials
-    ]
+    stiffness = [truss_stiffness(name, area, deck.laws.get(name, {})) for name, area in materials]
     t = times / times[-1]
     return {
         "nodes": nodes,

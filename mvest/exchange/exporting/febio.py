@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,26 @@ import numpy as np
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
-from mvest.errors import InputError
-from mvest.exchange.febio.valve import FebioOptions, differences, valve_document
+from mvest.errors import InputError, require_numbers
+from mvest.exchange.febio.document import Control, FebDocument
+from mvest.exchange.febio.mesh import (
+    FIBRED,
+    LAWS,
+    NAMES,
+    FebLaw,
+    febio_law,
+    febio_mesh,
+    opposite_faces,
+)
+from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.mechanics.system import System
+from mvest.mechanics.valve_system import boundary_loading, build_system
 from mvest.problem.registration import REGISTRATION
 from mvest.reading.documents import read_mapping
+from mvest.typing import FloatArray
 from mvest.valve.mesh.given import GivenValve
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 GENERIC = {
     "E_f": {"anterior": 6.23, "posterior": 2.09},
@@ -27,6 +42,93 @@ CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
 """Points at which the valve is sampled for patches of chordae and the annulus."""
 MAX_RECORD = 1 << 28
 """Bytes of a run's record that are read."""
+CONTACTS = ("potential", "sliding", "none")
+SAMPLES, TOE_POINTS = 61, 41
+"""Points of pressure and motion over the ramp, and of a chord's force over its toe."""
+STEPS = 30
+"""Time steps over the ramp to begin with; FEBio changes them."""
+EXPONENT = 4.0
+"""p of the contact potential, FEBio's own choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class FebioOptions:
+    """What is not in the case, and what is chosen in FEBio.
+
+    Attributes
+    ----------
+    case : str, optional
+        Folder of the case of a run; by default where the run says that it was.
+    E_f, ratio : tuple of float, optional
+        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; by default
+        what the run estimated, or the generic ones of an anterior and a posterior leaflet.
+    nu, reading : float, str
+        Poisson ratio and how it is read (A or C), where no run says so.
+    pressure_mmHg : float, optional
+        By default that of the closed frame.
+    mesh : str
+        ``structured`` (two leaflets: bricks) or ``tetwild`` (tetrahedra).
+    columns, rows : int
+        Bricks around the valve and along the leaflets.
+    edge_length : float
+        mm, of tetrahedra.
+    law : str
+        Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
+        keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
+    contact : str
+        ``potential``: FEBio's contact potential between the atrial faces; ``sliding``: its
+        ``sliding-elastic`` between the leaflets; ``none``.
+    contact_gap_mm : float
+        Between the atrial faces of two flat leaflets that press on each other with the reference
+        pressure of the contact (potential), or that touch (sliding).
+    contact_reach_mm : float
+        Gap at which contact begins (potential), or within which it is looked for (sliding).
+    dynamic : bool
+        With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
+        of its ramp.
+    density_factor : float
+        On the density of a dynamic run: heavier leaflets take larger steps of time, and come to
+        rest where lighter ones do.
+    quasi_newton : int
+        BFGS updates between two tangents; FEBio's tangent of ``neo-hookean`` is not exact.
+    tolerance : float
+        Of displacements, relative; that of the energy is its square.
+    """
+
+    case: str | None = None
+    E_f: tuple[float, ...] | None = None
+    ratio: tuple[float, ...] | None = None
+    nu: float = 0.488
+    reading: str = "A"
+    pressure_mmHg: float | None = None
+    mesh: str = "structured"
+    columns: int = 24
+    rows: int = 4
+    edge_length: float = 2.5
+    law: str = "neo-hookean"
+    contact: str = "potential"
+    contact_gap_mm: float = 1.0
+    contact_reach_mm: float = 1.65
+    dynamic: bool = True
+    density_factor: float = 1000.0
+    quasi_newton: int = 10
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        choices = {"mesh": ("structured", "tetwild"), "law": LAWS, "contact": CONTACTS}
+        for name, known in choices.items():
+            if (given := getattr(self, name)) not in known:
+                raise InputError(f"{name} {given!r}, expected one of {', '.join(known)}")
+        if not 0 <= self.contact_gap_mm < self.contact_reach_mm:
+            raise InputError(
+                f"contact_gap_mm = {self.contact_gap_mm}, contact_reach_mm = "
+                f"{self.contact_reach_mm}; expected 0 <= gap < reach"
+            )
+        if self.contact == "potential" and self.contact_gap_mm == 0:
+            raise InputError("contact_gap_mm = 0; expected a gap, which a potential keeps")
+        if self.quasi_newton < 0:
+            raise InputError(f"quasi_newton = {self.quasi_newton}, expected >= 0")
+        require_numbers(self, "FEBio", "tolerance", "density_factor")
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
@@ -154,3 +256,166 @@ def model_of_case(
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
     return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)
+
+
+def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) -> FebDocument:
+    """The closure of a valve with parameters ``m (p,)``, which are values in the file.
+
+    Raises
+    ------
+    InputError
+        If the mesh or the law has no counterpart, or the boundary goes another way than straight.
+    MaterialError
+        If a modulus is inadmissible.
+    """
+    values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
+    mechanics, protocol = model.settings, model.settings.protocol
+    if len(model.valve.motion.phase) != 2:
+        raise InputError(
+            f"the boundary has {len(model.valve.motion.phase)} key frames; expected two, between "
+            "which it goes straight"
+        )
+    if mechanics.fields or mechanics.patches:
+        raise InputError("the modulus varies within a leaflet; expected one of each leaflet")
+    if model.ties is not None:
+        raise InputError("leaflets are tied together, as by a clip; expected a valve without")
+    mesh = febio_mesh(model.mesh)
+    unhindered = replace(mechanics, contact=replace(mechanics.contact, active=False))
+    system = build_system(model.valve, model.contact_valve, mesh, unhindered, values)
+    cables, hinge = system.cables, system.hinge
+    assert cables is not None
+    assert hinge is not None
+    loading = boundary_loading(system, model.valve, model.contact_valve, mechanics)
+    times = np.linspace(0.0, protocol.ramp, SAMPLES)
+    pressure = np.array([loading(t).pressure for t in times]) * system.factors.pressure
+    phase = np.stack([times, [protocol.phase(t) for t in times]], axis=1)
+    opened, closed = loading(0.0), loading(protocol.ramp)
+    ends = cables.patches(mesh.nodes)
+    further = [opened.tips, ends, opened.hinge]
+    at = np.cumsum([len(mesh.nodes), *map(len, further)])
+    tip_nodes, end_nodes, hinge_nodes = (np.arange(a, b) for a, b in itertools.pairwise(at))
+    document = FebDocument(
+        mesh,
+        [_law(mechanics, values, name, options) for name in mesh.region_names],
+        Control(
+            protocol.end if options.dynamic else protocol.ramp,
+            protocol.ramp / STEPS,
+            options.tolerance,
+            options.dynamic,
+            options.quasi_newton,
+        ),
+        np.concatenate(further),
+        mechanics.density * options.density_factor,
+    )
+    document.prescribe("tips", tip_nodes, closed.tips - opened.tips, phase)
+    document.prescribe("annulus", hinge_nodes, closed.hinge - opened.hinge, phase)
+    document.average(end_nodes, cables.patches)
+    document.press(mesh.pressure_faces, np.stack([times, pressure], axis=1))
+    if options.dynamic and mechanics.damping.alpha:
+        document.damp(mechanics.damping.alpha)
+    if options.contact != "none" and mechanics.contact.active:
+        _add_contact(document, mesh, mechanics.contact.reference_pressure, options)
+    pairs = np.stack([tip_nodes[cables.tip], end_nodes], axis=1)
+    document.pull(pairs, _chord_forces(system, document.nodes[pairs]))
+    document.support(hinge_nodes, hinge.points, hinge.stiffness)
+    return document
+
+
+def _law(
+    mechanics: MechanicsSettings, values: dict[str, float], region: str, options: FebioOptions
+) -> FebLaw:
+    tissue = mechanics.tissue[region]
+    own = {
+        kind: values[f"{kind}.{region}"] for kind in tissue.kinds if f"{kind}.{region}" in values
+    }
+    if tissue.law == "stiffening" or own.pop("prestretch", tissue.prestretch) != 1.0:
+        raise InputError(
+            f"{region}: its tissue is between two laws or prestretched; the file has no such law"
+        )
+    if tissue.law == "exponential":
+        return febio_law(tissue.coefficients(own), options.law)
+    moduli = tissue.moduli(own["E_f"], own.get("ratio"), own.get("G"))
+    return febio_law(moduli.material, options.law)
+
+
+def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
+    """Elongation against the distance at rest (mm) and force (N) of chords, ends ``(c, 2, 3)``."""
+    cables, factors = system.cables, system.factors
+    assert cables is not None
+    apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    length = np.broadcast_to(factors.chord_rest_length, apart.shape) * cables.rest_length
+    stiffness = np.broadcast_to(factors.chord_stiffness, apart.shape) * cables.axial_stiffness
+    toe = cables.toe_strain
+    strain = np.concatenate([[-1.0], np.linspace(0.0, toe, TOE_POINTS), [toe + 1.0]])
+    elongation = length[:, None] * (1 + strain) - apart[:, None]
+    force = stiffness[:, None] * cable_force(strain, toe)[0]
+    return list(np.stack([elongation, force], axis=2))
+
+
+def _add_contact(
+    document: FebDocument, mesh: SolidMesh, pressure: float, options: FebioOptions
+) -> None:
+    faces, gap, reach = opposite_faces(mesh), options.contact_gap_mm, options.contact_reach_mm
+    if options.contact == "potential":
+        inner = 0.5 * (gap + reach)
+        # Each pair of elements of one surface is counted twice.
+        kc = 0.5 * pressure / _pressure_of_sheets(gap, EXPONENT, inner, reach)
+        own = {"kc": kc, "p": EXPONENT, "R_in": inner, "R_out": reach}
+        document.touch("contact potential", {"atrial": faces}, **own)
+    elif len(mesh.region_names) > 1:
+        # A face is of the region of the first element that has all its nodes.
+        hosts = [np.isin(mesh.elements, face).sum(axis=1).argmax() for face in faces]
+        region = mesh.region[hosts]
+        surfaces = {f"{n}_atrial": faces[region == k] for k, n in enumerate(mesh.region_names)}
+        own = {"laugon": 0, "penalty": 1.0, "auto_penalty": 1, "two_pass": 1,
+               "search_radius": reach, "offset": gap}  # fmt: skip
+        document.touch("sliding-elastic", surfaces, **own)
+
+
+def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> float:
+    r"""Pressure (MPa) between two flat sheets that are ``gap`` mm apart, for kc = 1.
+
+    With the force f(r) between two points, :math:`2 \pi d \int_d^\infty f(r) dr`: the derivative of
+    the energy :math:`2 \pi \int_d^\infty \varphi(r) r dr` by d. FEBio's force is :math:`r^{-p}`
+    less a constant within ``inner``, and falls to zero as a parabola at ``outer``.
+    """
+    c1 = 0.5 * p / ((outer - inner) * inner ** (p + 1))
+    c2 = inner**-p - c1 * (inner - outer) ** 2
+    parabola = c1 * (outer - max(gap, inner)) ** 3 / 3
+    if gap >= inner:
+        return 2 * np.pi * gap * parabola
+    power = (gap ** (1 - p) - inner ** (1 - p)) / (p - 1) - c2 * (inner - gap)
+    return 2 * np.pi * gap * (power + parabola)
+
+
+def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
+    """What is not the same in FEBio, a line each."""
+    mesh, mechanics = model.mesh, model.settings
+    contact, damping = mechanics.contact, mechanics.damping
+    law = f"linear in the Biot strain; in this file {LAWS[options.law]} with the same moduli"
+    if {mechanics.tissue[name].law for name in mesh.region_names} == {"exponential"}:
+        law = f"exponential; in this file {FIBRED}, fibres by their isochoric stretch"
+    gap, reach = options.contact_gap_mm, options.contact_reach_mm
+    theirs = {
+        "potential": f"a contact potential, atrial faces {gap:g} mm apart under this pressure and "
+        f"contact from {reach:g} mm on; nothing keeps leaflets from passing through each other",
+        "sliding": f"sliding-elastic between the atrial faces of different leaflets, {gap:g} mm "
+        "apart; none of a leaflet with itself",
+        "none": "none",
+    }[options.contact if contact.active else "none"]
+    time = "a static equilibrium at each time"
+    if options.dynamic:
+        time = f"the generalised alpha rule with {options.density_factor:g} times the density"
+    return [
+        f"element: here {mesh.element_type}; in this file "
+        f"{NAMES[febio_mesh(mesh).element_type][0]} without enhanced or assumed strains.",
+        f"law: here {law}.",
+        "direction of the fibre: here at every node; in this file at the centre of each element, "
+        "or at its nodes for the exponential law.",
+        f"contact: here a potential, midsurfaces {contact.reference_distance:g} thicknesses apart "
+        f"under {1e3 * contact.reference_pressure:g} kPa; in this file {theirs}.",
+        f"time: here implicit Euler with damping {damping.alpha:g} 1/s of mass and "
+        f"{damping.beta:g} s of stiffness; in this file {time} and damping by mass alone.",
+        "chordae: here cables with a toe of the fourth power; in this file springs whose force is "
+        f"linear between {TOE_POINTS} points of that toe.",
+    ]

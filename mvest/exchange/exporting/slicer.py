@@ -16,7 +16,7 @@ from mvest.cases.schema import CASE_FILE
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
 from mvest.exchange.segmentations import segment_name, voxelise_leaflets, write_segmentation
-from mvest.exchange.surfaces import SurfaceFile, region_arrays, write_surface_series
+from mvest.exchange.surfaces import Surface, region_arrays, write_surface_series
 from mvest.files import write_atomically
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.volume import VolumeSequence
@@ -109,7 +109,7 @@ def _write_case(folder: Path, case: ValveCase, options: SlicerOptions) -> None:
             thickness = np.zeros(len(frame.vertices))
             thickness[frame.triangles.ravel()] = np.repeat(mean[frame.region], 3)
         cells = region_arrays(frame.region, names)
-        states.append(SurfaceFile(frame.vertices, frame.triangles, points, cells))
+        states.append(Surface(frame.vertices, frame.triangles, points, cells))
         _write_frame(folder, frame, thickness, order, names, options.voxel_mm)
     write_surface_series(folder / "frames.pvd", [frame.time for frame in case.frames], states)
 
@@ -130,7 +130,7 @@ def _write_run(folder: Path, fields: CaseFields, options: SlicerOptions) -> None
             if distance is not None:
                 # The open valve is not compared with anything, but Slicer wants the same arrays.
                 data["distance_mm"] = distance[k - 1] if k else np.zeros(len(points))
-            states.append(SurfaceFile(points, fields.triangles, data, cells))
+            states.append(Surface(points, fields.triangles, data, cells))
         write_surface_series(folder / f"{name}.pvd", range(len(states)), states)
     order = _ring(fields.annulus, fields.triangles, fields.region, names)
     thickness = np.full(len(fields.rest), options.thickness_mm)
@@ -156,7 +156,7 @@ def _write_closing(folder: Path, file: Path) -> None:
             for name in ("stress", "contact_pressure"):
                 if name in arrays:
                     data[f"{name}_MPa"] = np.asarray(arrays[name][k], dtype=np.float64)
-            states.append(SurfaceFile(points, triangles, data, cells))
+            states.append(Surface(points, triangles, data, cells))
         write_surface_series(folder / "closing.pvd", arrays["times"].tolist(), states)
 
 

@@ -24,17 +24,20 @@ import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from mvest.errors import ConfigurationError, InputError, message_of
 from mvest.estimation.prediction import Prediction
 from mvest.processes import Program, ending
 from mvest.provenance import write_json
-from mvest.reading.documents import read_mapping
+from mvest.reading.documents import read_mapping, validated
 from mvest.reading.text import one_line, read_numbers, write_columns
 from mvest.typing import FloatArray
 
-FORMAT, VERSION = "mvest-external", 1
+FORMAT: Literal["mvest-external"] = "mvest-external"
+VERSION: Literal[1] = 1
 REQUEST, POINTS = "request.json", "points.csv"
 RESPONSE, OBSERVATION, JACOBIAN = "response.json", "observation.csv", "jacobian.csv"
 ANSWERS = (RESPONSE, OBSERVATION, JACOBIAN)
@@ -156,60 +159,54 @@ class Command:
         return PLACEHOLDER.sub(lambda found: places[found[1]], text)
 
 
-@dataclass(frozen=True, slots=True)
-class RunRequest:
-    """What one run is asked for.
+class RequestParameter(BaseModel):
+    """A parameter of a request."""
+
+    model_config = ConfigDict(frozen=True)
+    name: str = Field(min_length=1)
+    value: Annotated[float, Field(allow_inf_nan=False)]
+    unit: str = ""
+
+
+class RunRequest(BaseModel):
+    """What one run is asked for, as it stands in ``request.json``.
 
     Attributes
     ----------
-    names, units : tuple of str, (p,)
-        Of the parameters; a unit may be empty.
-    values : tuple of float, (p,)
-    count : int
+    parameters : tuple of RequestParameter, (p,)
+    points : int
         Number of observed points.
     jacobian : bool
         Whether derivatives are of use.
     settings : mapping
         Whatever else the program needs; plain data.
-
-    Raises
-    ------
-    InputError
-        If the numbers of names, units and values differ, or a value is not finite.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: tuple[float, ...]
-    count: int
+    model_config = ConfigDict(frozen=True)
+    format: Literal["mvest-external"] = FORMAT
+    version: Literal[1] = VERSION
+    parameters: tuple[RequestParameter, ...] = Field(min_length=1)
+    points: int = Field(ge=1)
+    length_unit: Literal["mm"] = "mm"
     jacobian: bool = True
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = {}
 
-    def __post_init__(self) -> None:
-        if not len(self.names) == len(self.units) == len(self.values) > 0:
-            raise InputError(
-                f"a request has {len(self.names)} names, {len(self.units)} units and "
-                f"{len(self.values)} values; expected as many of each, at least one"
-            )
-        if len(set(self.names)) != len(self.names) or not all(self.names):
-            raise InputError(f"parameters {self.names}: expected different names")
-        if not all(map(math.isfinite, self.values)):
-            raise InputError(f"values {self.values} of a request, expected finite numbers")
-        if self.count < 1:
-            raise InputError(f"a request for {self.count} points, expected at least one")
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters, ``(p,)``."""
+        return tuple(one.name for one in self.parameters)
 
-    def data(self) -> dict[str, Any]:
-        """As it stands in ``request.json``."""
-        parameters = zip(self.names, self.values, self.units, strict=True)
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "parameters": [{"name": n, "value": v, "unit": u} for n, v, u in parameters],
-            "points": self.count,
-            "length_unit": "mm",
-            "jacobian": self.jacobian,
-            "settings": dict(self.settings),
-        }
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Of the parameters, ``(p,)``."""
+        return tuple(one.value for one in self.parameters)
+
+
+class _Response(BaseModel):
+    format: Literal["mvest-external"] = FORMAT
+    version: Literal[1] = VERSION
+    status: Literal["converged", "failed"]
+    reason: str = ""
 
 
 def write_request(folder: Path, request: RunRequest, points: FloatArray | None = None) -> None:
@@ -222,7 +219,7 @@ def write_request(folder: Path, request: RunRequest, points: FloatArray | None =
     """
     if points is not None:
         write_points(folder / POINTS, points)
-    write_json(folder / REQUEST, request.data())
+    write_json(folder / REQUEST, request.model_dump())
 
 
 def read_request(file: Path) -> RunRequest:
@@ -233,19 +230,7 @@ def read_request(file: Path) -> RunRequest:
     InputError
         If the file is no request of this format.
     """
-    data = _read_json(file)
-    try:
-        parameters = data["parameters"]
-        return RunRequest(
-            tuple(str(p["name"]) for p in parameters),
-            tuple(str(p["unit"]) for p in parameters),
-            tuple(float(p["value"]) for p in parameters),
-            int(data["points"]),
-            bool(data["jacobian"]),
-            dict(data["settings"]),
-        )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{file}: no request: {one_line(repr(error), 120)}") from error
+    return validated(RunRequest, read_mapping(file, MAX_JSON_SIZE), str(file))
 
 
 def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | None = None) -> None:
@@ -261,7 +246,7 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
     if prediction.converged:
         write_points(folder / OBSERVATION, prediction.y.reshape(-1, 3))
         if names is not None:
-            _write_table(folder / JACOBIAN, names, prediction.jacobian)
+            write_columns(folder / JACOBIAN, names, prediction.jacobian.tolist())
     status = "converged" if prediction.converged else "failed"
     answer = {"format": FORMAT, "version": VERSION, "status": status, "reason": prediction.reason}
     write_json(folder / RESPONSE, answer)
@@ -275,17 +260,11 @@ def read_answer(folder: Path, request: RunRequest) -> Prediction:
     InputError
         If a file is missing or damaged, or its shape or its numbers are not what was asked for.
     """
-    file = folder / RESPONSE
-    data = _read_json(file)
-    status, reason = data.get("status"), data.get("reason", "")
-    if status not in ("converged", "failed") or not isinstance(reason, str):
-        raise InputError(
-            f"{file.name}: status {one_line(repr(status), 60)}, expected 'converged' or 'failed' "
-            "with a reason"
-        )
-    if status == "failed":
-        return Prediction.failed(reason.strip() or "the program gives no reason")
-    y = read_points(folder / OBSERVATION, request.count).ravel()
+    data = read_mapping(folder / RESPONSE, MAX_JSON_SIZE, RESPONSE)
+    answer = validated(_Response, data, RESPONSE)
+    if answer.status == "failed":
+        return Prediction.failed(answer.reason.strip() or "the program gives no reason")
+    y = read_points(folder / OBSERVATION, request.points).ravel()
     if not (folder / JACOBIAN).exists():
         return Prediction.undifferentiated(y)
     return Prediction(y, _read_table(folder / JACOBIAN, request.names, y.size))
@@ -310,18 +289,7 @@ def write_points(file: Path, points: FloatArray) -> None:
     InputError
         If the file cannot be written.
     """
-    _write_table(file, COORDINATES, points)
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    """A mapping of this format and version."""
-    data = read_mapping(file, MAX_JSON_SIZE, file.name)
-    found = (data.get("format"), data.get("version"))
-    if found != (FORMAT, VERSION):
-        raise InputError(
-            f"{file.name}: format and version {one_line(found, 80)}, expected {(FORMAT, VERSION)}"
-        )
-    return data
+    write_columns(file, COORDINATES, points.tolist())
 
 
 def _read_table(file: Path, header: Sequence[str], count: int | None) -> FloatArray:
@@ -330,8 +298,3 @@ def _read_table(file: Path, header: Sequence[str], count: int | None) -> FloatAr
     if count is not None and len(table) != count:
         raise InputError(f"{file.name}: {len(table)} rows, expected {count}")
     return table
-
-
-def _write_table(file: Path, header: Sequence[str], rows: FloatArray) -> None:
-    """Numbers with all their digits."""
-    write_columns(file, header, ([repr(value) for value in row] for row in rows.tolist()))

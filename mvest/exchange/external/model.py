@@ -28,6 +28,7 @@ from mvest.exchange.external.contract import (
 from mvest.files import require_writable, sha256_of
 from mvest.processes import Program
 from mvest.provenance import config_hash
+from mvest.reading.documents import validated
 from mvest.typing import FloatArray
 
 SCHEMES = ("central", "forward")
@@ -164,6 +165,12 @@ class ProcessModel:
         if self.points is not None and np.shape(self.points) != (self.count, 3):
             shape = np.shape(self.points)
             raise ConfigurationError(f"points: shape {shape}, expected ({self.count}, 3)")
+        units = self.names if self.units is None else self.units
+        if not len(set(self.names)) == len(self.names) == len(units):
+            raise ConfigurationError(
+                f"parameters {', '.join(self.names)} in {', '.join(units)}; expected different "
+                "names, and a unit of each"
+            )
         # Inputs, units and names are in order, or this says what is not.
         self._place(self._request(np.zeros(len(self.names)), True))
         require_writable(self.folder)
@@ -209,9 +216,15 @@ class ProcessModel:
         return self.differences.jacobian(m, y, [answer.y for answer in answers])
 
     def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
-        names, values = tuple(self.names), tuple(float(v) for v in m)
-        units = ("",) * len(names) if self.units is None else tuple(self.units)
-        return RunRequest(names, units, values, self.count, jacobian, dict(self.settings or {}))
+        units = [""] * len(self.names) if self.units is None else self.units
+        rows = zip(self.names, m.tolist(), units, strict=True)
+        asked = {
+            "parameters": [dict(zip(("name", "value", "unit"), row, strict=True)) for row in rows],
+            "points": self.count,
+            "jacobian": jacobian,
+            "settings": self.settings or {},
+        }
+        return validated(RunRequest, asked, "request")
 
     def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Prediction]:
         """Answers at all points, several at a time; none goes on where one is interrupted."""
@@ -280,7 +293,7 @@ class ProcessModel:
         files |= {str(path): path for path in self.inputs}
         named = config_hash(
             {
-                "request": request.data(),
+                "request": request.model_dump(),
                 "command": self.command.arguments,
                 "environment": self.command.environment,
                 "points": self.points,

@@ -9,6 +9,7 @@ import numpy as np
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.errors import InputError
+from mvest.exchange.abaqus.chordae import TOE_STRAIN
 from mvest.exchange.abaqus.recording import (
     Recording,
     deck_sets,
@@ -35,20 +36,12 @@ class AbaqusOptions:
         Node sets.
     std_mm : float or None
         Standard deviation of a coordinate of the closed frame; 1 mm assumed.
-    toe_strain : float
-        Of the chordae, up to which their stiffness rises; it is linearised there.
-    name, description, licence : str
-        Of the case.
     """
 
     leaflets: tuple[str, ...] | None = None
     annulus: str | None = None
     free_edge: str | None = None
     std_mm: float | None = None
-    toe_strain: float = 0.01
-    name: str = ""
-    description: str = ""
-    licence: str = ""
 
 
 def import_abaqus(source: Path, options: AbaqusOptions) -> ValveCase:
@@ -72,20 +65,20 @@ def import_abaqus(source: Path, options: AbaqusOptions) -> ValveCase:
         asked = ", ".join(option for option, absent in missing.items() if absent)
         raise InputError(f"{source}: give {asked}; the deck's sets are {known}")
     sets = leaflets, options.annulus or "", options.free_edge or ""
-    recording = read_recording(source, *sets, options.toe_strain)
+    recording = read_recording(source, *sets)
     valve = recording.valve
     derived = [
         "fibres: parallel to the annulus; the deck's own directions are not read",
         f"chordae: {len(valve.chordae)} straight ones as long as their ways through the network, "
-        f"of the stiffness at {100 * options.toe_strain:g} % strain",
+        f"of the stiffness at {100 * TOE_STRAIN:g} % strain",
     ]
     if options.std_mm is None:
         derived.append(f"observation: {STD_MM:g} mm assumed; std_mm=... states it")
     return ValveCase(
-        name=options.name or source.resolve().name,
-        description=options.description,
+        name=source.resolve().name,
+        description="",
+        licence="",
         source="computed with Abaqus",
-        licence=options.licence,
         simulated=True,
         surface=valve.surface,
         annulus=valve.annulus,

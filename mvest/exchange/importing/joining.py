@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.rims import loop_vector_area, two_loops, without_ears
 from mvest.cases.tissue import LeafletBand
 from mvest.errors import GeometryError
-from mvest.exchange.regions import RegionSurface, merged
+from mvest.exchange.surfaces import Surface, merged
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.moving_distance import closest_on_loop
@@ -78,8 +78,7 @@ class Leaflet:
         GeometryError
             It is closed, no manifold, or has a hole that is a second boundary.
         """
-        nothing = np.zeros(len(triangles), dtype=np.int64)
-        whole = merged(RegionSurface(vertices, triangles, nothing, {}))
+        whole = merged(Surface(vertices, triangles))
         points, faces = whole.vertices, whole.triangles
         apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         faces = _largest_piece(points, faces[apart & (areas(points, faces) > 0)])
@@ -200,7 +199,7 @@ def joined(
     contour: FloatArray | None,
     down: FloatArray,
     how: Joining,
-) -> tuple[RegionSurface, FloatArray, float]:
+) -> tuple[Surface, FloatArray, float]:
     """Join the anterior and the posterior leaflet to a band that faces the ventricle.
 
     Parameters
@@ -216,7 +215,7 @@ def joined(
 
     Returns
     -------
-    surface : RegionSurface
+    surface : Surface
         Regions 0 (anterior) and 1 (posterior).
     seams : (2, 2)
         As in `Joining`.
@@ -382,7 +381,7 @@ def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
     return np.atleast_1d(distance), np.atleast_1d(number)
 
 
-def _drawn(band: LeafletBand, around: float, along: float, how: Joining) -> RegionSurface:
+def _drawn(band: LeafletBand, around: float, along: float, how: Joining) -> Surface:
     """A band of a mean size (mm) on the lines of its coordinates, moved off its side."""
     columns = 4 * max(6, round(around / how.edge_mm / 4))
     grid = band_grid(columns, 1 + max(4, round(along / how.edge_mm)))
@@ -395,7 +394,7 @@ def _drawn(band: LeafletBand, around: float, along: float, how: Joining) -> Regi
     by = np.where(grid.phi < 180, *how.offset_mm)
     by = np.where(between, sum(how.offset_mm) / 2, by)
     vertices = vertices + by[:, None] * smooth_vertex_normals(vertices, grid.triangles)
-    return RegionSurface(vertices, grid.triangles, grid.region, {})
+    return Surface(vertices, grid.triangles, region=grid.region)
 
 
 def _flat_part(rows: FloatArray, offset_mm: FloatArray) -> FloatArray:

@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
-from mvest.exchange.regions import RegionSurface, merged, part_of
-from mvest.exchange.surfaces import SurfaceFile
-from mvest.exchange.volumes import LabelMap, Segment
+from mvest.exchange._images import Segment
+from mvest.exchange.surfaces import Surface, merged, part_of
+from mvest.exchange.volumes import LabelMap
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import STEP_MM, inside_surfaces
@@ -33,7 +33,7 @@ OTHERS = {"papillary", "muscle", "commissure", "annulus", "chordae", "tricuspid"
 """Words in the names of what is no mitral leaflet."""
 VALVE_MM = (10.0, 120.0)
 """Size of a valve."""
-Content: TypeAlias = SurfaceFile | LabelMap
+Content: TypeAlias = Surface | LabelMap
 Grid: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Spacing, direction and origin of voxels, as `mvest.exchange.volumes.LabelMap` has them."""
 
@@ -153,7 +153,7 @@ class _Part:
 
 def _parts(content: Content, frame: int | None) -> list[_Part]:
     """The parts of a file that hold anything."""
-    if isinstance(content, SurfaceFile):
+    if isinstance(content, Surface):
         names = sorted(set(content.groups))
         if len(names) < 2:
             return [_Part("".join(names) or "surface", "", "", lambda: content)]
@@ -218,9 +218,9 @@ def _listed(parts: Sequence[_Part]) -> str:
     return one_line(", ".join(names), 300)
 
 
-def _outwards(part: SurfaceFile, scale: float) -> tuple[FloatArray, IntArray]:
+def _outwards(part: Surface, scale: float) -> tuple[FloatArray, IntArray]:
     """A closed surface in mm with its normals outwards and coincident vertices one."""
-    one = merged(RegionSurface(scale * part.vertices, part.triangles, None, {}))
+    one = merged(Surface(scale * part.vertices, part.triangles))
     faces = one.triangles
     if enclosed_volume(one.vertices, faces) < 0:
         faces = faces[:, ::-1]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.checks import LARGEST_THICKNESS
 from mvest.cases.frames import MM_PER
-from mvest.errors import GeometryError, InputError, MvestError
+from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflet_parts import (
     REGIONS,
     Content,
@@ -25,6 +24,7 @@ from mvest.exchange.importing.leaflet_parts import (
 from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
+from mvest.reading.text import named
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.segmented import (
@@ -157,7 +157,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     """
     derived: list[str] = []
     frames: list[FoundFrame] = []
-    with _named(source):
+    with named(source):
         seen = _seen(source, options, derived)
         scale = _scale(seen[0].contents[0], options)
     anterior, commissures = (
@@ -168,7 +168,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     seams: Any = options.seam_mm
     exchanged, voxel = False, 0.0
     for one in seen:
-        with _named(*one.files):
+        with named(*one.files):
             given = {name: options.words(name) for name in ("leaflets", *REGIONS)}
             tissue = tissue_of(one.contents, one.frame, given, scale, derived)
             stated = options.tips_closed if frames else options.tips
@@ -214,18 +214,8 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
         "observation": {"std_mm": std, "correlation_length_mm": correlated},
         "derived": derived,
     }
-    with _named(source):
+    with named(source):
         return case_of_frames(frames, document)
-
-
-@contextmanager
-def _named(*files: Path) -> Iterator[None]:
-    """Put the first file before what is wrong with it, unless one is named already."""
-    try:
-        yield
-    except MvestError as fault:
-        known = any(str(fault).startswith(str(file)) for file in files)
-        raise type(fault)(str(fault) if known else f"{files[0]}: {fault}") from fault
 
 
 def _read(files: tuple[Path, ...]) -> tuple[Content, ...]:
@@ -283,7 +273,7 @@ def _seen(source: Path, options: LeafletsOptions, derived: list[str]) -> list[Se
     if not closed:
         return [opened]
     files = _paired(Path(*closed)) if len(closed) == 1 else tuple(map(Path, closed))
-    with _named(*files):
+    with named(*files):
         shut = Seen(Role.CLOSED, files, _read(files), None)
         if type(shut.contents[0]) is not type(content):
             raise InputError("a label map beside surfaces, expected both frames of one kind")

@@ -11,9 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.rims import two_loops
-from mvest.cases.tissue import FAMILIES, GENERIC_THICKNESS
-from mvest.errors import GeometryError, InputError, MvestError
+from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.errors import InputError
 from mvest.exchange.importing.joining import (
     REGIONS,
     Joining,
@@ -24,9 +23,9 @@ from mvest.exchange.importing.joining import (
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
 from mvest.exchange.importing.written import FoundFrame, case_of_frames
 from mvest.exchange.markups import TO_LPS
-from mvest.exchange.regions import RegionSurface
+from mvest.exchange.surfaces import Surface
+from mvest.reading.text import named
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.dimensions import ChordLayout
 
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
 """Phases in the order in which they are preferred."""
@@ -38,11 +37,6 @@ CORRELATED_MM = 10.0
 """Along the leaflets over which errors of a segmentation are alike."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
-MARGINAL_MM = 4.0
-"""From the free edge, within which a chord inserts as marginal ones do."""
-MAX_AWAY = 3.0
-"""mm from where a chord begins to its papillary tip."""
-
 
 _Seen: TypeAlias = tuple[SeenPhase, Role]
 
@@ -111,17 +105,6 @@ class SlicerheartOptions:
         return self.thickness_mm or tuple(GENERIC_THICKNESS[name] for name in REGIONS)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Phase:
-    """A phase with its leaflets made one."""
-
-    seen: SeenPhase
-    role: Role
-    name: str
-    surface: RegionSurface
-    tips: FloatArray
-
-
 def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     """A case of a folder that SlicerHeart's ValveBatchExport or ValveFemExport wrote.
 
@@ -144,14 +127,18 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
     derived: list[str] = []
-    try:
-        chosen = _chosen(source, options, derived)
-        phases = _placed(chosen, options, derived)
-        return _as_case(phases, options, derived)
-    except MvestError as fault:
-        words = str(fault)
-        start = "" if words.startswith(str(source)) else f"{source}: "
-        raise type(fault)(f"{start}{words}") from fault
+    with named(source):
+        frames = _frames(_chosen(source, options, derived), options, derived)
+        std, known = options.std_mm, {"correlation_length_mm": CORRELATED_MM}
+        document = {
+            "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
+            "source": "SlicerHeart",
+            "regions": list(REGIONS),
+            "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
+            **({} if std is None else {"observation": {"std_mm": std, **known}}),
+            "derived": derived,
+        }
+        return case_of_frames(frames, document)
 
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
@@ -183,10 +170,12 @@ def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> li
     return [(by_phase[p], roles[p]) for p in order]
 
 
-def _placed(
+def _frames(
     chosen: Sequence[_Seen], options: SlicerheartOptions, derived: list[str]
-) -> list[_Phase]:
-    phases: list[_Phase] = []
+) -> list[FoundFrame]:
+    """The frames with their leaflets made one, in the order of time."""
+    frames: list[FoundFrame] = []
+    pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
     offset = (0.0, 0.0)
     if options.thickness_mm is None:
         derived.append(
@@ -203,23 +192,32 @@ def _placed(
     for seen, role in chosen:
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")
         notes = list(seen.notes)
-        try:
-            tips = _tips_of((seen, role), options, phases, notes)
+        with named(label):
+            tips = _tips_of((seen, role), options, frames, notes)
             surface, seams = _join(seen, tips, options, how, notes)
-        except MvestError as fault:
-            raise type(fault)(f"{label}: {fault}") from fault
         # The closed edges lie side by side all along, and are joined as far as the open ones.
         how = replace(how, seams=seams)
         derived += [f"{label}: {note}" for note in notes]
-        phases.append(_Phase(seen, role, PHASES.get(seen.phase, label), surface, tips))
+        at, load = 0.0, 0.0
+        if role is not Role.REFERENCE:
+            at, load = max(frames[-1].time + 0.01, TIMES.get(seen.phase, 0.6)), pressure
+        name = PHASES.get(seen.phase, label)
+        frames.append(FoundFrame(name, role, at, load, surface, tips))
     derived.append(
         f"surfaces drawn anew on the lines of their coordinates, edges about {options.edge_mm:g} mm"
     )
-    return phases
+    if len(frames) > 1:
+        derived.append("times: by the order of the phases in a generic cardiac cycle")
+        if options.pressure_mmHg is None:
+            derived.append(
+                f"pressure: {pressure:g} mmHg on the closed valve assumed, none on the open one; "
+                "pressure_mmHg=... states it"
+            )
+    return frames
 
 
 def _tips_of(
-    phase: _Seen, options: SlicerheartOptions, before: Sequence[_Phase], notes: list[str]
+    phase: _Seen, options: SlicerheartOptions, before: Sequence[FoundFrame], notes: list[str]
 ) -> FloatArray:
     seen, role = phase
     given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
@@ -242,13 +240,11 @@ def _join(
     options: SlicerheartOptions,
     how: Joining,
     notes: list[str],
-) -> tuple[RegionSurface, FloatArray]:
+) -> tuple[Surface, FloatArray]:
     leaflets = []
     for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
-        try:
+        with named(f"{name} leaflet"):
             leaflets.append(Leaflet.of(vertices, triangles))
-        except GeometryError as fault:
-            raise type(fault)(f"{name} leaflet: {fault}") from fault
         if leaflets[-1].holes:
             notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
     edges = np.concatenate([leaflet.curve for leaflet in leaflets])
@@ -299,65 +295,3 @@ def _check_axes(seen: SeenPhase, edges: FloatArray, down: FloatArray, mirrored: 
 
 def _rms(points: FloatArray, edges: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(cKDTree(edges).query(points)[0]))))
-
-
-def _as_case(
-    phases: Sequence[_Phase], options: SlicerheartOptions, derived: list[str]
-) -> ValveCase:
-    pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
-    if len(phases) > 1:
-        derived.append("times: by the order of the phases in a generic cardiac cycle")
-        if options.pressure_mmHg is None:
-            derived.append(
-                f"pressure: {pressure:g} mmHg on the closed valve assumed, none on the open one; "
-                "pressure_mmHg=... states it"
-            )
-    frames: list[FoundFrame] = []
-    for one in phases:
-        at, load = 0.0, 0.0
-        if one.role is not Role.REFERENCE:
-            at, load = max(frames[-1].time + 0.01, TIMES.get(one.seen.phase, 0.6)), pressure
-        frames.append(FoundFrame(one.name, one.role, at, load, one.surface, one.tips))
-    chordae = _chordae(phases[0], derived)
-    stated = {"std_mm": options.std_mm, "correlation_length_mm": CORRELATED_MM}
-    document = {
-        "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
-        "source": "SlicerHeart",
-        "regions": list(REGIONS),
-        "thickness": dict(zip(REGIONS, map(float, options.thickness), strict=True)),
-        **({} if options.std_mm is None else {"observation": stated}),
-        "derived": derived,
-    }
-    return case_of_frames(frames, document, chordae)
-
-
-def _chordae(reference: _Phase, derived: list[str]) -> list[tuple[object, ...]]:
-    """Rows of the table of chordae; none if the export has none.
-
-    Raises
-    ------
-    InputError
-        Chords begin elsewhere than at the tips.
-    """
-    seen, surface = reference.seen, reference.surface
-    if not len(seen.chords):
-        return []
-    loops = [surface.vertices[k] for k in two_loops(surface.vertices, surface.triangles)]
-    edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
-    away = np.linalg.norm(seen.chords[:, 0, None] - reference.tips, axis=2)
-    if away.min(axis=1).max() > MAX_AWAY:
-        raise InputError("chords begin elsewhere than at the papillary tips; leave out tips=...")
-    layout, insertion = ChordLayout(), seen.chords[:, 1]
-    family = np.where(cKDTree(edge).query(insertion)[0] > MARGINAL_MM, 1, 0)
-    # As stiff together as the template's, of which there may be fewer.
-    marginal = len(layout.marginal_phi) * layout.marginal_stiffness
-    basal = len(layout.basal) * layout.basal_stiffness
-    count = np.bincount(family, minlength=2)
-    each = 2 * np.array([marginal, basal]) / np.maximum(count, 1)
-    names = np.array(FAMILIES)[family]
-    columns = (away.argmin(axis=1), *insertion.T, names, seen.chord_lengths, each[family])
-    derived.append(
-        f"chordae: {len(family)} of the export, as long as there; the {count[0]} within "
-        f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
-    )
-    return list(zip(*(column.tolist() for column in columns), strict=True))

@@ -20,7 +20,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
-from mvest.exchange.surfaces import SURFACE_SUFFIXES, Mesh, read_mesh
+from mvest.exchange.surfaces import SURFACE_SUFFIXES, Surface, read_mesh
 from mvest.reading.text import numbers, one_line, read_columns
 from mvest.typing import FloatArray, IntArray
 
@@ -50,8 +50,8 @@ MUSCLES = (
 )
 """Words of the two papillary muscles, in the order of a case's tips."""
 PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
-CHORDS, ANNULUS, MARKS = {"chords", "chordae"}, {"annulus"}, {"landmarks", "labels"}
-NO_LEAFLET = PAPILLARY | CHORDS | ANNULUS | {"ventricular"}
+ANNULUS, MARKS = {"annulus"}, {"landmarks", "labels"}
+NO_LEAFLET = PAPILLARY | ANNULUS | {"chords", "chordae", "ventricular"}
 LANDMARKS = ("A", "P", "AL", "PM", "ALC", "PMC")
 _COMMON = ("Filename", "Phase", "FrameNumber", "Valve")
 _TABLES = {
@@ -106,8 +106,6 @@ class SeenPhase:
         ``(3,)`` mm by label, of `LANDMARKS`.
     tips
         ``(2, 3)`` mm, antero-lateral and postero-medial, or None.
-    chords
-        ``(c, 2, 3)`` mm from tip to insertion, with their lengths in ``chord_lengths``.
     notes
         What was assumed in reading, and what was not used.
     """
@@ -117,8 +115,6 @@ class SeenPhase:
     contour: FloatArray | None
     landmarks: dict[str, FloatArray]
     tips: FloatArray | None
-    chords: FloatArray
-    chord_lengths: FloatArray
     notes: tuple[str, ...]
 
 
@@ -211,21 +207,12 @@ def _read_phase(
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:
         notes.append(f"landmarks {', '.join(sorted(unused))} not used")
-    chords, lengths, roots = _chords([f for f in beside if f.words & CHORDS], notes)
-    if len(roots) not in (0, 2):
-        raise InputError(
-            f"{folder}: chords begin at {len(roots)} points, expected two papillary tips"
-        )
-    if len(tips) == 2:
-        roots = np.stack([tips[0], tips[1]])
     return SeenPhase(
         this.phase,
         surfaces,
         next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
         {label: known[label] for label in LANDMARKS if label in known},
-        roots if len(roots) else None,
-        chords,
-        lengths,
+        np.stack([tips[0], tips[1]]) if len(tips) == 2 else None,
         tuple(dict.fromkeys(one_line(note) for note in notes)),
     )
 
@@ -248,15 +235,15 @@ def _leaflet(
     surface = _model(fitting[0], notes)
     if not len(surface.triangles):
         raise GeometryError(f"{fitting[0].path}: no triangles; expected a surface")
-    return surface.points, surface.triangles
+    return surface.vertices, surface.triangles
 
 
-def _model(file: _File, notes: list[str]) -> Mesh:
+def _model(file: _File, notes: list[str]) -> Surface:
     """A model with its points in LPS."""
     model = read_mesh(file.path)
     if model.space is None:
         notes.append("a surface names no axes in its header, so R, A, S are assumed")
-    return replace(model, points=model.points * TO_LPS[model.space or "RAS"])
+    return replace(model, vertices=model.vertices * TO_LPS[model.space or "RAS"])
 
 
 def _table(name: str, places: Sequence[Path], this: _File) -> tuple[list[str], FloatArray]:
@@ -301,39 +288,9 @@ def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArr
     return {muscle: item.points[tip[0] if tip else 1]}
 
 
-def _chords(files: Sequence[_File], notes: list[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chords of models of lines, each from where it begins to where it ends.
-
-    A branch begins where its trunk ends. Returns chords from tip to insertion ``(c, 2, 3)``, their
-    lengths along trunk and branch ``(c,)``, and the tips ``(t, 3)``, mm.
-    """
-    found = [np.zeros((0, 2, 3))]
-    for file in files:
-        model = _model(file, notes)
-        if any(len(line) != 2 for line in model.lines):
-            raise InputError(f"{file.path}: lines of other than two points, expected one a chord")
-        found.append(model.points[np.array(model.lines, dtype=np.int64).reshape(-1, 2)])
-    segments = np.concatenate(found)
-    joints, number = np.unique(np.round(segments.reshape(-1, 3), 3), axis=0, return_inverse=True)
-    begin, end = number.reshape(-1, 2).T
-    length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
-    trunk = {int(e): k for k, e in enumerate(end)}
-    last = np.flatnonzero(~np.isin(end, begin))
-    first, total = [], []
-    for k in last.tolist():
-        way, root = {k: None}, k
-        while (before := trunk.get(int(begin[root]))) is not None and before not in way:
-            root = before
-            way[root] = None
-        first.append(root)
-        total.append(length[list(way)].sum())
-    chords = np.stack([segments[first, 0], segments[last, 1]], axis=1)
-    return chords, np.array(total), joints[np.unique(begin[first])]
-
-
 def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:
     """The curve in the middle of a tube whose points are rings one after another."""
-    points = _model(file, notes).points
+    points = _model(file, notes).vertices
     for sides in range(3, 101):
         if len(points) % sides or len(points) // sides < 8:
             continue

@@ -14,11 +14,8 @@ import yaml
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
-from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES
 from mvest.errors import MvestError
-from mvest.exchange.regions import RegionSurface
-from mvest.exchange.surfaces import write_surface
-from mvest.reading.text import write_columns
+from mvest.exchange.surfaces import Surface, write_surface
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
 
@@ -31,7 +28,7 @@ class FoundFrame:
     role: Role
     time: float
     pressure: float
-    surface: Midsurface | RegionSurface
+    surface: Midsurface | Surface
     tips: FloatArray
     thickness: FloatArray | None = None
 
@@ -39,7 +36,6 @@ class FoundFrame:
 def case_of_frames(
     frames: Sequence[FoundFrame],
     document: Mapping[str, Any],
-    chordae: Sequence[Sequence[object]] = (),
 ) -> ValveCase:
     """The case of frames without common vertices, with the checks and rules of every case.
 
@@ -49,8 +45,6 @@ def case_of_frames(
         The reference and others.
     document
         Further fields of ``case.yaml``.
-    chordae
-        Rows of a table with `CHORD_COLUMNS`, if the chordae are known.
 
     Raises
     ------
@@ -69,10 +63,6 @@ def case_of_frames(
             entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
             apart = {} if one.role is Role.REFERENCE else {"corresponds": False}
             entries.append(entry | {"pressure": float(one.pressure)} | apart)
-        if chordae:
-            write_columns(folder / "chordae.csv", CHORD_COLUMNS, chordae)
-            known = {"chordae": {"file": "chordae.csv", "families": list(FAMILIES)}}
-            document = {**document, **known}
         units = {"length": "mm", "pressure": "mmHg", "time": "s"}
         whole = {"version": 1, "units": units, **document, "frames": entries}
         text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)

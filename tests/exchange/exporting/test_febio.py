@@ -224,7 +224,6 @@ def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, u
         ({"contact_gap_mm": 2.0}, "gap < reach"),
         ({"law": "mooney"}, "orthotropic, neo-hookean"),
         ({"mesh": "voxels"}, "structured, tetwild"),
-        ({"steps": 0}, ">= 1"),
     ],
 )
 def test_what_is_wrong_is_said(folder, tmp_path, given, words):

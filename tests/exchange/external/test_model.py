@@ -160,12 +160,8 @@ def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
         ("sys.exit('out of licences')", "exit status 1; its last words: out of licences"),
         ("time.sleep(60)", "stopped at the time limit of 0.5 s"),
         ("response.unlink()", "response.json is missing"),
-        ("response.write_text(response.read_text()[:9])", "response.json is not JSON"),
-        ("observation.unlink()", "observation.csv is missing"),
-        ("observation.write_text('x,y,z\\n1,2,3\\n')", "1 rows, expected 2"),
         ("observation.write_text('x,y,z\\n1,2,3\\n4,nan,6\\n')", "'nan'"),
         ("jacobian.write_text('k1\\n' + '1\\n' * 6)", "jacobian.csv: columns k1"),
-        ("jacobian.write_text('k1,k2\\n' + '1,2\\n' * 2)", "jacobian.csv: 2 rows, expected 6"),
     ],
 )
 def test_whatever_goes_wrong_is_the_reason_of_a_failed_prediction(tmp_path, body, message):
@@ -219,7 +215,7 @@ def test_inadmissible_differences_are_refused(settings, message):
 
 def test_an_inadmissible_model_is_refused_before_anything_runs(tmp_path):
     command = Command((sys.executable,))
-    with pytest.raises(InputError, match="2 names, 1 units"):
+    with pytest.raises(InputError, match="k1, k2 in MPa; expected different"):
         ProcessModel(command, tmp_path, NAMES, 2, units=("MPa",))
     with pytest.raises(ConfigurationError, match="points"):
         ProcessModel(command, tmp_path, NAMES, 2, points=np.zeros((3, 3)))

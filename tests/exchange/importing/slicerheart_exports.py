@@ -223,11 +223,8 @@ def batch_export(folder: Path, case, scene="P001", *, voxel_mm=None, **how) -> P
     return folder
 
 
-def fem_export(folder: Path, frame, chordae, *, branched=False) -> Path:
-    """What ValveFemExport writes of one frame: shells, the tube of the annulus, bundles of chords.
-
-    A bundle is a model of lines with two points each. Branched chords part 3.5 mm before they end.
-    """
+def fem_export(folder: Path, frame) -> Path:
+    """What ValveFemExport writes of one frame: shells and the tube of the annulus."""
     folder.mkdir(parents=True)
     for label, (name, thickness) in enumerate(THICKNESS.items()):
         model = atrial_leaflet(frame, label, thickness)
@@ -240,18 +237,6 @@ def fem_export(folder: Path, frame, chordae, *, branched=False) -> Path:
     tube.CappingOff()
     path = run(polyline(ring), tube, vtk.vtkTriangleFilter())
     write_model(folder / "AnnulusContourModel.vtk", path, binary=False)
-    for half, bundle in ((chordae.tip == 0, "primary"), (chordae.tip == 1, "secondary")):
-        segments = []
-        for tip, end in zip(chordae.tip[half], chordae.insertion[half], strict=True):
-            start, end = in_lps(frame.papillary_tips[tip]), in_lps(end)
-            fork = end - 3.5 * (end - start) / np.linalg.norm(end - start)
-            segments += [(start, fork), (fork, end)] if branched else [(start, end)]
-        lines = vtk.vtkAppendPolyData()
-        for segment in segments:
-            lines.AddInputData(polyline(np.array(segment)))
-        lines.Update()
-        file = folder / f"Chords_mesh_-_mitral_anterior_leaflet-{bundle}.vtk"
-        write_model(file, lines.GetOutput(), binary=False)
     return folder
 
 

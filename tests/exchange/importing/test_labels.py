@@ -23,7 +23,6 @@ from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.segmented import segmentation_std
 from mvest.valve.geometry.thickening import thicken
 from tests.exchange.importing.voxelised import small_valve, voxelised, write_slicer
-from tests.places import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -280,37 +279,6 @@ def test_whatever_is_imported_can_be_thickened(
     write_case(tmp_path / "case", imported)
     again = read_case(tmp_path / "case")
     assert np.sqrt(np.mean(_distances(again, valve)[0] ** 2)) < 0.15
-
-
-FIELD_TIPS = (-16.0, -0.24, -25.0, 16.0, -0.24, -25.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "given"),
-    [
-        ("mvseg_posterior1_anterior2.nii.gz", {}),
-        ("scene_mitral_frame_3_MD_anterior_leaflet.nrrd", {}),
-        ("overlapping.seg.nrrd", {}),
-        ("overlapping_empty_layer.seg.nrrd", {}),
-        ("sparse4d_ms.nii.gz", {"pressure_mmHg": 110.0}),
-        ("full4d_default_times.nii.gz", {}),
-        ("int64_labels.nrrd", {}),
-        ("child_cropped.nii.gz", {}),
-    ],
-)
-def test_label_maps_of_the_field(name: str, given: dict[str, Any], tmp_path: Path) -> None:
-    path = ROOT.parent / "shared" / "data" / "field_inputs" / name
-    if not path.is_file():
-        pytest.skip(f"needs {path}")
-    imported = import_leaflets(path, LeafletsOptions(tips=FIELD_TIPS, **given))
-    thicken(imported.surface)
-    centres = imported.surface.vertices[imported.surface.triangles].mean(axis=1)
-    # The anterior leaflet is the one at y > 0.
-    middles = [centres[imported.surface.region == k, 1].mean() for k in (0, 1)]
-    assert middles[0] > 2.0 > -2.0 > middles[1]
-    write_case(tmp_path / "case", imported)
-    assert len(read_case(tmp_path / "case").frames) == 1 + bool(given)
 
 
 def test_leaflets_that_do_not_meet_are_refused(

@@ -23,10 +23,8 @@ from tests.exchange.importing.slicerheart_exports import (
     fem_export,
     in_lps,
     vtk,
-    vtk_to_numpy,
     write_model,
 )
-from tests.places import field_input
 
 OPTIONS = SlicerheartOptions(pressure_mmHg=120.0)
 TRUTH = template_case(64, 16)
@@ -137,7 +135,7 @@ def test_the_annulus_alone_tells_the_commissures(folder, case, tmp_path, as_mode
     if as_model:
         (folder / "AnnulusContourPoints.csv").unlink()
         for role, stem in ((Role.REFERENCE, "frame_3_MD"), (Role.CLOSED, "frame_12_MS")):
-            fem = fem_export(tmp_path / stem, TRUTH.frame(role), TRUTH.chordae)
+            fem = fem_export(tmp_path / stem, TRUTH.frame(role))
             (fem / "AnnulusContourModel.vtk").rename(folder / f"P001_mitral_{stem}_annulus.vtk")
     found = import_slicerheart(folder, OPTIONS)
     assert "commissures where the leaflet nearer to the annulus changes" in " | ".join(
@@ -216,21 +214,6 @@ def test_points_that_are_not_used_are_said(folder, case):
     assert "MS: landmarks APEX not used" in found.derived
 
 
-def test_a_folder_of_april_2026_is_read_as_vtk_reads_it():
-    folder = field_input("slicerheart_apr2026")
-    found = import_slicerheart(folder, SlicerheartOptions())
-    assert [frame.name for frame in found.frames] == ["mid-diastole", "mid-systole"]
-    for frame, phase in zip(found.frames, ("MD", "MS"), strict=True):
-        for leaflet, half_thickness in (("anterior", 0.66), ("posterior", 0.63)):
-            (file,) = folder.glob(f"*_{phase}_mitral_{leaflet}_leaflet.vtk")
-            reader = vtk.vtkPolyDataReader()
-            reader.SetFileName(str(file))
-            reader.Update()
-            points = vtk_to_numpy(reader.GetOutput().GetPoints().GetData()).astype(float)
-            off = closest_points(points, frame.vertices, frame.triangles).distance
-            assert np.median(off) == pytest.approx(half_thickness, abs=0.05)
-
-
 def refused(folder, words, kind=InputError, **options):
     with pytest.raises(kind, match=words) as caught:
         import_slicerheart(folder, SlicerheartOptions(**options))
@@ -294,32 +277,12 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
 
 
-@pytest.mark.parametrize("branched", [False, True])
-def test_a_folder_of_valve_fem_export_brings_its_chords(tmp_path, branched):
-    reference = TRUTH.frame(Role.REFERENCE)
-    fem = fem_export(tmp_path / "fem", reference, TRUTH.chordae, branched=branched)
-    case = import_slicerheart(fem, SlicerheartOptions())
-    assert [frame.role for frame in case.frames] == [Role.REFERENCE]
-    assert np.sqrt(np.mean(away(case.frame(Role.REFERENCE), reference) ** 2)) < 0.05
-    assert len(case.chordae) == len(TRUTH.chordae)
-    expected = np.linalg.norm(
-        TRUTH.chordae.insertion - reference.papillary_tips[TRUTH.chordae.tip], axis=1
-    )
-    # Files of text have six digits.
-    assert np.sort(case.chordae.rest_length) == pytest.approx(np.sort(expected), abs=1e-2)
-    marginal = TRUTH.chordae.family_names.index("marginal")
-    assert (case.chordae.family == 0).sum() == (TRUTH.chordae.family == marginal).sum()
-    assert case.chordae.axial_stiffness.sum() == pytest.approx(TRUTH.chordae.axial_stiffness.sum())
-    tips = in_lps(reference.papillary_tips)
-    found = case.frame(Role.REFERENCE).papillary_tips
-    assert np.abs(found[:, None] - tips).sum(axis=2).min(axis=1).max() < 1e-2
-
-
-def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(tmp_path):
-    folders = [
-        fem_export(tmp_path / frame.name, frame, TRUTH.chordae)
-        for frame in (TRUTH.frame(Role.REFERENCE), TRUTH.frame(Role.CLOSED))
-    ]
-    options = SlicerheartOptions(closed=str(folders[1]), pressure_mmHg=100.0)
+def test_two_folders_of_valve_fem_export_are_the_open_and_the_closed_frame(tmp_path):
+    frames = [TRUTH.frame(Role.REFERENCE), TRUTH.frame(Role.CLOSED)]
+    folders = [fem_export(tmp_path / frame.name, frame) for frame in frames]
+    tips = frames[0].papillary_tips
+    tips = tuple(in_lps(tips[np.argsort(tips[:, 0])]).ravel())
+    options = SlicerheartOptions(closed=str(folders[1]), pressure_mmHg=100.0, tips=tips)
     case = import_slicerheart(folders[0], options)
-    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), TRUTH.frame(Role.CLOSED)) ** 2)) < 0.05
+    for frame in frames:
+        assert np.sqrt(np.mean(away(case.frame(frame.role), frame) ** 2)) < 0.05

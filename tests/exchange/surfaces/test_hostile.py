@@ -5,8 +5,6 @@ import struct
 import zlib
 
 import pytest
-from vtkmodules import vtkIOLegacy, vtkIOXML
-from vtkmodules.vtkFiltersCore import vtkAppendFilter
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.surfaces import read_surface
@@ -16,13 +14,8 @@ from tests.exchange.surfaces.test_formats import (
     POINTS,
     STL,
     TRIANGLES,
-    output,
     ply,
-    sphere,
-    written,
 )
-
-__all__ = ["sphere"]
 
 LEGACY = "# vtk DataFile Version {}\nx\nASCII\nDATASET POLYDATA\nPOINTS {} float\n{}"
 THREE = LEGACY.format("4.2", 3, "0 0 0 1 0 0 0 1 0\n")
@@ -55,10 +48,6 @@ def bomb(size):
     }
 
 
-ENTITIES = '<!DOCTYPE l [<!ENTITY a "{}">{}]>'.format(
-    "9 " * 1000,
-    "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 20}">' for k in range(8)),
-)
 OUTSIDE = '<!DOCTYPE l [<!ENTITY x SYSTEM "next.vtp">]>'
 VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 ASCII_PLY = ply("ascii", TRIANGLES.tolist()).decode()
@@ -98,9 +87,7 @@ ASCII_PLY = ply("ascii", TRIANGLES.tolist()).decode()
         ("a.vtp", xml(corners="0 1 3"), "points that do not exist"),
         ("a.vtp", xml(offsets="900"), "damaged"),
         ("a.vtp", xml(places="0 0 0 1 x 0"), "damaged"),
-        ("a.vtp", xml(**bomb(2**40)), "damaged"),
         ("a.vtp", xml(**bomb(36)), "damaged"),
-        ("a.vtp", xml(doctype=ENTITIES, places="&i;"), "damaged: Error parsing XML"),
         ("a.vtp", xml(doctype=OUTSIDE, places="&x;"), "damaged"),
         ("a.stl", "", "0 bytes, expected 84"),
         ("a.stl", bytes(80) + b"\xff\xff\xff\xff" + BINARY, "expected 214748364834 for"),
@@ -141,37 +128,6 @@ def test_a_missing_file_is_named(tmp_path):
         read_surface(tmp_path / "a.stl")
 
 
-def cut(path, share):
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    return path
-
-
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.3, 0.6, 0.8, 0.95])
-@pytest.mark.parametrize("kind", ["vtk 42 1", "vtk 42 2", "vtk 51 1", "vtk 51 2", "vtp", "vtu"])
-def test_what_is_cut_off_is_refused(tmp_path, sphere, kind, share):
-    suffix, *version = kind.split()
-    path = tmp_path / f"a.{suffix}"
-    if version:
-        settings = {"FileVersion": int(version[0]), "FileType": int(version[1])}
-        written(vtkIOLegacy.vtkPolyDataWriter(), path, sphere, **settings)
-    elif suffix == "vtp":
-        written(vtkIOXML.vtkXMLPolyDataWriter(), path, sphere)
-    else:
-        grid = output(vtkAppendFilter(), sphere)
-        written(vtkIOXML.vtkXMLUnstructuredGridWriter(), path, grid)
-    with pytest.raises((InputError, GeometryError)):
-        read_surface(cut(path, share))
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-@pytest.mark.parametrize("share", [0.1, 0.7, 0.9])
-def test_a_ply_file_that_is_cut_off_is_refused(tmp_path, form, share):
-    (tmp_path / "a.ply").write_bytes(ply(form, TRIANGLES.tolist()))
-    with pytest.raises(InputError):
-        read_surface(cut(tmp_path / "a.ply", share))
-
-
 def spoilt(change):
     file = Glb()
     file.node("valve", mesh=file.mesh(POINTS, TRIANGLES))
@@ -200,9 +156,6 @@ def test_scenes_that_are_damaged_or_packed_otherwise(change, message, tmp_path):
         read_surface(path)
 
 
-def test_a_scene_of_another_version_or_cut_off(tmp_path):
-    file = spoilt(lambda _: None)
+def test_a_scene_of_another_version(tmp_path):
     with pytest.raises(InputError, match="only GLTF 2"):
-        read_surface(file.write(tmp_path / "a.glb", version=1))
-    with pytest.raises(InputError, match="damaged"):
-        read_surface(cut(file.write(tmp_path / "b.glb"), 0.95))
+        read_surface(spoilt(lambda _: None).write(tmp_path / "a.glb", version=1))

@@ -7,10 +7,10 @@ import nibabel
 import nrrd
 import numpy as np
 import pytest
-import SimpleITK
 
 from mvest.errors import InputError
-from mvest.exchange.volumes import LabelMap, Segment, read_labels, read_volume
+from mvest.exchange._images import Segment
+from mvest.exchange.volumes import LabelMap, read_labels, read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange.volumes import test_metaimage, test_nifti, test_philips
 from tests.exchange.volumes import volumes as v
@@ -74,66 +74,12 @@ def test_layers_of_a_segmentation(tmp_path: Path) -> None:
     )
 
 
-def test_layers_as_slicerio_writes_them(tmp_path: Path) -> None:
-    slicerio = pytest.importorskip("slicerio")
-    place = np.eye(4)
-    place[:3, :3], place[:3, 3] = v.MIRRORED * v.SPACING, v.ORIGIN
-    segments = [
-        {"id": f"s{layer}", "name": f"leaflet {layer}", "labelValue": label, "layer": layer}
-        for layer, label in ((0, 1), (2, 2))
-    ]
-    made = {"voxels": labels(), "ijkToLPS": place, "segments": segments}
-    slicerio.write_segmentation(str(tmp_path / "a.seg.nrrd"), made)
-    found = read_labels(tmp_path / "a.seg.nrrd")
-    np.testing.assert_array_equal(found.frames, labels())
-    assert_placed(found, v.MIRRORED)
-    assert found.is_layers
-    assert found.segments == (Segment("leaflet 0", "|", 1, 0), Segment("leaflet 2", "|", 2, 2))
-
-
-def test_layers_of_slicer_before_4_11(tmp_path: Path) -> None:
-    """It wrote neither layer nor label: each segment has a layer of its own, and the label 1."""
-    names = {f"Segment{n}_Name": f"part {n}" for n in range(3)}
-    found = write_layers(tmp_path / "a.seg.nrrd", labels(), **names)
-    assert [(s.label, s.layer) for s in found.segments] == [(1, 0), (1, 1), (1, 2)]
-
-
-def test_segments_of_one_layer(tmp_path: Path) -> None:
-    path = tmp_path / "a.seg.nrrd"
-    header = PLACE | {"Segment0_Name": "a", "Segment1_Name": "b", "Segment1_LabelValue": "5"}
-    nrrd.write(str(path), labels()[0], header)
-    found = read_labels(path)
-    assert not found.is_layers
-    assert [(s.label, s.layer) for s in found.segments] == [(1, 0), (5, 0)]
-
-
 @pytest.mark.parametrize(
     ("key", "value"), [("Segment0_Layer", "3"), ("Segment0_LabelValue", "1.5")]
 )
 def test_a_segment_that_cannot_be(tmp_path: Path, key: str, value: str) -> None:
     with pytest.raises(InputError, match=rf"a\.seg\.nrrd: {key}: '{value}', expected a number"):
         write_layers(tmp_path / "a.seg.nrrd", labels(), **{key: value})
-
-
-@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "int32", "int64", "float32"])
-@pytest.mark.parametrize("kind", ["nrrd", "nii.gz", "mha"])
-def test_labels_of_any_type(tmp_path: Path, kind: str, dtype: str) -> None:
-    path, voxels = tmp_path / f"a.{kind}", labels(dtype)[0]
-    if kind == "nii.gz":
-        made = nibabel.Nifti1Image(voxels, test_nifti.affine(v.MIRRORED), dtype=dtype)
-        nibabel.save(made, path)
-    else:
-        image = SimpleITK.GetImageFromArray(np.ascontiguousarray(voxels.T))
-        image.SetSpacing(v.SPACING.tolist())
-        image.SetDirection(v.MIRRORED.ravel().tolist())
-        image.SetOrigin(v.ORIGIN.tolist())
-        SimpleITK.WriteImage(image, str(path))
-    found = read_labels(path)
-    np.testing.assert_array_equal(found.frames, labels()[:1])
-    assert found.frames.dtype.kind in "iu"
-    assert found.segments == ()
-    assert not found.is_layers
-    assert_placed(found, v.MIRRORED)
 
 
 def test_frames_over_time_may_be_empty_and_without_a_unit(tmp_path: Path) -> None:

@@ -33,34 +33,15 @@ def read(path: Path, time_unit: str | None = "s") -> VolumeSequence:
 
 
 @pytest.mark.parametrize("name", ["a.mha", "a.mhd"])
-@pytest.mark.parametrize("compress", [False, True])
-@pytest.mark.parametrize("direction", [v.ROTATION, v.MIRRORED], ids=["right", "left"])
-def test_what_simpleitk_writes(
-    tmp_path: Path, name: str, compress: bool, direction: np.ndarray
-) -> None:
-    expected = write(tmp_path / name, direction=direction, compress=compress)
+def test_a_left_handed_volume_stays_left_handed(tmp_path: Path, name: str) -> None:
+    expected = write(tmp_path / name, direction=v.MIRRORED, compress=True)
     v.assert_same(read(tmp_path / name), expected)
-
-
-@pytest.mark.parametrize("dtype", ["int16", "float32", "uint16"])
-def test_types_of_voxels(tmp_path: Path, dtype: str) -> None:
-    expected = write(tmp_path / "a.mha", dtype)
-    v.assert_same(read(tmp_path / "a.mha"), expected)
 
 
 def test_the_unit_of_time_is_asked_for(tmp_path: Path) -> None:
     write(tmp_path / "a.mha")
     with pytest.raises(InputError, match=r"a\.mha: ElementSpacing: times without a unit"):
         read(tmp_path / "a.mha", time_unit=None)
-
-
-def test_three_axes_are_one_frame(tmp_path: Path) -> None:
-    stored = np.ascontiguousarray(v.frames()[0].T)
-    image = SimpleITK.GetImageFromArray(stored)
-    image.SetSpacing(v.SPACING.tolist())
-    SimpleITK.WriteImage(image, str(tmp_path / "a.mha"))
-    found = read(tmp_path / "a.mha", time_unit=None)
-    np.testing.assert_array_equal(found.frames, v.frames()[:1])
 
 
 BAD = {
@@ -103,8 +84,4 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
     text, count = re.subn(pattern, replacement, (head + mark).decode(), count=1)
     assert count == 1
     path.write_bytes(text.encode() + voxels)
-    with pytest.raises(InputError) as caught:
-        read(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: {field}")
-    assert "\n" not in message
+    v.assert_refused(path, field, modality=Modality.ULTRASOUND, time_unit="s")

@@ -41,20 +41,12 @@ def read(path: Path) -> VolumeSequence:
     return read_volume(path, modality=Modality.MR)
 
 
-@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
-@pytest.mark.parametrize("direction", [v.ROTATION, v.MIRRORED], ids=["right", "left"])
-def test_what_nibabel_writes(tmp_path: Path, name: str, kind: Any, direction: np.ndarray) -> None:
-    nibabel.save(image(v.frames(), kind, direction), tmp_path / name)
-    found = read(tmp_path / name)
-    v.assert_same(found, expected(direction=direction))
-    assert found.modality is Modality.MR
-
-
-def test_direction_of_a_quaternion(tmp_path: Path) -> None:
+@pytest.mark.parametrize("of", ["sform", "qform"])
+def test_a_left_handed_volume_stays_left_handed(tmp_path: Path, of: str) -> None:
     made = image(v.frames(), direction=v.MIRRORED)
-    made.set_qform(affine(v.MIRRORED), "scanner")
-    made.set_sform(None, "unknown")
+    if of == "qform":
+        made.set_qform(affine(v.MIRRORED), "scanner")
+        made.set_sform(None, "unknown")
     nibabel.save(made, tmp_path / "a.nii")
     v.assert_same(read(tmp_path / "a.nii"), expected(direction=v.MIRRORED))
 
@@ -65,8 +57,6 @@ def test_scaled_voxels_have_their_values(tmp_path: Path) -> None:
     nibabel.save(made, tmp_path / "a.nii")
     found = read(tmp_path / "a.nii").frames
     assert found.dtype == np.float32
-    again = np.moveaxis(np.asarray(nibabel.load(tmp_path / "a.nii").dataobj), 3, 0)
-    np.testing.assert_array_equal(found, again)
     np.testing.assert_array_equal(found, 2 * v.frames("int16") - 1024)
 
 
@@ -96,11 +86,6 @@ def test_no_times_at_all(tmp_path: Path) -> None:
     nibabel.save(made, tmp_path / "a.nii")
     with pytest.raises(InputError, match=r"a\.nii: pixdim\[4\].*: no times of frames"):
         read(tmp_path / "a.nii")
-
-
-def test_three_axes_are_one_frame(tmp_path: Path) -> None:
-    nibabel.save(nibabel.Nifti1Image(v.frames()[0], affine()), tmp_path / "a.nii.gz")
-    np.testing.assert_array_equal(read(tmp_path / "a.nii.gz").frames, v.frames()[:1])
 
 
 def sheared(header: Any) -> None:
@@ -138,12 +123,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
     header = nibabel.Nifti1Header(content[:348])
     change(header)
     path.write_bytes(header.binaryblock + content[348:])
-    with pytest.raises(InputError) as caught:
-        read(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: {field}")
-    assert words in message.partition(", expected ")[2]
-    assert "\n" not in message
+    v.assert_refused(path, field, words, modality=Modality.MR)
 
 
 def test_something_else_compressed_is_refused(tmp_path: Path) -> None:

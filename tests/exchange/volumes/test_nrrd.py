@@ -3,11 +3,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import SimpleITK
 
 from mvest.errors import InputError
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
+from tests.exchange.volume_variants import by_itk
 from tests.exchange.volumes import volumes as v
 
 VALUES = "axis 0 index values"
@@ -18,24 +18,14 @@ def read(path: Path) -> VolumeSequence:
     return read_volume(path, modality=Modality.ULTRASOUND)
 
 
-@pytest.mark.parametrize("encoding", ["raw", "gzip"])
-@pytest.mark.parametrize("axis", [0, 1, 3])
-def test_the_frames_may_lie_along_any_axis(tmp_path: Path, axis: int, encoding: str) -> None:
-    fields = v.nrrd_fields(axis) | {"encoding": encoding}
-    path = v.write_nrrd(tmp_path / "a.seq.nrrd", fields, v.nrrd_voxels(axis))
+def test_the_frames_may_lie_along_any_axis(tmp_path: Path) -> None:
+    fields = v.nrrd_fields(1) | {"encoding": "gzip"}
+    path = v.write_nrrd(tmp_path / "a.seq.nrrd", fields, v.nrrd_voxels(1))
     found = read(path)
     v.assert_same(found, v.sequence())
     assert found.frames.flags.c_contiguous
     assert found.source == "a.seq.nrrd"
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def test_a_limit_of_bytes_can_be_stated(tmp_path: Path) -> None:
-    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields())
-    size = v.frames().size
-    assert read_volume(path, modality=Modality.MR, max_bytes=size).frames.size == size
-    with pytest.raises(InputError, match=r"a\.nrrd: sizes: .* expected at most"):
-        read_volume(path, modality=Modality.MR, max_bytes=size - 1)
 
 
 def test_the_content_counts_and_not_the_name(tmp_path: Path) -> None:
@@ -52,7 +42,6 @@ def test_a_left_handed_volume_stays_left_handed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("space", "signs"),
     [
-        ("right-anterior-superior", (-1, -1, 1)),
         ("RAS", (-1, -1, 1)),
         ("LAS", (1, -1, 1)),
         ("LPS", (1, 1, 1)),
@@ -77,22 +66,6 @@ def test_carriage_returns_before_the_ends_of_lines(tmp_path: Path) -> None:
     v.assert_same(read(path), v.sequence())
 
 
-def test_milliseconds(tmp_path: Path) -> None:
-    fields = v.nrrd_fields() | {
-        "units": '"ms" "" "" ""',
-        "axis 0 index values=": "0 30 80",
-    }
-    np.testing.assert_allclose(read(v.write_nrrd(tmp_path / "a.nrrd", fields)).times, v.TIMES)
-
-
-def test_times_of_a_multivolume(tmp_path: Path) -> None:
-    fields = v.nrrd_fields()
-    del fields["axis 0 index values="], fields["axis 0 index type="], fields["units"]
-    fields["MultiVolume.FrameLabels="] = "0,30,80"
-    fields["MultiVolume.FrameIdentifyingDICOMTagUnits="] = "ms"
-    np.testing.assert_allclose(read(v.write_nrrd(tmp_path / "a.nrrd", fields)).times, v.TIMES)
-
-
 def test_time_as_an_axis_of_the_world(tmp_path: Path) -> None:
     fields = v.nrrd_fields(3)
     steps = (v.ROTATION * v.SPACING).T
@@ -110,22 +83,10 @@ def test_time_as_an_axis_of_the_world(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.frames, v.frames())
 
 
-def test_a_volume_over_time_as_itk_writes_it(tmp_path: Path) -> None:
-    """Four axes of "space dimension: 4" without a space, which is LPS, nor a unit of time."""
-    image = SimpleITK.GetImageFromArray(
-        np.ascontiguousarray(v.frames().transpose(0, 3, 2, 1)), isVector=False
-    )
-    whole = np.eye(4)
-    whole[:3, :3] = v.ROTATION
-    image.SetDirection(whole.ravel())
-    image.SetSpacing([*v.SPACING, 0.04])
-    image.SetOrigin([*v.ORIGIN, 0.5])
-    SimpleITK.WriteImage(image, str(tmp_path / "a.nrrd"))
+def test_a_volume_over_time_by_itk_has_no_unit_of_time(tmp_path: Path) -> None:
+    by_itk(tmp_path / "a.nrrd", "4D", "uint8", "plain")
     with pytest.raises(InputError, match=r"space directions: times without a unit.*time_unit"):
         read(tmp_path / "a.nrrd")
-    found = read_volume(tmp_path / "a.nrrd", modality=Modality.MR, time_unit="s")
-    times = np.array([0.5, 0.54, 0.58])
-    v.assert_same(found, VolumeSequence(v.frames(), v.SPACING, v.ROTATION, v.ORIGIN, times))
 
 
 def test_frames_that_are_named_take_the_users_interval(tmp_path: Path) -> None:
@@ -153,25 +114,6 @@ def test_times_without_a_unit_take_the_users(tmp_path: Path) -> None:
         read(path)
 
 
-def single(encoding: str = "raw") -> tuple[dict[str, str], bytes]:
-    fields = v.nrrd_fields() | {"encoding": encoding, "dimension": "3"}
-    steps = (v.ROTATION * v.SPACING).T
-    fields |= {
-        "sizes": " ".join(map(str, v.SHAPE[1:])),
-        "kinds": "domain domain domain",
-        "space directions": " ".join(v.vector(step) for step in steps),
-    }
-    for name in ("labels", "units", "axis 0 index values=", "axis 0 index type="):
-        del fields[name]
-    return fields, v.frames()[1].tobytes(order="F")
-
-
-def test_three_axes_are_one_frame_at_zero(tmp_path: Path) -> None:
-    found = read(v.write_nrrd(tmp_path / "a.nrrd", *single()))
-    np.testing.assert_array_equal(found.frames, v.frames()[1:2])
-    assert found.times.tolist() == [0.0]
-
-
 @pytest.mark.parametrize("encoding", ["raw", "gzip"])
 def test_data_beside_their_header(tmp_path: Path, encoding: str) -> None:
     fields = v.nrrd_fields() | {"encoding": encoding, "data file": "./a.bin"}
@@ -186,15 +128,6 @@ def test_data_beside_their_header(tmp_path: Path, encoding: str) -> None:
     assert found.sha256 == hashlib.sha256(both).hexdigest()
 
 
-def test_a_detached_header_without_an_empty_line_at_its_end(tmp_path: Path) -> None:
-    """As ITK, SimpleITK and 3D Slicer write it."""
-    made = SimpleITK.GetImageFromArray(np.ascontiguousarray(v.frames()[0].T))
-    made.SetSpacing(v.SPACING.tolist())
-    SimpleITK.WriteImage(made, str(tmp_path / "a.nhdr"))
-    assert b"\n\n" not in (tmp_path / "a.nhdr").read_bytes()
-    np.testing.assert_array_equal(read(tmp_path / "a.nhdr").frames, v.frames()[:1])
-
-
 def test_bytes_and_lines_before_the_data_are_skipped(tmp_path: Path) -> None:
     (tmp_path / "a.raw").write_bytes(b"one line\n12345" + v.nrrd_voxels())
     path = tmp_path / "a.nhdr"
@@ -206,12 +139,10 @@ def test_bytes_and_lines_before_the_data_are_skipped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stored", "endian", "kind"),
     [
-        ("uint8", "little", "uint8"),
         ("int8", "little", "int16"),
         ("int16", "big", "int16"),
         ("uint16", "little", "int16"),
         ("int32", "big", "int16"),
-        ("float32", "big", "float32"),
         ("float64", "little", "float32"),
     ],
 )
@@ -300,13 +231,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, what: str) -> None:
     changes, field, expected = BAD[what]
     fields = {k: value for k, value in (v.nrrd_fields() | changes).items() if value is not None}
     path = v.write_nrrd(tmp_path / "bad.nrrd", fields)
-    with pytest.raises(InputError) as caught:
-        read(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: {field}: ")
-    assert expected in message.partition(", expected ")[2]
-    assert "\n" not in message
-    assert len(message) < 700
+    v.assert_refused(path, f"{field}: ", expected, modality=Modality.ULTRASOUND)
 
 
 def test_a_data_file_that_is_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:

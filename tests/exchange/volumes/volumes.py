@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import gzip
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mvest.errors import InputError
+from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import VolumeSequence
 
 SHAPE = (3, 20, 24, 28)
@@ -87,3 +91,14 @@ def assert_same(found: VolumeSequence, expected: VolumeSequence) -> None:
     corner = np.array(found.frames.shape[1:]) - 1.0
     np.testing.assert_allclose(found.world(corner), expected.world(corner), rtol=0, atol=1e-4)
     np.testing.assert_allclose(found.index(found.world(corner)), corner, rtol=0, atol=1e-9)
+
+
+def assert_refused(path: Path, field: str, expected: str = "", **given: Any) -> None:
+    """In one line that names the file, the field, and what was expected of it."""
+    with pytest.raises(InputError) as caught:
+        read_volume(path, **given)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: {field}")
+    assert expected in message.partition(", expected ")[2]
+    assert "\n" not in message
+    assert len(message) < 700

@@ -108,8 +108,14 @@ def _on_grid(x, at):
 
 def with_cell_data(suffix):
     def save(folder, name, points, triangles, region):
-        write_surface(folder / f"{name}{suffix}", points, triangles, None, {"region": region})
-        return f"{name}{suffix}"
+        file = folder / f"{name}{suffix}"
+        if suffix == ".vtp":
+            write_surface(file, points, triangles, None, {"region": region})
+        else:
+            meshio.Mesh(points, [("triangle", triangles)], cell_data={"region": [region]}).write(
+                file
+            )
+        return file.name
 
     return save
 
