@@ -10,7 +10,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
-from mvest.exchange.surfaces import SurfaceFile, region_arrays, write_surface_series
+from mvest.exchange.surfaces import Surface, region_arrays, write_surface_series
 from mvest.files import write_atomically
 from mvest.imaging.valve_sequence import (
     ANNULUS_LABELS,
@@ -154,7 +154,7 @@ def write_surfaces(folder: Path, sequence: ValveSequence) -> Path:
     layout, std = sequence.layout, sequence.std_mm
     cells = region_arrays(layout.region, layout.region_names)
     states = [
-        SurfaceFile(x, layout.triangles, {"confidence": confidence, "std_mm": std}, cells)
+        Surface(x, layout.triangles, {"confidence": confidence, "std_mm": std}, cells)
         for x, confidence in zip(sequence.vertices, sequence.vertex_confidence, strict=True)
     ]
     return write_surface_series(folder / "valve.pvd", sequence.times.tolist(), states)
