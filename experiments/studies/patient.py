@@ -189,6 +189,7 @@ def summary(results: Results) -> dict[str, Table]:
             "verdicts": verdict_table(estimates),
             "moduli": skill_table("scenario, modulus", _by_name(grouped)),
             "grounds": _grounds(estimates),
+            "estimates": _estimates(patients),
         }
     distances = _distance_rows(patients)
     moduli = {name: [own for own in each if own.is_modulus] for name, each in groups.items()}
@@ -198,6 +199,7 @@ def summary(results: Results) -> dict[str, Table]:
             "moduli": skill_table("estimation", moduli),
             "verdicts": verdict_table(estimates),
             "distances": _distances(distances),
+            "estimates": _estimates(patients),
         }
     return {
         "table_2": _table2(patients),
@@ -368,6 +370,40 @@ def _narrower(estimates: Sequence[EstimateRecord]) -> Table:
     ordered = sorted(shares.items(), key=lambda item: -mean(item[1]))
     rows = [{"if known": what, "narrower by": 100 * mean(each)} for what, each in ordered]
     return table(rows, **{"if known": "", "narrower by": "%:.0f"})
+
+
+def _estimates(patients: Patients) -> Table:
+    """A row for each patient, way to estimate and unknown: the tidy table for programs."""
+    rows = []
+    for record, estimate in patients:
+        innovation, verdict = estimate.innovation, estimate.verdict
+        grounds = () if verdict is None else verdict.grounds
+        for way_name, way in _ways(estimate):
+            for own in way.parameters:
+                z = score(own)
+                rows.append(
+                    {
+                        "patient": estimate.case,
+                        "scenario": _scenario(record),
+                        "seed": record.provenance.seed,
+                        "estimation": way_name,
+                        "status": way.status,
+                        "verdict": trust_of(estimate),
+                        "unknown": own.name,
+                        "unit": own.unit,
+                        "truth": own.truth,
+                        "std": own.std,
+                        **interval("estimate", own),
+                        **interval(PRIOR, prior_alone(own)),
+                        "off by SD": z,
+                        "truth in posterior": None if z is None else float(norm.cdf(z)),
+                        "NEES": record.numbers.get("nees"),
+                        "NIS": innovation and innovation.nis / innovation.size,
+                        "grounds": "; ".join(f"{one.check}: {one.text}" for one in grounds),
+                        "ended": way.reason,
+                    }
+                )
+    return table(rows)
 
 
 def _scenarios(scenarios: Mapping[str, Patients]) -> Table:

@@ -130,7 +130,10 @@ def doubts(case: ValveCase) -> tuple[Doubt, ...]:
         expected = RANGES[name]
         if not expected.holds(value):
             text = f"{what} is {f'{value:.3g} {expected.unit}'.rstrip()}, expected {expected}"
-            found.append(Doubt(field, f"{text}: {hint}" if hint else text, mistake=bool(hint)))
+            # Single vertices that were seen elsewhere are no mistake of the whole case: with one in
+            # fifty of them, 38 of 40 intervals held.
+            mistake = bool(hint) and name != "stretch"
+            found.append(Doubt(field, f"{text}: {hint}" if hint else text, mistake=mistake))
     return tuple(sorted(found, key=lambda doubt: not doubt.mistake))
 
 

@@ -249,6 +249,9 @@ def test_the_population_counts_how_often_intervals_hold():
     # 1 for 6 is off by 83 %; within exp(1.96) = 7.1 of 1 lies 6.
     assert anterior["generic guess"] == pytest.approx(250 / 3)
     assert anterior["inside prior"] == 20
+    tidy = rows(population(), "estimates")
+    assert len(tidy) == 20 * (4 + 2)
+    assert {row["estimation"] for row in tidy} == {"with nuisances", "without nuisances"}
 
 
 def test_failures_of_the_population_are_counted_and_not_averaged():
@@ -353,6 +356,9 @@ def test_a_scenario_in_which_nothing_is_trusted_has_no_coverage_of_trusted():
 
 def test_correlated_errors_are_judged_as_such():
     (row,) = rows([run("reference", 1, (1.0, 1.0), correlation=0.5)])
+    table = rows([run("reference", 1, (1.0, 1.0), correlation=0.5)], "estimates")
+    assert [row["off by SD"] for row in table] == pytest.approx([1.0, 1.0])
+    assert [row["truth in posterior"] for row in table] == pytest.approx([0.841, 0.841], abs=1e-3)
     # (1, 1) C⁻¹ (1, 1)ᵀ / 2 with C⁻¹ = 4/3 (1, -1/2; -1/2, 1): 2/3.
     assert row["NEES"] == pytest.approx(2 / 3)
 
