@@ -15,10 +15,11 @@ from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.solid import Law, Solid
+from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Loads, System
@@ -169,7 +170,7 @@ def simulate_body(
         ``hex18_thin`` is good on coarse cells (see the results on thin shells).
     material : TransverselyIsotropic, sequence of them, or Law
         One, or one per region; or a law of one's own, which has what
-        :class:`mvest.mechanics.solid.Law` asks for, for all regions.
+        :class:`mvest.mechanics.Law` asks for, for all regions.
     times : array_like
         ``(s,)`` s, end times of the steps, increasing, > 0.
     fixed_nodes : array_like

@@ -31,6 +31,7 @@ from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import HARMLESS, ContactPairs
+from mvest.mechanics.law import Points
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import SolidState
 from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver
@@ -470,13 +471,11 @@ class _Stepper:
             d_stress = system.partial_stress(parameter, state, old.strain, rate)
             if parameter.kind == "damping" and not static:
                 # The law is damped by ``rate = beta / dt`` times the change of its strain.
-                d_stress = d_stress + solid.law.history_stress(
-                    state.green, region, old.strain - new.strain, 1 / dt
-                )
+                at = Points(state.green, region, old.strain, 1 / dt)
+                d_stress = d_stress + solid.law.history_stress(at, old.strain - new.strain)
             if rate:
-                d_stress = d_stress + solid.law.history_stress(
-                    state.green, region, old.d_strain[k], rate
-                )
+                at = Points(state.green, region, old.strain, rate)
+                d_stress = d_stress + solid.law.history_stress(at, old.d_strain[k])
             stresses.append(d_stress)
             r = system.partial_load(parameter, solved.x, loads)
             add_forces(r, solid.mesh.elements, solid.condensed_forces(state, d_stress))

@@ -2,7 +2,7 @@
 
 A name is ``KIND`` or ``KIND.PART``: the part is a leaflet of the valve, a family of chordae, a
 papillary tip, or the leaflet and number of a mode. This is the one place that knows them; laws say
-which of the kinds of tissue they know (:attr:`mvest.mechanics.solid.Law.kinds`).
+which of the kinds of tissue they know (:attr:`mvest.mechanics.law.Law.kinds`).
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +38,9 @@ from mvest.mechanics.element import (
     strain_derivative,
     strains,
 )
+from mvest.mechanics.law import Law, Points
 from mvest.mechanics.law.linear import EdgeRotations, LinearLaw
-from mvest.mechanics.parameters import Parameter
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 ENHANCED_ITERATIONS = 12
@@ -49,57 +48,6 @@ ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
 LINEAR = 1e-7
 """Size of an alpha correction that the stress follows linearly, and the tangent not noticeably."""
-
-
-@runtime_checkable
-class Law(Protocol):
-    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`).
-
-    Arrays of points have the axes (element, quadrature point, component). Strain and stress are
-    six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame of the point, strain with engineering
-    shear, stress the second Piola-Kirchhoff one in MPa; ``region (e,)`` counts from 0.
-    """
-
-    def strain(self, green: FloatArray) -> FloatArray:
-        """Strain measure ``(e, q, 6)`` whose rate is damped."""
-
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``, its derivative by ``green``.
-
-        ``previous (e, q, 6)`` is the strain measure at the start of the step and ``rate`` the
-        stiffness-proportional damping over the step, 0 in an equilibrium.
-        """
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kinds of parameter (:data:`mvest.mechanics.parameters.KINDS`) that it knows."""
-
-    def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
-    ) -> FloatArray:
-        """Derivative of the stress ``(e, q, 6)`` by a parameter of region ``which``.
-
-        At fixed strain; ``stress`` is what `response` has given with the same arguments, of which
-        the derivative is often a multiple. InputError if the parameter is none of `kinds`.
-        """
-
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
-        """Change of the stress for a change of the previous strain measure."""
-
-    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
-        """Change of the strain measure for a change of the Green-Lagrange strain."""
 
 
 @dataclass(slots=True, eq=False)
@@ -183,12 +131,12 @@ class Solid:
         if self.rotations is not None:
             green_u, f = self.rotations(x, f)
         if self.n_modes == 0:
-            stress, tangent = self.law.response(green_u, region, previous, rate)
+            stress, tangent = self.law.response(Points(green_u, region, previous, rate))
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
         alpha = self.enhanced_parameters
         for _ in range(ENHANCED_ITERATIONS):
             green = enhanced_strain(green_u, self.direction, self.polynomials, alpha)
-            stress, tangent = self.law.response(green, region, previous, rate)
+            stress, tangent = self.law.response(Points(green, region, previous, rate))
             step = self._alpha_change(stress, tangent)
             size = float(np.abs(step).max(initial=0.0))
             if not np.isfinite(size) or size < ENHANCED_TOLERANCE:

@@ -24,8 +24,9 @@ from mvest.mechanics.forces.cables import Cables, Hinge, Ties
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law import Law, Points
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of
-from mvest.mechanics.solid import Law, Solid, SolidState
+from mvest.mechanics.solid import Solid, SolidState
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding
 
@@ -327,15 +328,8 @@ class System:
             raise InputError(
                 f"parameter {parameter.name!r}: unknown region; the mesh has {', '.join(names)}"
             )
-        return self.solid.law.partial_stress(
-            parameter,
-            state.green,
-            mesh.region,
-            previous,
-            rate,
-            which=names.index(parameter.region),
-            stress=state.stress,
-        )
+        at, which = Points(state.green, mesh.region, previous, rate), names.index(parameter.region)
+        return self.solid.law.partial_stress(parameter, at, which=which, stress=state.stress)
 
     def partial_load(self, parameter: Parameter, x: FloatArray, loads: Loads) -> FloatArray:
         """Partial derivative ``(n, 3)`` of the residual by the parameter, solid's part excluded."""

@@ -16,15 +16,16 @@ from mvest.errors import InputError
 from mvest.mechanics.forces.cables import Cables, Hinge, TiedPoints
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli
-from mvest.mechanics.law.regional import FieldBasis, FieldLaw, RegionalLaw, at_quadrature
-from mvest.mechanics.law.stiffening import PrestretchedLaw, StiffeningLaw
+from mvest.mechanics.law.regional import FieldBasis, LeafletLaw, ModulusVariation, at_quadrature
+from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
-from mvest.mechanics.solid import Law, Solid
+from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray, IntArray
 from mvest.units import mmhg_to_mpa
@@ -59,22 +60,6 @@ class HeldState:
     pressure_mmHg: float
     annulus: FloatArray
     papillary_tips: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ModulusVariation:
-    """How the modulus varies within the leaflets, at the quadrature points of a mesh.
-
-    Attributes
-    ----------
-    modes : mapping
-        Region -> ``(e, q, k)`` modes of its field.
-    given : ndarray or float
-        ``(e, q)`` part of log E_f that is no unknown.
-    """
-
-    modes: Mapping[str, FloatArray]
-    given: FloatArray | float
 
 
 def build_system(
@@ -188,29 +173,24 @@ def material_law(
     tissues = [_tissue(region, settings, values) for region in mesh.region_names]
     linear = [t for t in tissues if isinstance(t, LeafletModuli)]
     exponential = [t for t in tissues if isinstance(t, ExponentialTissue)]
-    alike = len(tissues) in (len(linear), len(exponential))
     corotational = {settings.tissue[r].law == "corotational" for r in mesh.region_names}
     if len(corotational) > 1:
         raise InputError("the corotational law is that of all regions of a mesh, or of none")
-    law: Law
+    laws: tuple[Law, ...]
     if corotational == {True}:
-        law = LinearLaw.of_moduli(linear, corotational=True)
-    elif not alike:
-        law = RegionalLaw(tuple(map(_law_of_one, tissues)), mesh.region)
-    elif linear:
-        law = BiotLaw.of_moduli(linear)
+        laws = (LinearLaw.of_moduli(linear, corotational=True),)
+    elif len(linear) == len(tissues):
+        laws = (BiotLaw.of_moduli(linear),)
+    elif len(exponential) == len(tissues):
+        laws = (ExponentialLaw.of(exponential),)
     else:
-        law = ExponentialLaw.of(exponential)
+        laws = tuple(map(_law_of_one, tissues))
     prestretch = _prestretch(mesh, settings, values)
-    if np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values):
-        law = PrestretchedLaw(law, prestretch, mesh.region)
-    if variation is None:
-        return law
-    coefficients = {
-        region: np.array([values.get(f"field.{region}.{k}", 0.0) for k in range(own.shape[2])])
-        for region, own in variation.modes.items()
-    }
-    return FieldLaw(law, variation.modes, coefficients, variation.given)
+    stretched = np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values)
+    if variation is None and not stretched and len(laws) == 1:
+        return laws[0]
+    scale = 1.0 if variation is None else variation.scale(values)
+    return LeafletLaw(laws, mesh.region, prestretch, scale, variation)
 
 
 def _prestretch(
@@ -279,7 +259,7 @@ def retune(system: System, settings: MechanicsSettings, values: Mapping[str, flo
     """Give a system of a valve other values of its parameters; see `build_system`."""
     assert system.cables is not None
     old = system.solid.law
-    variation = ModulusVariation(old.modes, old.given) if isinstance(old, FieldLaw) else None
+    variation = old.variation if isinstance(old, LeafletLaw) else None
     law = material_law(system.solid.mesh, settings, values, variation)
     system.retune(law, factors_of(system.cables, values))
 

@@ -214,7 +214,7 @@ def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatAr
         return np.zeros((0, 3)), np.zeros(0)
     y = contact.points(x)
     force = np.linalg.norm(contact.forces(contact.search(y), y), axis=1)
-    return contact.rest, force / contact.areas
+    return contact.sheet.rest, force / contact.sheet.areas
 
 
 def _peaks(values: FloatArray, volumes: FloatArray) -> Measured:

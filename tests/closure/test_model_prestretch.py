@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.law.stiffening import PrestretchedLaw
+from mvest.mechanics.law.regional import LeafletLaw
 from mvest.mechanics.valve_system import material_law
 from tests.closure.test_model import (
     CLOSING,
@@ -53,7 +53,7 @@ def test_parameters_go_before_settings_and_without_either_the_law_is_as_it_was()
         return material_law(model.mesh, replace(model.settings, tissue=tissue), values)
 
     moduli = dict(zip(NAMES[:2], AT[:2], strict=True))
-    assert not isinstance(law(moduli), PrestretchedLaw)
+    assert not isinstance(law(moduli), LeafletLaw)
     np.testing.assert_array_equal(law(moduli, longer).prestretch, [1.1, 1.0])
     stated = {**moduli, "prestretch.posterior": 0.98}
     np.testing.assert_array_equal(law(stated, longer).prestretch, [1.1, 0.98])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mvest.closure.anchors import STIFFENED, Coordinates
-from mvest.mechanics.law.regional import RegionalLaw
+from mvest.mechanics.law.regional import LeafletLaw
 from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import material_law
@@ -80,7 +80,7 @@ def test_each_leaflet_has_its_own_share_and_without_a_value_that_of_its_settings
     def laws(values, tissue=MIXED):
         settings = replace(model.settings, tissue=tissue)
         law = material_law(model.mesh, settings, values)
-        assert isinstance(law, RegionalLaw)
+        assert isinstance(law, LeafletLaw)
         return law.laws
 
     values = dict(zip(NAMES, AT, strict=True))

@@ -158,16 +158,16 @@ class SaintVenantKirchhoff:
     def strain(self, green):
         return green
 
-    def response(self, green, region, previous, rate):
-        stress = (green + rate * (green - previous)) @ self.stiffness
-        tangent = np.broadcast_to((1 + rate) * self.stiffness, (*green.shape, 6))
+    def response(self, at):
+        stress = (at.green + at.rate * (at.green - at.previous)) @ self.stiffness
+        tangent = np.broadcast_to((1 + at.rate) * self.stiffness, (*at.green.shape, 6))
         return stress, np.ascontiguousarray(tangent)
 
-    def partial_stress(self, parameter, green, region, previous, rate, *, which, stress):
-        return np.where((region == which)[:, None, None], stress, 0.0) / parameter.value
+    def partial_stress(self, parameter, at, *, which, stress):
+        return np.where((at.region == which)[:, None, None], stress, 0.0) / parameter.value
 
-    def history_stress(self, green, region, d_previous, rate):
-        return -rate * d_previous @ self.stiffness
+    def history_stress(self, at, d_previous):
+        return -at.rate * d_previous @ self.stiffness
 
     def strain_change(self, green, d_green):
         return d_green

@@ -74,9 +74,11 @@ def test_contact_pressure_is_force_over_area():
     system = SimpleNamespace(contact=contact)
     rest, pressure = contact_pressure(system, y)
     force = np.linalg.norm(contact.forces(pairs, y)[0])
-    assert pressure == pytest.approx([force / contact.areas[0], force / contact.areas[1], 0.0])
+    assert pressure == pytest.approx(
+        [force / contact.sheet.areas[0], force / contact.sheet.areas[1], 0.0]
+    )
     assert force > 0
-    assert np.array_equal(rest, contact.rest)
+    assert np.array_equal(rest, contact.sheet.rest)
     assert len(contact_pressure(SimpleNamespace(contact=None), y)[1]) == 0
 
 

@@ -31,6 +31,7 @@ from mvest.exchange.febio.valve import CONTACTS, FebioOptions, differences, valv
 from mvest.files import write_atomically
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.settings import (
@@ -39,7 +40,6 @@ from mvest.mechanics.settings import (
     MechanicsSettings,
     TissueSettings,
 )
-from mvest.mechanics.solid import Law
 from mvest.mechanics.steps import NewtonSettings, Simulation
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.observation.vertices import FRAMES, Observation

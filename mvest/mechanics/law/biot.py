@@ -36,6 +36,7 @@ import numba as nb
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
@@ -56,8 +57,6 @@ their norm is the tensor's."""
 @dataclass(frozen=True, slots=True, eq=False)
 class BiotLaw:
     """The law of a body: one stiffness per region, evaluated at all quadrature points at once.
-
-    Arrays of points have the axes (element, quadrature point, component).
 
     Attributes
     ----------
@@ -97,54 +96,16 @@ class BiotLaw:
         """Biot strain ``(e, q, 6)`` of Green-Lagrange strain ``(e, q, 6)``, both engineering."""
         return _linear(green, green, 0)
 
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
-
-        Parameters
-        ----------
-        green : ndarray
-            ``(e, q, 6)`` Green-Lagrange strain.
-        region : ndarray
-            ``(e,)``.
-        previous : ndarray
-            ``(e, q, 6)`` Biot strain at the start of the step.
-        rate : float
-            ``beta / dt``, dimensionless; 0 without damping.
-        """
-        return _response(green, region, self.stiffness, previous, rate)
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
+        """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa."""
+        return _response(at.green, at.region, self.stiffness, at.previous, at.rate)
 
     def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)`` by a parameter of region ``which``, at fixed strain.
-
-        Parameters
-        ----------
-        parameter : Parameter
-        green, region, previous, rate
-            As in `response`.
-        which : int
-            Index of the parameter's region.
-        stress : ndarray
-            ``(e, q, 6)`` what `response` has given.
-
-        Raises
-        ------
-        InputError
-            If the law does not know the parameter.
-        """
+        """Derivative of S ``(e, q, 6)``; InputError if the law does not know the parameter."""
         parameter.require(self.kinds)
-        here = region == which
+        here = at.region == which
         if parameter.kind == "E_f" and (not self.moduli or self.moduli[which].G is None):
             # All moduli follow E_f: S is linear in the scale of C.
             return np.where(here[:, None, None], stress, 0.0) / parameter.value
@@ -152,16 +113,15 @@ class BiotLaw:
             raise InputError(f"parameter {parameter.name!r}: the law has a stiffness, no moduli")
         out = np.zeros_like(stress)
         by = self.moduli[which].stiffness_by(parameter.kind)
-        strain = (1 + rate) * self.strain(green[here]) - rate * previous[here]
-        out[here] = _linear(green[here], strain @ by.T, 1)
+        green, rate = at.green[here], at.rate
+        strain = (1 + rate) * self.strain(green) - rate * at.previous[here]
+        out[here] = _linear(green, strain @ by.T, 1)
         return out
 
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of S ``(e, q, 6)`` for a change of the previous Biot strain: ``-rate L^T C d``."""
-        stress = np.einsum("eij,eqj->eqi", self.stiffness[region], d_previous)
-        return -rate * _linear(green, stress, 1)
+        stress = np.einsum("eij,eqj->eqi", self.stiffness[at.region], d_previous)
+        return -at.rate * _linear(at.green, stress, 1)
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """Change of the Biot strain ``L dE`` ``(e, q, 6)``."""

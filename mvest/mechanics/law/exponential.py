@@ -43,12 +43,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
-from typing import Protocol
 
 import numba as nb
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Law, Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, TissueSettings
@@ -67,8 +67,6 @@ VISCOUS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 @dataclass(frozen=True, slots=True, eq=False)
 class ExponentialLaw:
     """The law of a body: one set of coefficients per region, all quadrature points at once.
-
-    Arrays of points have the axes (element, quadrature point, component).
 
     Attributes
     ----------
@@ -96,48 +94,24 @@ class ExponentialLaw:
         """W ``(e, q)`` MPa of Green-Lagrange strain ``(e, q, 6)``; infinite if turned over."""
         return _energy(green, region, self.coefficients)
 
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
 
         A strain of matter that has turned over, where there is no W, can occur during a Newton
         iteration. The response is then that of very stiff linear matter, which is far from any
         equilibrium and leads back.
-
-        Parameters
-        ----------
-        green : ndarray
-            ``(e, q, 6)`` Green-Lagrange strain.
-        region : ndarray
-            ``(e,)``.
-        previous : ndarray
-            ``(e, q, 6)`` Green-Lagrange strain at the start of the step.
-        rate : float
-            ``beta / dt``, dimensionless; 0 without damping.
         """
-        stress, tangent = _response(green, region, self.coefficients)
-        if rate:
-            viscous = rate * self._viscous(region)
-            stress += viscous * (green - previous)
+        stress, tangent = _response(at.green, at.region, self.coefficients)
+        if at.rate:
+            viscous = at.rate * self._viscous(at.region)
+            stress += viscous * (at.green - at.previous)
             tangent[:, :, range(6), range(6)] += viscous
         return stress, tangent
 
     def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)`` by a coefficient of region ``which``, at fixed strain.
-
-        Damping has no part in it. The arguments are those of
-        :meth:`mvest.mechanics.law.biot.BiotLaw.partial_stress`.
+        """Derivative of S ``(e, q, 6)`` by a coefficient, in which damping has no part.
 
         Raises
         ------
@@ -146,13 +120,11 @@ class ExponentialLaw:
         """
         parameter.require(self.kinds)
         kind = EXPONENTIAL_KINDS.index(parameter.kind)
-        return _partial_stress(green, region, self.coefficients, kind, which)
+        return _partial_stress(at.green, at.region, self.coefficients, kind, which)
 
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of S ``(e, q, 6)`` for a change of the previous strain."""
-        return -rate * self._viscous(region) * d_previous
+        return -at.rate * self._viscous(at.region) * d_previous
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """Change of the damped strain ``(e, q, 6)``, which is that of the Green-Lagrange strain."""
@@ -308,13 +280,7 @@ TOLERANCE = 1e-12
 """Change of the thickness strain at which the stretch of the thickness is found."""
 
 
-class _Stressed(Protocol):
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]: ...
-
-
-def biaxial_stress(law: _Stressed, stretches: FloatArray, region: int = 0) -> FloatArray:
+def biaxial_stress(law: Law, stretches: FloatArray, region: int = 0) -> FloatArray:
     """Nominal stresses ``(n, 2)`` MPa along and across the fibres.
 
     Parameters
@@ -339,7 +305,7 @@ def biaxial_stress(law: _Stressed, stretches: FloatArray, region: int = 0) -> Fl
     where, none = np.full(len(stretches), region), np.zeros_like(green)
     for _ in range(MAX_ITERATIONS):
         green[:, 0, 2] = 0.5 * (thickness**2 - 1)
-        stress, tangent = law.response(green, where, none, 0.0)
+        stress, tangent = law.response(Points(green, where, none, 0.0))
         # In the logarithm of the thickness, which stays positive whatever the step.
         slope = tangent[:, 0, 2, 2] * thickness**2 + 2 * stress[:, 0, 2]
         change = -stress[:, 0, 2] / np.where(slope > 0, slope, tangent[:, 0, 2, 2] * thickness**2)

@@ -20,9 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 
@@ -69,45 +70,34 @@ class LinearLaw:
         """The strain itself."""
         return green
 
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)`` MPa."""
-        tangent = np.repeat((1 + rate) * self.stiffness[region, None], green.shape[1], axis=1)
-        return self._stress(self.stiffness[region], green, previous, rate), tangent
-
-    @staticmethod
-    def _stress(
-        stiffness: FloatArray, strain: FloatArray, previous: FloatArray, rate: float
-    ) -> FloatArray:
-        return np.einsum("eij,eqj->eqi", stiffness, (1 + rate) * strain - rate * previous)
+        stiffness = self.stiffness[at.region]
+        tangent = np.repeat((1 + at.rate) * stiffness[:, None], at.green.shape[1], axis=1)
+        return _stress(stiffness, at), tangent
 
     def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
         """Derivative of the stress by a parameter of region ``which``; InputError if of no use."""
         parameter.require(self.kinds)
         by = np.zeros_like(self.stiffness)
         by[which] = self.moduli[which].stiffness_by(parameter.kind)
-        return self._stress(by[region], green, previous, rate)
+        return _stress(by[at.region], at)
 
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of the stress for a change of the previous strain: ``-rate C d``."""
-        return -rate * np.einsum("eij,eqj->eqi", self.stiffness[region], d_previous)
+        return -at.rate * np.einsum("eij,eqj->eqi", self.stiffness[at.region], d_previous)
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """The change of the strain itself."""
         return d_green
+
+
+def _stress(stiffness: FloatArray, at: Points) -> FloatArray:
+    """Stress ``(e, q, 6)`` of stiffnesses ``(e, 6, 6)``, damping included."""
+    strain = (1 + at.rate) * at.green - at.rate * at.previous
+    return np.einsum("eij,eqj->eqi", stiffness, strain)
 
 
 class EdgeRotations:

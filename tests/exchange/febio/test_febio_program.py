@@ -9,9 +9,9 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.exchange.febio.document import Control, FebDocument, read_positions
 from mvest.exchange.febio.mesh import febio_law, febio_mesh
 from mvest.mechanics.body import simulate_body
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
-from mvest.mechanics.solid import Law
 from mvest.mechanics.steps import NewtonSettings
 from tests.exchange.febio.program import febio_program, run_febio
 from tests.exchange.febio.test_febio_mesh import mesh_of
