@@ -90,10 +90,6 @@ class ExponentialLaw:
         """The Green-Lagrange strain ``(e, q, 6)`` itself is what is damped."""
         return green
 
-    def energy(self, green: FloatArray, region: IntArray) -> FloatArray:
-        """W ``(e, q)`` MPa of Green-Lagrange strain ``(e, q, 6)``; infinite if turned over."""
-        return _energy(green, region, self.coefficients)
-
     def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
 
@@ -161,25 +157,6 @@ def _exponential(q: float) -> tuple[float, float, float]:
         return np.expm1(q), e, e
     e, d = np.exp(MAX_EXPONENT), q - MAX_EXPONENT
     return e * (1.0 + d + 0.5 * d * d) - 1.0, e * (1.0 + d), e
-
-
-@nb.njit(cache=True)
-def _energy(green: FloatArray, region: IntArray, coefficients: FloatArray) -> FloatArray:
-    n_e, n_q, _ = green.shape
-    out = np.empty((n_e, n_q))
-    h = np.empty(6)
-    for e in range(n_e):
-        c0, c1, c2, mu, kappa, _ = coefficients[region[e]]
-        for p in range(n_q):
-            det, trace = _metric(green[e, p], h)
-            if det == 0.0:
-                out[e, p] = np.inf
-                continue
-            a = trace * det ** (-1.0 / 3.0) - 3.0
-            x = max(np.sqrt(1.0 + 2.0 * green[e, p, 0]) - 1.0, 0.0)
-            g, _, _ = _exponential(c1 * a * a + c2 * x**4)
-            out[e, p] = c0 * g + 0.5 * mu * a + 0.25 * kappa * (det - 1.0 - np.log(det))
-    return out
 
 
 @nb.njit(cache=True)

@@ -33,6 +33,17 @@ def stress(law, green=GREEN, region=REGION, previous=NONE, rate=0.0):
     return law.response(Points(green, region, previous, rate))[0]
 
 
+def energy(green):
+    """W ``(10, 3)`` MPa of the docstring of `mvest.mechanics.law.exponential`."""
+    C = np.eye(3) + green[..., [[0, 5, 4], [5, 1, 3], [4, 3, 2]]] * (1 + np.eye(3))
+    J2 = np.linalg.det(C)
+    c0, c1, c2, mu, kappa, _ = LAW.coefficients[REGION].T[..., None]
+    a = np.trace(C, axis1=-2, axis2=-1) * J2 ** (-1 / 3) - 3
+    x = np.maximum(np.sqrt(C[..., 0, 0]) - 1, 0)
+    exponential = c0 * np.expm1(c1 * a**2 + c2 * x**4)
+    return exponential + 0.5 * mu * a + 0.25 * kappa * (J2 - 1 - np.log(J2))
+
+
 def fourth_order(function, h):
     """Central difference without its h^2 error: (16 D(h/4) - D(h)) / 15."""
     coarse, fine = ((function(s) - function(-s)) / (2 * s) for s in (h, h / 4))
@@ -46,7 +57,7 @@ def test_stress_is_the_derivative_of_the_energy_and_the_tangent_that_of_the_stre
     found, tangent = LAW.response(Points(GREEN, REGION, NONE, 0.0))
     for i in range(6):
         e = np.eye(6)[i]
-        by_energy = fourth_order(lambda s, e=e: LAW.energy(GREEN + s * e, REGION), 2e-3)
+        by_energy = fourth_order(lambda s, e=e: energy(GREEN + s * e), 2e-3)
         by_stress = fourth_order(lambda s, e=e: stress(LAW, GREEN + s * e), 2e-3)
         np.testing.assert_allclose(by_energy, found[..., i], atol=1e-7 * np.abs(found).max())
         np.testing.assert_allclose(by_stress, tangent[..., i], atol=1e-7 * np.abs(tangent).max())
@@ -166,7 +177,6 @@ def test_turned_over_matter_is_finite_and_driven_back():
     green[0, 0, 2] = -0.6  # a squared thickness of -0.2
     region = np.zeros(1, dtype=int)
     found, tangent = LAW.response(Points(green, region, np.zeros_like(green), 0.0))
-    assert np.isinf(LAW.energy(green, region)).all()
     assert found[0, 0, 2] < -1e3
     assert np.linalg.eigvalsh(tangent[0, 0]).min() > 0
 
