@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
+    PAIRS,
     Sampling,
     add_tangents,
     alpha_change,
@@ -296,17 +297,7 @@ def _enhanced_direction(mesh: SolidMesh, reference: Element) -> FloatArray:
     # Unit amplitude means unit thickness strain: scale by the length of G^3.
     thickness_vector /= np.linalg.norm(thickness_vector, axis=1, keepdims=True)
     g = np.einsum("ei,eqim->eqm", thickness_vector, frame)
-    dyad = np.stack(
-        [
-            g[..., 0] ** 2,
-            g[..., 1] ** 2,
-            g[..., 2] ** 2,
-            2 * g[..., 1] * g[..., 2],
-            2 * g[..., 0] * g[..., 2],
-            2 * g[..., 0] * g[..., 1],
-        ],
-        axis=-1,
-    )
+    dyad = np.stack([(1 if i == j else 2) * g[..., i] * g[..., j] for i, j in PAIRS], axis=-1)
     ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian)
     return np.ascontiguousarray(ratio[:, :, None] * dyad)
 

@@ -340,5 +340,7 @@ class System:
             own = factors.chord_stiffness if stiffness else factors.chord_rest_length
             # A chord's factor is a product: its derivative by one factor is the product over it.
             share = own * self.cables.members(parameter.part) / parameter.value
-            add_forces_at(out, self.cables.patches, share[:, None] * force)
+            patches = self.cables.patches
+            weights = patches.weights * share[:, None]
+            add_forces(out, patches.nodes, weights[:, :, None] * force[:, None, :])
         return out

@@ -18,11 +18,10 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.law.exponential import ExponentialLaw, StiffeningLaw
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli
 from mvest.mechanics.law.regional import FieldBasis, LeafletLaw, ModulusVariation, at_quadrature
-from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
 from mvest.mechanics.solid import Solid

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mvest.closure.anchors import STIFFENED, Coordinates
+from mvest.mechanics.law.exponential import StiffeningLaw
 from mvest.mechanics.law.regional import LeafletLaw
-from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import material_law
 from tests.closure.test_model import (

@@ -9,10 +9,10 @@ from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import (
     CLOSED_STRETCHES,
     ExponentialLaw,
+    StiffeningLaw,
     as_stiff,
     biaxial_stress,
 )
-from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
 
