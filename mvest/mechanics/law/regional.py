@@ -68,14 +68,11 @@ class FieldBasis:
         What their covariances with a point are multiplied by.
     length : float
         mm.
-    share : float
-        Of the field's variance over the leaflet that the modes have.
     """
 
     support: FloatArray
     combination: FloatArray
     length: float
-    share: float
 
     @classmethod
     def of(cls, surface: LeafletSurface, region: str, settings: ModulusField) -> FieldBasis:
@@ -109,12 +106,7 @@ class FieldBasis:
         shapes = vectors / root[:, None]
         largest = shapes[np.argmax(np.abs(shapes), axis=0), np.arange(settings.modes)]
         combination = settings.std_log * root[:, None] * vectors * np.sign(largest)
-        return cls(
-            support,
-            combination / np.sqrt(values),
-            settings.correlation_length_mm,
-            float(values.sum() / np.sum(root**2)),
-        )
+        return cls(support, combination / np.sqrt(values), settings.correlation_length_mm)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """The modes ``(..., k)`` at points ``(..., 3)`` mm of the reference frame."""
