@@ -99,7 +99,7 @@ class TissueSettings:
         ``A`` or ``C`` (see :class:`mvest.mechanics.law.biot.PoissonReading`).
     law : str
         ``biot``, the linear law, to which all of the above belongs, ``corotational``, its usual
-        form on linear tetrahedra (:mod:`mvest.mechanics.law.linear`), ``exponential``
+        form on linear tetrahedra (:mod:`mvest.mechanics.law.biot`), ``exponential``
         (:mod:`mvest.mechanics.law.exponential`), or ``stiffening``, on the way from the first to
         the last.
     exponential : ExponentialTissue, optional

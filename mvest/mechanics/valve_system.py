@@ -19,7 +19,6 @@ from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw, StiffeningLaw
-from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.regional import FieldBasis, LeafletLaw, ModulusVariation, at_quadrature
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, MechanicsSettings
@@ -225,9 +224,7 @@ def _law_of(
         tissue.moduli(**given(region, "E_f", "ratio", "G"))
         for tissue, region in zip(tissues, regions, strict=True)
     ]
-    if tissues[0].law == "corotational":
-        return LinearLaw.of_moduli(moduli, corotational=True)
-    return BiotLaw.of_moduli(moduli)
+    return BiotLaw.of_moduli(moduli, corotational=tissues[0].law == "corotational")
 
 
 def variation_of(

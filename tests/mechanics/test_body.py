@@ -10,7 +10,7 @@ import mvest.mechanics.body
 from mvest.errors import GeometryError, InputError, MaterialError, MvestError
 from mvest.mechanics import Parameter, TransverselyIsotropic, box, outer_faces, simulate_body
 from mvest.mechanics.solver import linear_solver
-from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS
+from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SaintVenantKirchhoff
 
 RUBBER = TransverselyIsotropic.isotropic(2.0, 0.45)
 
@@ -144,40 +144,15 @@ def test_half_a_sheet_with_a_plane_of_symmetry_does_what_the_whole_does(static):
     assert np.abs(part.sensitivities[-1]).max() > 1e-3
 
 
-class SaintVenantKirchhoff:
-    """A law of a user's own: ``S = lambda tr(E) I + 2 mu E``, damped as the strain E."""
-
-    kinds = ("E_f",)
-
-    def __init__(self, young, nu):
-        lame, mu = young * nu / ((1 + nu) * (1 - 2 * nu)), young / (2 * (1 + nu))
-        self.young, self.stiffness = young, np.zeros((6, 6))
-        self.stiffness[:3, :3] = lame
-        self.stiffness += mu * np.diag([2.0, 2, 2, 1, 1, 1])
-
-    def strain(self, green):
-        return green
-
-    def response(self, at):
-        stress = (at.green + at.rate * (at.green - at.previous)) @ self.stiffness
-        tangent = np.broadcast_to((1 + at.rate) * self.stiffness, (*at.green.shape, 6))
-        return stress, np.ascontiguousarray(tangent)
-
-    def partial_stress(self, parameter, at, *, which, stress):
-        return np.where((at.region == which)[:, None, None], stress, 0.0) / parameter.value
-
-    def history_stress(self, at, d_previous):
-        return -at.rate * d_previous @ self.stiffness
-
-    def strain_change(self, green, d_green):
-        return d_green
+def saint_venant(young):
+    return SaintVenantKirchhoff([TransverselyIsotropic.isotropic(young, 0.45)])
 
 
 @pytest.mark.parametrize("static", [True, False])
 def test_a_law_of_ones_own_takes_the_place_of_the_material(static):
     given = arguments() | {"fibre": (1.0, 0.0, 0.0), "static": static}
     known = simulate_body(**given)
-    law = SaintVenantKirchhoff(2.0, 0.45)
+    law = saint_venant(2.0)
     parameter = [Parameter("E_f.0", 2.0)]
     own = simulate_body(**given | {"material": law}, parameters=parameter)
     assert own.converged
@@ -187,8 +162,7 @@ def test_a_law_of_ones_own_takes_the_place_of_the_material(static):
     assert 1e-5 * lift < difference < 0.05 * lift
     # Its derivative is that of its differences.
     moved = [
-        simulate_body(**given | {"material": SaintVenantKirchhoff(e, 0.45)}).frames[-1]
-        for e in (1.999, 2.001)
+        simulate_body(**given | {"material": saint_venant(e)}).frames[-1] for e in (1.999, 2.001)
     ]
     np.testing.assert_allclose(own.sensitivities[-1, 0], (moved[1] - moved[0]) / 0.002, atol=2e-6)
     assert np.abs(own.sensitivities[-1]).max() > 1e-2
@@ -237,7 +211,7 @@ def broken(name):
         "fixed component not bool": {"fixed_components": np.zeros(nodes.shape)},
         "force of a wrong shape": {"forces": (0.0, 0.0, 1.0)},
         "force not finite": {"forces": lambda t: np.full(nodes.shape, np.inf)},
-        "fibre of a law missing": {"material": SaintVenantKirchhoff(2.0, 0.45)},
+        "fibre of a law missing": {"material": saint_venant(2.0)},
         "fibre missing": {"material": fibre},
         "fibre zero": {"material": fibre, "fibre": (0, 0, 0)},
         "fibre across the layer": {"material": fibre, "fibre": (0, 0, 1)},
