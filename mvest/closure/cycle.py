@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError, MaterialError, require_numbers
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
 from mvest.estimation.noise import NoiseCovariance
@@ -62,15 +62,10 @@ class CycleProtocol:
     times: tuple[BeatTime, ...] = field(default=DEFAULT_TIMES)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.dt) and self.dt > 0):
-            raise InputError(f"time step of a cycle dt = {self.dt} s, expected > 0")
+        require_numbers(self, "cycle", "dt", "rise", "fall")
+        require_numbers(self, "cycle", "hold", least=0)
         if not np.isfinite(self.pressure_mmHg):
             raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
-        if not (self.rise > 0 and self.hold >= 0 and self.fall > 0):
-            raise InputError(
-                f"cycle with rise = {self.rise}, hold = {self.hold}, fall = {self.fall} s, "
-                f"expected rise and fall > 0 and hold >= 0"
-            )
         times = np.asarray(self.times, dtype=float)
         if not (
             times.ndim == 1

@@ -348,8 +348,8 @@ class ClosureModel:
                 # Where that is not soon found, the guide finds it sooner.
                 most = min(newton.max_iterations, CONTINUED)
                 soon = replace(newton, max_iterations=most)
-            moves = [self._expected_move(m), None]
-            for move in moves[moves[0] is None :]:
+            expected = self._expected_move(m)
+            for move in (None,) if expected is None else (expected, None):
                 simulation = run(
                     steps[-1:],
                     newton=soon,
@@ -365,6 +365,7 @@ class ClosureModel:
                 rest = _resting(end, steps[-1].time)
                 simulation = run(rest, newton=newton, initial_positions=start, initial_time=end)
         if simulation is None or self._unsettled(simulation):
+            # From the open valve.
             start = None if self.perturbation is None else self.mesh.nodes + self.perturbation
             simulation = run(steps, newton=newton, initial_positions=start)
         if simulation.converged:

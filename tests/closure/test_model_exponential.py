@@ -25,9 +25,9 @@ from tests.closure.test_model import (
     SMALL,
     TINY,
     TISSUE,
-    continued,
+    check_closed_derivatives,
+    check_moving_derivatives,
     model_of,
-    step_study,
 )
 
 STIFF = ExponentialTissue(0.2, 4.3, 1400.0)
@@ -60,44 +60,15 @@ def test_every_kind_of_the_exponential_law_is_here():
 
 
 def test_derivatives_of_a_moving_valve_agree_with_differences():
-    # No equilibrium at the end: the history of both laws' strains is in the derivative.
-    model = mixed(OPEN, **SMALL)
-    simulation = model.close(AT).simulation
-    assert simulation.converged
-    exact = simulation.sensitivities[-1]
-
-    def run(values):
-        result = model.close(values, sensitivities=False).simulation
-        assert result.converged
-        return result.frames[-1]
-
-    for k, name in enumerate(NAMES):
-        size = np.linalg.norm(exact[k]) * AT[k]
-        assert size > 1e-3, name
-        # Nearly linear in a coefficient: large steps keep the error above the round-off.
-        step = 1.6e-3 if name == "damping" else 1.6e-2
-        coarse, fine, best = step_study(exact[k], run, AT, k, step)
-        # Second order, unless the error is round-off already.
-        assert coarse / fine == pytest.approx(16, rel=0.2) or coarse < 1e-5, name
-        assert best < 1e-6, name
+    # Nearly linear in a coefficient: large steps keep the error above the round-off.
+    steps = [1.6e-3 if name == "damping" else 1.6e-2 for name in NAMES]
+    check_moving_derivatives(mixed(OPEN, **SMALL), AT, steps)
 
 
 def test_derivatives_of_the_closed_valve_agree_with_differences_in_contact():
     names = ("c0.anterior", "c2.anterior", "E_f.posterior")
     own = np.array([VALUES[name] for name in names])
-    model = mixed(CLOSING, names, continuation=True)
-    simulation = model.close(own).simulation
-    assert simulation.converged
-    assert simulation.records[-1].active_contacts > 100
-    start = simulation.frames[-1]
-    for k, name in enumerate(names):
-        exact = simulation.sensitivities[-1][k]
-        assert np.linalg.norm(exact) * own[k] > 0.1, name
-        coarse, fine, best = step_study(
-            exact, lambda m: continued(model, start, m).frames[-1], own, k, 3.2e-3
-        )
-        assert coarse / fine == pytest.approx(16, rel=0.1) or coarse < 1e-6, name
-        assert best < 1e-6, name
+    check_closed_derivatives(mixed(CLOSING, names, continuation=True), own)
 
 
 def law_of(tissue, values):

@@ -164,13 +164,10 @@ def _metric(green: FloatArray, h: FloatArray) -> tuple[float, float]:
 
 
 @nb.njit(cache=True)
-def _exponential(q: float) -> tuple[float, float, float]:
-    """exp(q) - 1 and its first two derivatives, a parabola beyond ``MAX_EXPONENT``."""
-    if q <= MAX_EXPONENT:
-        e = np.exp(q)
-        return np.expm1(q), e, e
-    e, d = np.exp(MAX_EXPONENT), q - MAX_EXPONENT
-    return e * (1.0 + d + 0.5 * d * d) - 1.0, e * (1.0 + d), e
+def _exponential(q: float) -> tuple[float, float]:
+    """The first two derivatives of exp(q), which is a parabola beyond ``MAX_EXPONENT``."""
+    e = np.exp(min(q, MAX_EXPONENT))
+    return e * (1.0 + max(q - MAX_EXPONENT, 0.0)), e
 
 
 @nb.njit(cache=True)
@@ -198,7 +195,7 @@ def _response(
                 da[i] = 2.0 * isochoric * ((1.0 if i < 3 else 0.0) - trace / 3.0 * h[i])
             length = np.sqrt(1.0 + 2.0 * green[e, p, 0])
             x = max(length - 1.0, 0.0)
-            _, g1, g2 = _exponential(c1 * a * a + c2 * x**4)
+            g1, g2 = _exponential(c1 * a * a + c2 * x**4)
             q_a, q_f = 2.0 * c1 * a, 4.0 * c2 * x**3 / length
             q_ff = c2 * (12.0 * x * x / length**2 - 4.0 * x**3 / length**3)
             w_a, w_f = 0.5 * mu + c0 * g1 * q_a, c0 * g1 * q_f
@@ -244,7 +241,7 @@ def _partial_stress(
             a = trace * isochoric - 3.0
             length = np.sqrt(1.0 + 2.0 * green[e, p, 0])
             x = max(length - 1.0, 0.0)
-            _, g1, g2 = _exponential(c1 * a * a + c2 * x**4)
+            g1, g2 = _exponential(c1 * a * a + c2 * x**4)
             q_a, fourth = 2.0 * c1 * a, 4.0 * x**3 / length
             by_a, by_f, by_volume = 0.0, 0.0, 0.0
             if kind == 0:
