@@ -248,7 +248,9 @@ def simulate_body(
         fixed_components=_components(fixed_components, n),
     )
     curve, pull = _pressure_curve(pressure), _force_curve(forces, n)
-    held, ends = mesh.nodes[fixed], checked_floats("times", np.asarray(times), (None,))
+    held, ends = mesh.nodes[fixed], np.asarray(times, dtype=float)
+    if ends.ndim != 1:
+        raise InputError(f"times: shape {ends.shape}, expected (s,)")
     return simulate(
         system,
         lambda t: Loads(pressure=curve(t), fixed=held, body_force=pull(t)),
