@@ -7,7 +7,7 @@ Everything follows from one simulated cycle of a valve whose parameters are know
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,9 +111,7 @@ def run_cycle(job: Job[Settings]) -> Result:
         path[:, 0] *= np.linspace(1.0, 1.0 + settings.path_change, len(path))
         with _bar("time steps", model, len(dts) * len(path)):
             steps = compare_time_steps(model, dts, path)
-        tables["time_steps"] = table(
-            [asdict(step) for step in steps], dt="s", change="mm", unevenness=":.1f"
-        )
+        tables["time_steps"] = table(steps, dt="s", change="mm", unevenness=":.1f")
         solves += len(dts) * len(path)
     if settings.estimated:
         fits = _estimates(values, settings, frames, truth, numbers)

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest
+from typing import Any
 
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError, MaterialError, require_numbers
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
 from mvest.estimation.noise import NoiseCovariance
@@ -61,15 +62,10 @@ class CycleProtocol:
     times: tuple[BeatTime, ...] = field(default=DEFAULT_TIMES)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.dt) and self.dt > 0):
-            raise InputError(f"time step of a cycle dt = {self.dt} s, expected > 0")
+        require_numbers(self, "cycle", "dt", "rise", "fall")
+        require_numbers(self, "cycle", "hold", least=0)
         if not np.isfinite(self.pressure_mmHg):
             raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
-        if not (self.rise > 0 and self.hold >= 0 and self.fall > 0):
-            raise InputError(
-                f"cycle with rise = {self.rise}, hold = {self.hold}, fall = {self.fall} s, "
-                f"expected rise and fall > 0 and hold >= 0"
-            )
         times = np.asarray(self.times, dtype=float)
         if not (
             times.ndim == 1
@@ -228,36 +224,10 @@ class CycleModel:
         return Prediction(y, np.stack(columns, axis=-1))
 
 
-@dataclass(frozen=True, slots=True)
-class StepEffect:
-    """What a time step does to the frames of a cycle.
-
-    Attributes
-    ----------
-    dt : float
-        s.
-    change : float or None
-        mm, root mean square of all frames, when the step is halved; None where that is not known.
-    order : float or None
-        Binary logarithm of the ratio of two such changes.
-    unevenness : float or None
-        Largest change of all frames over the median one, along equal steps of the parameters: large
-        where frames jump.
-    reason : str
-        Why the parameters could not be followed to their end; empty if they could.
-    """
-
-    dt: float
-    change: float | None
-    order: float | None
-    unevenness: float | None
-    reason: str
-
-
 def compare_time_steps(
     model: CycleModel, dts: Sequence[float], path: FloatArray
-) -> tuple[StepEffect, ...]:
-    """Run cycles with several time steps along a path of parameters.
+) -> list[dict[str, Any]]:
+    """What time steps do to the frames of a cycle, along a path of parameters.
 
     Parameters
     ----------
@@ -265,6 +235,15 @@ def compare_time_steps(
     dts : sequence of float
         s, each half of the one before.
     path : (n, p)
+
+    Returns
+    -------
+    list of dict
+        Of each time step ``dt`` (s); ``change`` (mm), root mean square of all frames, when the
+        step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
+        ``unevenness``, the largest change of all frames over the median one along the path, large
+        where frames jump; and the ``reason`` why the path could not be followed to its end. None
+        where a number is not known.
 
     Raises
     ------
@@ -282,7 +261,9 @@ def compare_time_steps(
         reasons.append(reason)
     change = [None if a is None or b is None else _rms(b - a) for a, b in pairwise(first)]
     order = [float(np.log2(a / b)) if a and b else None for a, b in pairwise(change)]
-    return tuple(StepEffect(*row) for row in zip_longest(dts, change, order, uneven, reasons))
+    names = ("dt", "change", "order", "unevenness", "reason")
+    rows = zip_longest(dts, change, order, uneven, reasons)
+    return [dict(zip(names, row, strict=True)) for row in rows]
 
 
 def with_mesh_error(

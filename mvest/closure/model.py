@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate
 
 import numpy as np
@@ -22,7 +22,7 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
-from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
+from mvest.mechanics.steps import Damping, Simulation, Step
 from mvest.mechanics.system import Loads, System
 from mvest.mechanics.valve_system import (
     HeldState,
@@ -44,6 +44,11 @@ REST = (0.05, 0.15)
 """s, steps of time in which a state taken over from another mesh comes to rest under the final
 loads. Damping by stiffness holds what the coarser mesh could not tell; without it the equilibrium
 of large meshes (160 x 19 cells) is not found from there."""
+
+
+def _resting(start: float, end: float) -> list[Step]:
+    """Steps of a rest from ``start`` s, and to an equilibrium as long after it as ``end`` is."""
+    return [*(Step(start + t) for t in accumulate(REST)), Step(end + sum(REST), static=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -324,55 +329,45 @@ class ClosureModel:
     ) -> ClosureResult:
         """One closure, from the last closed state or from the open valve."""
         system, parameters = self.tuned(m)
-        steps = self.settings.protocol.steps()
-        loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
-
-        def run(
-            steps: Sequence[Step],
-            start: FloatArray | None = None,
-            time: float = 0.0,
-            move: FloatArray | None = None,
-            newton: NewtonSettings = self.settings.newton,
-        ) -> Simulation:
-            return simulate(
-                system,
-                loading,
-                steps,
-                damping=self.damping(m),
-                newton=newton,
-                parameters=parameters if sensitivities else [],
-                final_only=not every_frame,
-                solver=self._solver,
-                initial_positions=start,
-                initial_move=move,
-                initial_time=time,
-                on_step=self.on_step,
-            )
-
-        simulation = None
-        if steps[-1].static and not every_frame:
-            end, last = self.settings.protocol.end, steps[-1]
-            if self._closed is not None and self._near(m):
-                move, newton = self._expected_move(m), self.settings.newton
-                if self.guide is not None and self.repeat:
-                    # Where that is not soon found, the guide finds it sooner.
-                    most = min(newton.max_iterations, CONTINUED)
-                    newton = replace(newton, max_iterations=most)
-                simulation = run([last], self._closed.positions, end, move, newton)
-                if move is not None and not simulation.converged:
-                    simulation = run([last], self._closed.positions, end, None, newton)
-            if self.guide is not None and (
-                simulation is None or (self.repeat and not simulation.converged)
-            ):
-                start = self._guided(self.guide, m)
-                if start is not None:
-                    rests = [Step(end + t) for t in accumulate(REST)]
-                    simulation = run(
-                        [*rests, replace(last, time=last.time + sum(REST))], start, end
-                    )
-        if simulation is None or (self.repeat and not simulation.converged):
-            moved = self.perturbation
-            simulation = run(steps, None if moved is None else self.mesh.nodes + moved)
+        newton, steps = self.settings.newton, self.settings.protocol.steps()
+        run = partial(
+            simulate,
+            system,
+            boundary_loading(system, self.valve, self.contact_valve, self.settings),
+            damping=self.damping(m),
+            parameters=parameters if sensitivities else [],
+            final_only=not every_frame,
+            solver=self._solver,
+            on_step=self.on_step,
+        )
+        simulation, end = None, self.settings.protocol.end
+        straight = steps[-1].static and not every_frame
+        if straight and self._closed is not None and self._near(m):
+            soon = newton
+            if self.guide is not None and self.repeat:
+                # Where that is not soon found, the guide finds it sooner.
+                most = min(newton.max_iterations, CONTINUED)
+                soon = replace(newton, max_iterations=most)
+            expected = self._expected_move(m)
+            for move in (None,) if expected is None else (expected, None):
+                simulation = run(
+                    steps[-1:],
+                    newton=soon,
+                    initial_positions=self._closed.positions,
+                    initial_move=move,
+                    initial_time=end,
+                )
+                if simulation.converged:
+                    break
+        if straight and self.guide is not None and self._unsettled(simulation):
+            start = self._guided(self.guide, m)
+            if start is not None:
+                rest = _resting(end, steps[-1].time)
+                simulation = run(rest, newton=newton, initial_positions=start, initial_time=end)
+        if simulation is None or self._unsettled(simulation):
+            # From the open valve.
+            start = None if self.perturbation is None else self.mesh.nodes + self.perturbation
+            simulation = run(steps, newton=newton, initial_positions=start)
         if simulation.converged:
             self._closed = ClosedState(
                 np.array(m, dtype=np.float64),
@@ -380,6 +375,10 @@ class ClosureModel:
                 slopes=simulation.sensitivities[-1] if sensitivities else None,
             )
         return ClosureResult(system, simulation)
+
+    def _unsettled(self, simulation: Simulation | None) -> bool:
+        """Whether a closure is yet to be tried, or to be repeated in another way."""
+        return simulation is None or (self.repeat and not simulation.converged)
 
     def _values(self, m: FloatArray) -> dict[str, float]:
         """All parameters that have a value, those that are not estimated included."""
@@ -496,28 +495,24 @@ class ClosureModel:
         It is looked for at once, or, where that fails or ``damped``, after some steps of time.
         """
         end = self.settings.protocol.end
-
-        def run(steps: Sequence[Step]) -> Simulation:
-            return simulate(
-                system,
-                loading,
-                steps,
-                damping=self.settings.damping,
-                newton=self.settings.newton,
-                parameters=list(parameters),
-                final_only=True,
-                solver=self._solver,
-                initial_positions=start,
-                initial_time=end,
-            )
-
+        run = partial(
+            simulate,
+            system,
+            loading,
+            damping=self.settings.damping,
+            newton=self.settings.newton,
+            parameters=parameters,
+            final_only=True,
+            solver=self._solver,
+            initial_positions=start,
+            initial_time=end,
+        )
         if not damped:
             simulation = run([Step(end + 1.0, static=True)])
             if simulation.converged:
                 return simulation
         # Damping by stiffness helps leaflets to slide over each other to where they are held.
-        rests = [Step(end + t) for t in accumulate(REST)]
-        return run([*rests, Step(end + sum(REST) + 1.0, static=True)])
+        return run(_resting(end, end + 1.0))
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
         """The guide's closed state at this mesh's nodes ``(n, 3)``.

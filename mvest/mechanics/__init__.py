@@ -9,7 +9,8 @@ engineering shear). Lengths are mm, times s, masses tonne, forces N, stresses MP
 What is here, in the order data flows:
 
 * ``parameters``: what can be differentiated by; ``law``: transversely isotropic moduli, the law in
-  Biot strain, an exponential one, laws made of others, and laws that differ from place to place;
+  Biot strain, an exponential one, one between both, and the law of leaflets, whose tissue differs
+  from place to place and may be prestretched;
   ``solid``: strains, forces and tangents of all elements of a mesh;
 * ``forces``: what acts on the solid (pressure, chordae, annular hinge, ties, contact);
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;

@@ -2,13 +2,14 @@ from .body import box as box
 from .body import outer_faces as outer_faces
 from .body import simulate_body as simulate_body
 from .integrate import simulate as simulate
+from .law import Law as Law
+from .law import Points as Points
 from .law.biot import BiotLaw as BiotLaw
 from .law.moduli import PoissonReading as PoissonReading
 from .law.moduli import TransverselyIsotropic as TransverselyIsotropic
 from .parameters import Parameter as Parameter
 from .settings import ModulusField as ModulusField
 from .settings import StiffPatch as StiffPatch
-from .solid import Law as Law
 from .steps import Damping as Damping
 from .steps import NewtonSettings as NewtonSettings
 from .steps import Simulation as Simulation

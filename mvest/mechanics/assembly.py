@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.mesh.solid_mesh import Embedding
 
 Positions = NDArray[np.int32]
 
@@ -327,6 +328,11 @@ def add_forces(out: FloatArray, nodes: IntArray, forces: FloatArray) -> None:
         for a in range(nodes.shape[1]):
             for i in range(3):
                 out[nodes[g, a], i] += forces[g, a, i]
+
+
+def add_forces_at(out: FloatArray, points: Embedding, force: FloatArray) -> None:
+    """Add forces ``(k, 3)`` N at embedded points to those of the nodes ``out (n, 3)``."""
+    add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])
 
 
 @nb.njit(cache=True)

@@ -6,6 +6,7 @@ Rectangular blocks of any element serve as sheets, strips and patches for exampl
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -15,14 +16,16 @@ from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.solid import Law, Solid
+from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Loads, System
 from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import checked_floats, checked_indices
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 # All local nodes on the grid that halves every cell, in the node orders of mvest.elements.
@@ -169,7 +172,7 @@ def simulate_body(
         ``hex18_thin`` is good on coarse cells (see the results on thin shells).
     material : TransverselyIsotropic, sequence of them, or Law
         One, or one per region; or a law of one's own, which has what
-        :class:`mvest.mechanics.solid.Law` asks for, for all regions.
+        :class:`mvest.mechanics.Law` asks for, for all regions.
     times : array_like
         ``(s,)`` s, end times of the steps, increasing, > 0.
     fixed_nodes : array_like
@@ -235,27 +238,17 @@ def simulate_body(
     >>> result.converged, result.frames.shape
     (True, (11, 338, 3))
     """
-    points, cells = np.asarray(nodes, dtype=float), np.asarray(elements)
-    law: Law
-    if isinstance(material, Law):
-        n_regions = 1 if region is None else int(np.max(np.asarray(region), initial=0)) + 1
-        law, directed = material, True
-    else:
-        materials = _materials(material)
-        n_regions, law = len(materials), BiotLaw.of(materials)
-        directed = not all(_is_isotropic(m) for m in materials)
-    mesh = _mesh(points, cells, element_type, n_regions, directed, fibre, region, pressure_faces)
-    _check_pressure_faces(mesh)
-    fixed = _fixed(fixed_nodes, len(mesh.nodes))
+    mesh, law = _body(nodes, elements, element_type, material, fibre, region, pressure_faces)
+    n = len(mesh.nodes)
+    fixed = np.unique(checked_indices("fixed_nodes", np.asarray(fixed_nodes), n, (None,)))
     system = System(
         Solid(mesh, law, density=density),
         pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
         fixed_nodes=fixed,
-        fixed_components=_components(fixed_components, len(mesh.nodes)),
+        fixed_components=_components(fixed_components, n),
     )
-    curve, pull = _pressure_curve(pressure), _force_curve(forces, len(mesh.nodes))
-    held = mesh.nodes[fixed]
-    ends = np.asarray(times, dtype=float)
+    curve, pull = _pressure_curve(pressure), _force_curve(forces, n)
+    held, ends = mesh.nodes[fixed], np.asarray(times, dtype=float)
     if ends.ndim != 1:
         raise InputError(f"times: shape {ends.shape}, expected (s,)")
     return simulate(
@@ -269,47 +262,43 @@ def simulate_body(
     )
 
 
-def _mesh(
-    nodes: FloatArray,
-    elements: IntArray,
+def _body(
+    nodes: ArrayLike,
+    elements: ArrayLike,
     element_type: str,
-    n_regions: int,
-    directed: bool,
+    material: TransverselyIsotropic | Sequence[TransverselyIsotropic] | Law,
     fibre: ArrayLike | None,
     region: ArrayLike | None,
     pressure_faces: ArrayLike | None,
-) -> SolidMesh:
-    reference = element(element_type)
-    if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
-        raise InputError(f"nodes: shape {nodes.shape}, expected finite (n, 3) mm")
-    if elements.ndim != 2 or elements.shape[1] != reference.n_nodes or elements.size == 0:
-        raise InputError(
-            f"elements: shape {elements.shape}, expected (m, {reference.n_nodes}) of {element_type}"
-        )
-    if not np.issubdtype(elements.dtype, np.integer):
-        raise InputError(f"elements: {elements.dtype}, expected integers")
+) -> tuple[SolidMesh, Law]:
+    points, cells = np.asarray(nodes, dtype=float), np.asarray(elements)
+    width = FACES[element(element_type).face].n_nodes
+    law: Law
+    if isinstance(material, Law):
+        n_regions = 1 if region is None else int(np.max(np.asarray(region), initial=0)) + 1
+        law, directed = material, True
+    else:
+        materials = _materials(material)
+        n_regions, law = len(materials), BiotLaw.of(materials)
+        directed = not all(_is_isotropic(m) for m in materials)
     if region is None and n_regions > 1:
         raise InputError(f"{n_regions} materials need the region (m,) of each element")
-    if fibre is None:
-        if directed:
-            raise InputError("fibre is needed: a material is not isotropic, or a law of one's own")
-        direction = _any_fibre(nodes, elements, element_type)
-    else:
-        direction = _unit(np.asarray(fibre, dtype=float))
-        if direction.shape == (3,):
-            direction = np.broadcast_to(direction, nodes.shape).copy()
-    width = FACES[reference.face].n_nodes
-    return SolidMesh(
-        nodes,
-        elements,
+    if fibre is None and directed:
+        raise InputError("fibre is needed: a material is not isotropic, or a law of one's own")
+    direction = _unit(np.asarray((1.0, 0.0, 0.0) if fibre is None else fibre, dtype=float))
+    mesh = SolidMesh(
+        points,
+        cells,
         element_type,
-        np.zeros(len(elements), dtype=np.int64) if region is None else np.asarray(region),
+        np.zeros(len(cells), dtype=np.int64) if region is None else np.asarray(region),
         tuple(map(str, range(n_regions))),
-        direction,
+        np.tile(direction, (len(points), 1)) if direction.shape == (3,) else direction,
         np.zeros((0, width), dtype=np.int64)
         if pressure_faces is None
         else np.asarray(pressure_faces),
     )
+    _check_pressure_faces(mesh)
+    return (mesh if fibre is not None else replace(mesh, fibre=_any_fibre(mesh))), law
 
 
 def _materials(
@@ -328,35 +317,17 @@ def _is_isotropic(material: TransverselyIsotropic) -> bool:
     return material == TransverselyIsotropic.isotropic(material.E_f, material.nu_fp)
 
 
-def _any_fibre(nodes: FloatArray, elements: IntArray, element_type: str) -> FloatArray:
+def _any_fibre(mesh: SolidMesh) -> FloatArray:
     """Some direction ``(m, k, 3)`` within each layer: along the first reference axis."""
-    reference = element(element_type)
-    if elements.min() < 0 or elements.max() >= len(nodes):
-        raise InputError(f"elements must hold node indices between 0 and {len(nodes) - 1}")
-    along = np.einsum(
-        "mai,qa->mqi", nodes[elements], reference.gradient(reference.node_coordinates)[:, :, 0]
-    )
-    return _unit(along, "the first reference axis of an element")
+    along = mesh.reference.gradient(mesh.reference.node_coordinates)[:, :, 0]
+    return _unit(np.einsum("mai,qa->mqi", mesh.nodes[mesh.elements], along))
 
 
-def _unit(direction: FloatArray, what: str = "fibre") -> FloatArray:
+def _unit(direction: FloatArray) -> FloatArray:
     length = np.linalg.norm(direction, axis=-1, keepdims=True)
     if not np.all(length > 0) or not np.isfinite(direction).all():
-        raise InputError(f"{what} has a length of zero or is not finite")
+        raise InputError("fibre has a length of zero or is not finite")
     return np.asarray(direction / length)
-
-
-def _fixed(fixed_nodes: ArrayLike, n: int) -> IntArray:
-    fixed = np.asarray(fixed_nodes)
-    if fixed.size == 0:
-        return np.zeros(0, dtype=np.int64)
-    if fixed.ndim != 1 or not np.issubdtype(fixed.dtype, np.integer):
-        raise InputError(
-            f"fixed_nodes: shape {fixed.shape} of {fixed.dtype}, expected integers (h,)"
-        )
-    if fixed.min() < 0 or fixed.max() >= n:
-        raise InputError(f"fixed_nodes must lie between 0 and {n - 1}")
-    return np.unique(fixed)
 
 
 def _components(fixed_components: ArrayLike | None, n: int) -> BoolArray:
@@ -373,17 +344,11 @@ def _components(fixed_components: ArrayLike | None, n: int) -> BoolArray:
 def _force_curve(
     forces: Callable[[float], ArrayLike] | ArrayLike | None, n: int
 ) -> Callable[[float], FloatArray | None]:
-    def checked(value: ArrayLike, when: str) -> FloatArray:
-        array = np.asarray(value, dtype=float)
-        if array.shape != (n, 3) or not np.isfinite(array).all():
-            raise InputError(f"forces{when}: shape {array.shape}, expected finite ({n}, 3) N")
-        return array
-
     if forces is None:
         return lambda t: None
     if callable(forces):
-        return lambda t: checked(forces(t), f" at t = {t:g} s")
-    constant = checked(forces, "")
+        return lambda t: checked_floats(f"forces at t = {t:g} s", np.asarray(forces(t)), (n, 3))
+    constant = checked_floats("forces", np.asarray(forces), (n, 3))
     return lambda t: constant
 
 
@@ -393,15 +358,11 @@ def _pressure_curve(
     if callable(pressure):
         return pressure
     table = np.asarray(pressure, dtype=float)
-    if not np.isfinite(table).all():
-        raise InputError("pressure is not finite")
     if table.ndim == 0:
-        constant = float(table)
-        return lambda t: constant
-    if table.ndim != 2 or table.shape[1] != 2 or np.any(np.diff(table[:, 0]) <= 0):
-        raise InputError(
-            f"pressure table: shape {table.shape}, expected (t, 2) with increasing times (s, MPa)"
-        )
+        table = np.array([(0.0, table)])
+    table = checked_floats("pressure table (s, MPa)", table, (None, 2))
+    if np.any(np.diff(table[:, 0]) <= 0):
+        raise InputError("pressure table: expected increasing times")
     return lambda t: float(np.interp(t, table[:, 0], table[:, 1]))
 
 
@@ -411,18 +372,17 @@ def _check_pressure_faces(mesh: SolidMesh) -> None:
     if len(faces) == 0:
         return
     corners = FACES[mesh.reference.face].corners
-    # A node with its elements, as pairs sorted by node, so that candidates of a face are few.
-    flat = mesh.elements.ravel()
-    order = np.argsort(flat, kind="stable")
-    start = np.searchsorted(flat[order], np.arange(len(mesh.nodes) + 1))
+    hosts: dict[int, list[int]] = {}
+    for e, nodes in enumerate(mesh.elements.tolist()):
+        for node in nodes:
+            hosts.setdefault(node, []).append(e)
     for f, face in enumerate(faces):
-        near = order[start[face[0]] : start[face[0] + 1]] // mesh.elements.shape[1]
-        host = [e for e in near if np.isin(face, mesh.elements[e]).all()]
-        if not host:
+        near = [e for e in hosts[int(face[0])] if np.isin(face, mesh.elements[e]).all()]
+        if not near:
             raise GeometryError(f"pressure face {f} {face.tolist()} is not a face of an element")
         a, b, c = np.moveaxis(mesh.nodes[face[corners]], 1, 0)
         normal = np.cross(b - a, c - a).sum(axis=0)
-        inside = mesh.nodes[mesh.elements[host[0]]].mean(axis=0)
+        inside = mesh.nodes[mesh.elements[near[0]]].mean(axis=0)
         if normal @ (mesh.nodes[face].mean(axis=0) - inside) <= 0:
             raise GeometryError(
                 f"pressure face {f} {face.tolist()} points into the solid; reverse its node order"

@@ -293,6 +293,8 @@ def add_tangents(
 
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+TOGETHER = 32
+"""Elements whose tangents are computed at once, in some 10 MB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,13 +335,17 @@ class Sampling:
             np.asarray(np.linalg.inv(to_common)),
         )
 
-    def strain(self, green: FloatArray) -> FloatArray:
-        """Combined strain ``(e, q, 6)`` of strain ``(e, q, 6)``, in the fibre frame."""
-        covariant = _times(self.to_covariant, green)
-        combined = np.einsum("iqp,epi->eqi", self.combination, covariant)
-        sampled = _times(self.from_covariant, combined)
-        mean = _times(self.to_mean, green - sampled).sum(axis=1, keepdims=True)
-        return sampled + _times(self.from_mean, mean)
+    def strain(self, green: FloatArray, part: slice = slice(None)) -> FloatArray:
+        """Combined strain ``(e, q, 6, ...)`` of strain ``(e, q, 6, ...)`` in the fibre frame.
+
+        ``part`` are the elements that the strain is of.
+        """
+        given = green.reshape(*green.shape[:3], -1)
+        covariant = self.to_covariant[part] @ given
+        combined = self.combination[:, None] @ np.moveaxis(covariant, 2, 0)
+        sampled = self.from_covariant[part] @ np.moveaxis(combined, 0, 2)
+        mean = (self.to_mean[part] @ (given - sampled)).sum(axis=1, keepdims=True)
+        return np.asarray((sampled + self.from_mean[part] @ mean).reshape(green.shape))
 
     def stress(self, stress: FloatArray, volumes: FloatArray) -> FloatArray:
         """Stress ``(e, q, 6)`` that does the work of ``stress`` on the strain of displacements."""
@@ -366,10 +372,38 @@ class Sampling:
 
         ``stress`` is what `stress` gives; the others are those of :class:`Solid`.
         """
-        _add_tangents(
-            gradients, volumes, deformation, stress, tangent, modes, self.combination,
-            self.to_covariant, self.from_covariant, self.to_mean, self.from_mean, positions, blocks,
-        )  # fmt: skip
+        n_a = gradients.shape[2]
+        for start in range(0, len(volumes), TOGETHER):
+            part = slice(start, start + TOGETHER)
+            f, g, d = deformation[part], gradients[part], volumes[part][..., None, None]
+            flat = (len(g), g.shape[1] * 6, -1)
+            # Strain by the displacements of the nodes, (e, q, 6, k, 3).
+            b = np.empty((*g.shape[:2], 6, n_a, 3))
+            for row, (i, j) in enumerate(PAIRS):
+                b[:, :, row] = g[..., i, None] * f[:, :, None, :, j]
+                if i != j:
+                    b[:, :, row] += g[..., j, None] * f[:, :, None, :, i]
+            strain = self.strain(b, part).reshape(*g.shape[:2], 6, -1)
+            work, modal = d * tangent[part] @ strain, d * tangent[part] @ modes[part]
+            m = modes[part].reshape(flat).swapaxes(1, 2)
+            k_am = m @ work.reshape(flat)
+            k = strain.reshape(flat).swapaxes(1, 2) @ work.reshape(flat)
+            k -= k_am.swapaxes(1, 2) @ np.linalg.solve(m @ modal.reshape(flat), k_am)
+            pull = np.moveaxis(g @ (d * stress[part][..., VOIGT]), 2, 1)
+            along = np.moveaxis(g, 2, 1).reshape(len(g), n_a, -1)
+            geometric = pull.reshape(along.shape) @ along.swapaxes(1, 2)
+            k = k.reshape(-1, n_a, 3, n_a, 3) + geometric[:, :, None, :, None] * np.eye(3)[:, None]
+            _scatter(k, positions[part], blocks)
+
+
+@nb.njit(cache=True)
+def _scatter(k: FloatArray, positions: NDArray[np.int32], blocks: FloatArray) -> None:
+    """Add ``k (e, k, 3, k, 3)`` to the blocks at ``positions (e, k, k)``, if not negative."""
+    for e in range(len(k)):
+        for a in range(k.shape[1]):
+            for b in range(k.shape[1]):
+                if positions[e, a, b] >= 0:
+                    blocks[positions[e, a, b]] += k[e, a, :, b]
 
 
 def _components(base: FloatArray) -> FloatArray:
@@ -387,76 +421,3 @@ def _components(base: FloatArray) -> FloatArray:
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _add_tangents(
-    gradients: FloatArray,
-    volumes: FloatArray,
-    deformation: FloatArray,
-    stress: FloatArray,
-    tangent: FloatArray,
-    modes: FloatArray,
-    combination: FloatArray,
-    to_covariant: FloatArray,
-    from_covariant: FloatArray,
-    to_mean: FloatArray,
-    from_mean: FloatArray,
-    positions: NDArray[np.int32],
-    blocks: FloatArray,
-) -> None:
-    n_e, n_q, n_a, _ = gradients.shape
-    n_d, n_m = 3 * n_a, modes.shape[3]
-    b = np.empty((6 * n_q, n_d))
-    covariant, combined = np.empty((6, n_q, n_d)), np.empty((6, n_q, n_d))
-    strain, work = np.empty((6 * n_q, n_d)), np.empty((6 * n_q, n_d))
-    g, sg = np.empty((3 * n_q, n_a)), np.empty((3 * n_q, n_a))
-    m = np.empty((6 * n_q, n_m))
-    dm = np.empty((6 * n_q, n_m))
-    for e in range(n_e):
-        for q in range(n_q):
-            f, s, w, r = deformation[e, q], stress[e, q], volumes[e, q], 6 * q
-            for a in range(n_a):
-                g0, g1, g2 = gradients[e, q, a, 0], gradients[e, q, a, 1], gradients[e, q, a, 2]
-                for i in range(3):
-                    c = 3 * a + i
-                    b[r, c] = f[i, 0] * g0
-                    b[r + 1, c] = f[i, 1] * g1
-                    b[r + 2, c] = f[i, 2] * g2
-                    b[r + 3, c] = f[i, 1] * g2 + f[i, 2] * g1
-                    b[r + 4, c] = f[i, 0] * g2 + f[i, 2] * g0
-                    b[r + 5, c] = f[i, 0] * g1 + f[i, 1] * g0
-                p = 3 * q
-                g[p, a], g[p + 1, a], g[p + 2, a] = g0, g1, g2
-                sg[p, a] = w * (s[0] * g0 + s[5] * g1 + s[4] * g2)
-                sg[p + 1, a] = w * (s[5] * g0 + s[1] * g1 + s[3] * g2)
-                sg[p + 2, a] = w * (s[4] * g0 + s[3] * g1 + s[2] * g2)
-            covariant[:, q] = np.dot(to_covariant[e, q], b[r : r + 6])
-        for i in range(6):
-            combined[i] = np.dot(combination[i], covariant[i])
-        mean = np.zeros((6, n_d))
-        for q in range(n_q):
-            r = 6 * q
-            strain[r : r + 6] = np.dot(from_covariant[e, q], np.ascontiguousarray(combined[:, q]))
-            mean += np.dot(to_mean[e, q], b[r : r + 6] - strain[r : r + 6])
-        for q in range(n_q):
-            r = 6 * q
-            strain[r : r + 6] += np.dot(from_mean[e, q], mean)
-            d = volumes[e, q] * tangent[e, q]
-            work[r : r + 6] = np.dot(d, strain[r : r + 6])
-            m[r : r + 6] = modes[e, q]
-            dm[r : r + 6] = np.dot(d, np.ascontiguousarray(modes[e, q]))
-        k = np.dot(strain.T, work)
-        geometric = np.dot(g.T, sg)
-        if n_m > 0:
-            k_am = np.dot(m.T, work)
-            k -= np.dot(k_am.T, np.linalg.solve(np.dot(m.T, dm), k_am))
-        for a in range(n_a):
-            for c in range(n_a):
-                if positions[e, a, c] < 0:
-                    continue
-                block = blocks[positions[e, a, c]]
-                for i in range(3):
-                    block[i, i] += geometric[a, c]
-                    for j in range(3):
-                        block[i, j] += k[3 * a + i, 3 * c + j]

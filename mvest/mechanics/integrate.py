@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import HARMLESS, ContactPairs
+from mvest.mechanics.law import Points
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import SolidState
 from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver
@@ -81,6 +83,15 @@ class _Solved:
     residuals: list[float] = field(default_factory=list)
     pairs: ContactPairs | None = None
     linearised: SolidState | None = None  # of a single solve, where it ends: what it was solved for
+
+
+class _Stride(NamedTuple):
+    """What a step is under: its loads, its length in s, and the damping over it."""
+
+    loads: Loads
+    dt: float
+    static: bool
+    rate: float
 
 
 class _StepError(Exception):
@@ -172,12 +183,11 @@ def simulate(
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
     stepper.last_only = final_only and steps[-1].static
     frames, sensitivities, done = [x0], [state.dx], [initial_time]
-    records: list[StepRecord] = []
     reason = StepReason.COMPLETED
     for step in steps:
         stepper.passing = stepper.last_only and step is not steps[-1]
         try:
-            state = stepper.advance(state, done[-1], step, records)
+            state = stepper.advance(state, done[-1], step)
         except _StepError as failure:
             reason = failure.reason
             break
@@ -185,13 +195,13 @@ def simulate(
         sensitivities.append(state.dx)
         done.append(step.time)
         if on_step is not None:
-            on_step(step.time, sum(len(r.residuals) - 1 for r in records))
+            on_step(step.time, sum(len(r.residuals) - 1 for r in stepper.records))
     return Simulation(
         np.array(done),
         np.array(frames),
         np.array(sensitivities),
         reason,
-        tuple(records),
+        tuple(stepper.records),
         solver.name,
     )
 
@@ -215,21 +225,22 @@ class _Stepper:
         self.newton = newton
         self.parameters = parameters
         self.solver = solver
+        self.records: list[StepRecord] = []
         self.last_only = False
         self.passing = False  # whether the steps now taken are not wanted for themselves
         self._pairs: ContactPairs | None = None
         self._detect = False  # whether collisions are looked for whatever the distances
 
-    def advance(self, state: _State, start: float, step: Step, records: list[StepRecord]) -> _State:
+    def advance(self, state: _State, start: float, step: Step) -> _State:
         """State at ``step.time``; halves the step where it fails."""
         if step.static and (state.dt or self.system.contact is not None):
-            return self._settle(state, start, step.time, records)
+            return self._settle(state, start, step.time)
         pending = [(step.time, 0)]
         time = start
         while pending:
             end, level = pending[-1]
             try:
-                state = self._try(state, end, end - time, step.static, level, records)
+                state = self._try(state, end, end - time, step.static, level)
             except _StepError:
                 if level >= self.newton.max_halvings:
                     raise
@@ -240,34 +251,24 @@ class _Stepper:
             time = end
         return state
 
-    def _settle(
-        self, state: _State, start: float, time: float, records: list[StepRecord]
-    ) -> _State:
+    def _settle(self, state: _State, start: float, time: float) -> _State:
         """Equilibrium at ``time``; where it is not found from a moving body, the body rests first.
 
         Resting takes steps of time under the final loads, each twice as long as the one before.
         """
         for level in range(SETTLINGS + 1):
             try:
-                return self._try(state, time, time - start, True, level, records)
+                return self._try(state, time, time - start, True, level)
             except _StepError:
                 if level == SETTLINGS or not state.dt:
                     raise
             self.passing = self.last_only
             for _ in range(SETTLING_STEPS):
-                state = self._try(state, time, 2 * state.dt, False, level + 1, records)
+                state = self._try(state, time, 2 * state.dt, False, level + 1)
             self.passing = False
         raise AssertionError("unreachable")
 
-    def _try(
-        self,
-        state: _State,
-        time: float,
-        dt: float,
-        static: bool,
-        level: int,
-        records: list[StepRecord],
-    ) -> _State:
+    def _try(self, state: _State, time: float, dt: float, static: bool, level: int) -> _State:
         """State after one step, which is put on record; a failed one leaves nothing behind."""
         enhanced = self.system.solid.enhanced_parameters
         try:
@@ -279,24 +280,12 @@ class _Stepper:
         active = 0
         if contact is not None and solved.pairs is not None:
             active = contact.active(solved.pairs, contact.points(new.x))
-        records.append(StepRecord(time, dt, tuple(solved.residuals), active, level))
+        self.records.append(StepRecord(time, dt, tuple(solved.residuals), active, level))
         return new
 
     def _step(self, state: _State, end: float, dt: float, static: bool) -> tuple[_State, _Solved]:
-        loads = self.loading(end)
-        rate = 0.0 if static else self.damping.beta / dt
-        mass = self.system.solid.lumped_mass[:, None]
-        inertia = 0.0 if static else 1.0
-        # dv/dx of backward Euler is 1/dt: M v' and alpha M v together weigh M by this factor.
-        mass_factor = inertia * (1 / dt**2 + self.damping.alpha / dt)
-        push = inertia * mass * (state.x / dt + state.v) / dt + (
-            inertia * self.damping.alpha * mass * state.x / dt
-        )
-        move = state.move
-        if move is None and not static and state.dt and not self.newton.single_solve:
-            # The first guess continues the motion, but no farther than the last step went.
-            move = min(dt, state.dt) * state.v
-        solved = self._newton(state, loads, rate, mass_factor, push, move)
+        stride = _Stride(self.loading(end), dt, static, 0.0 if static else self.damping.beta / dt)
+        solved = self._newton(state, stride)
         contact = self.system.contact
         if contact is not None and contact.intersects(contact.points(solved.x)):
             if self._detect:
@@ -312,21 +301,23 @@ class _Stepper:
         advanced = 0.0 if static else dt
         new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain, advanced)
         if self.parameters and not self.passing:
-            self._differentiate(state, new, solved, loads, rate, dt, static)
+            self._differentiate(state, new, solved, stride)
         return new, solved
 
-    def _newton(
-        self,
-        state: _State,
-        loads: Loads,
-        rate: float,
-        mass_factor: float,
-        push: FloatArray,
-        move: FloatArray | None,
-    ) -> _Solved:
-        system, newton = self.system, self.newton
+    def _newton(self, state: _State, stride: _Stride) -> _Solved:
+        system, newton, loads, dt = self.system, self.newton, stride.loads, stride.dt
         tolerance = max(newton.path_tolerance if self.passing else 0.0, newton.tolerance)
         mass = system.solid.lumped_mass[:, None]
+        inertia = 0.0 if stride.static else 1.0
+        # dv/dx of backward Euler is 1/dt: M v' and alpha M v together weigh M by this factor.
+        mass_factor = inertia * (1 / dt**2 + self.damping.alpha / dt)
+        push = inertia * mass * (state.x / dt + state.v) / dt + (
+            inertia * self.damping.alpha * mass * state.x / dt
+        )
+        move = state.move
+        if move is None and not stride.static and state.dt and not newton.single_solve:
+            # The first guess continues the motion, but no farther than the last step went.
+            move = min(dt, state.dt) * state.v
         fixed = system.fixed_nodes
         x = state.x.copy()
         pairs = self._candidates(x)
@@ -342,7 +333,7 @@ class _Stepper:
         def evaluate(at: FloatArray) -> Evaluation:
             nonlocal pairs
             pairs = self._candidates(at)
-            result = system.evaluate(at, loads, pairs, state.strain, rate, tangent=False)
+            result = system.evaluate(at, loads, pairs, state.strain, stride.rate, tangent=False)
             inertial = mass_factor * mass * at - push
             result.residual += inertial
             result.scale = max(result.scale, float(np.linalg.norm(inertial)), 1e-12)
@@ -449,18 +440,9 @@ class _Stepper:
             raise _StepError(StepReason.NO_CONVERGENCE)
         return best[1:]
 
-    def _differentiate(
-        self,
-        old: _State,
-        new: _State,
-        solved: _Solved,
-        loads: Loads,
-        rate: float,
-        dt: float,
-        static: bool,
-    ) -> None:
+    def _differentiate(self, old: _State, new: _State, solved: _Solved, stride: _Stride) -> None:
         """Fill the derivatives of ``new``; the solver holds the factor of the converged tangent."""
-        system = self.system
+        system, (loads, dt, static, rate) = self.system, stride
         solid, state = system.solid, solved.linearised or solved.evaluation.solid
         mass = solid.lumped_mass[:, None]
         region = solid.mesh.region
@@ -470,13 +452,11 @@ class _Stepper:
             d_stress = system.partial_stress(parameter, state, old.strain, rate)
             if parameter.kind == "damping" and not static:
                 # The law is damped by ``rate = beta / dt`` times the change of its strain.
-                d_stress = d_stress + solid.law.history_stress(
-                    state.green, region, old.strain - new.strain, 1 / dt
-                )
+                at = Points(state.green, region, old.strain, 1 / dt)
+                d_stress = d_stress + solid.law.history_stress(at, old.strain - new.strain)
             if rate:
-                d_stress = d_stress + solid.law.history_stress(
-                    state.green, region, old.d_strain[k], rate
-                )
+                at = Points(state.green, region, old.strain, rate)
+                d_stress = d_stress + solid.law.history_stress(at, old.d_strain[k])
             stresses.append(d_stress)
             r = system.partial_load(parameter, solved.x, loads)
             add_forces(r, solid.mesh.elements, solid.condensed_forces(state, d_stress))

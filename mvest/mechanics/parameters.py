@@ -2,7 +2,7 @@
 
 A name is ``KIND`` or ``KIND.PART``: the part is a leaflet of the valve, a family of chordae, a
 papillary tip, or the leaflet and number of a mode. This is the one place that knows them; laws say
-which of the kinds of tissue they know (:attr:`mvest.mechanics.solid.Law.kinds`).
+which of the kinds of tissue they know (:attr:`mvest.mechanics.law.Law.kinds`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from mvest.errors import InputError
 
@@ -23,92 +24,57 @@ class NamePart(Enum):
     MODE = "REGION.K"
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(NamedTuple):
     """One kind of parameter.
 
     Attributes
     ----------
     unit : str
         Empty for what has none.
-    positive : bool
-        Whether it is positive by nature, so that it is estimated by its logarithm.
     part : NamePart
         What its names are made of.
-    whole : bool
-        Whether it also exists without a part, for the whole valve.
-    description : str
     low, high : float
         Ends of the range that a configuration may ask for.
+    description : str
+    positive : bool
+        Whether it is positive by nature, so that it is estimated by its logarithm.
     """
 
     unit: str
-    positive: bool
     part: NamePart
-    whole: bool
-    description: str
     low: float
     high: float
+    description: str
+    positive: bool = True
 
+    @property
+    def whole(self) -> bool:
+        """Whether it also exists without a part, for the whole valve."""
+        return self.part in (NamePart.NONE, NamePart.CHORDS)
+
+
+_REGION, _CHORDS = NamePart.REGION, NamePart.CHORDS
 
 KINDS: dict[str, Kind] = {
-    "E_f": Kind(
-        "MPa", True, NamePart.REGION, False, "Young's modulus along the fibre", 1e-06, 10000
-    ),
-    "ratio": Kind(
-        "", True, NamePart.REGION, False, "E_f over E_perp, at the same E_f", 0.001, 1000
-    ),
-    "G": Kind(
-        "MPa",
-        True,
-        NamePart.REGION,
-        False,
-        "shear modulus, where it does not follow E_f",
-        1e-06,
-        10000,
-    ),
+    "E_f": Kind("MPa", _REGION, 1e-6, 1e4, "Young's modulus along the fibre"),
+    "ratio": Kind("", _REGION, 1e-3, 1e3, "E_f over E_perp, at the same E_f"),
+    "G": Kind("MPa", _REGION, 1e-6, 1e4, "shear modulus, where it does not follow E_f"),
     "field": Kind(
-        "",
-        False,
-        NamePart.MODE,
-        False,
-        "coefficient of a mode of log E_f within a leaflet",
-        -10,
-        10,
+        "", NamePart.MODE, -10, 10, "coefficient of a mode of log E_f within a leaflet", False
     ),
-    "pressure_scale": Kind("", True, NamePart.NONE, True, "factor on the pressure", 0, 100),
-    "chord_stiffness": Kind(
-        "", True, NamePart.CHORDS, True, "factor on the axial stiffness", 0, 100
-    ),
-    "chord_rest_length": Kind("", True, NamePart.CHORDS, True, "factor on the rest length", 0, 100),
-    "damping": Kind(
-        "s", True, NamePart.NONE, True, "stiffness-proportional part of the damping", 0, 1000
-    ),
-    "c0": Kind("MPa", True, NamePart.REGION, False, "scale of the exponential law", 1e-06, 10000),
-    "c1": Kind(
-        "", True, NamePart.REGION, False, "its exponent of the isochoric deformation", 0, 100000
-    ),
-    "c2": Kind("", True, NamePart.REGION, False, "its exponent of the fibres' stretch", 0, 100000),
-    "mu": Kind("MPa", True, NamePart.REGION, False, "its shear modulus at rest", 1e-06, 10000),
-    "kappa": Kind("MPa", True, NamePart.REGION, False, "its bulk modulus", 1e-06, 10000),
+    "pressure_scale": Kind("", NamePart.NONE, 0, 100, "factor on the pressure"),
+    "chord_stiffness": Kind("", _CHORDS, 0, 100, "factor on the axial stiffness"),
+    "chord_rest_length": Kind("", _CHORDS, 0, 100, "factor on the rest length"),
+    "damping": Kind("s", NamePart.NONE, 0, 1e3, "stiffness-proportional part of the damping"),
+    "c0": Kind("MPa", _REGION, 1e-6, 1e4, "scale of the exponential law"),
+    "c1": Kind("", _REGION, 0, 1e5, "its exponent of the isochoric deformation"),
+    "c2": Kind("", _REGION, 0, 1e5, "its exponent of the fibres' stretch"),
+    "mu": Kind("MPa", _REGION, 1e-6, 1e4, "its shear modulus at rest"),
+    "kappa": Kind("MPa", _REGION, 1e-6, 1e4, "its bulk modulus"),
     "stiffening": Kind(
-        "",
-        True,
-        NamePart.REGION,
-        False,
-        "share of the exponential law over that of the linear one",
-        0,
-        1e06,
+        "", _REGION, 0, 1e6, "share of the exponential law over that of the linear one"
     ),
-    "prestretch": Kind(
-        "",
-        True,
-        NamePart.REGION,
-        False,
-        "length of the open leaflet over that free of stress",
-        0,
-        5,
-    ),
+    "prestretch": Kind("", _REGION, 0, 5, "length of the open leaflet over that free of stress"),
 }
 
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from mvest.mechanics.assembly import add_forces
+from mvest.mechanics.assembly import add_forces, add_forces_at
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import EXACT, LinearSolver
@@ -234,11 +234,10 @@ def _outside_change(
             None if variation.areas is None else variation.areas[k],
             None if variation.thickness is None else variation.thickness[k],
         )
-        add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])
+        add_forces_at(out, points, force)
     if system.hinge is not None and variation.supports is not None:
-        points = system.hinge.points
         force = -system.hinge.stiffness[:, None] * variation.supports[k]
-        add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])
+        add_forces_at(out, system.hinge.points, force)
     if system.cables is not None:
         cables, factors = system.cables, system.factors
         pull, stiffness, _, by_length = cables.forces(
@@ -257,7 +256,6 @@ def _outside_change(
             force += np.einsum("cij,cj->ci", stiffness, moved)
             pulled = np.zeros((len(points), 3))
             add_forces(pulled, variation.members, weights[:, :, None] * pull[:, None, :])
-            add_forces(out, points.nodes, points.weights[:, :, None] * pulled[:, None, :])
-        patches = cables.patches
-        add_forces(out, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
+            add_forces_at(out, points, pulled)
+        add_forces_at(out, cables.patches, force)
     return out

@@ -99,9 +99,9 @@ class TissueSettings:
         ``A`` or ``C`` (see :class:`mvest.mechanics.law.biot.PoissonReading`).
     law : str
         ``biot``, the linear law, to which all of the above belongs, ``corotational``, its usual
-        form on linear tetrahedra (:mod:`mvest.mechanics.law.linear`), ``exponential``
+        form on linear tetrahedra (:mod:`mvest.mechanics.law.biot`), ``exponential``
         (:mod:`mvest.mechanics.law.exponential`), or ``stiffening``, on the way from the first to
-        the last (:mod:`mvest.mechanics.law.stiffening`).
+        the last.
     exponential : ExponentialTissue, optional
         Coefficients of the exponential law, where they are not parameters; of a stiffening one
         their common scale does not matter.
@@ -109,7 +109,7 @@ class TissueSettings:
         How far on that way, where it is no parameter.
     prestretch : float
         How many times as long in its plane the open leaflet was seen as it would be free of stress
-        (:mod:`mvest.mechanics.law.stiffening`), where it is no parameter; not of the corotational
+        (:mod:`mvest.mechanics.law.regional`), where it is no parameter; not of the corotational
         law.
     """
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +30,7 @@ from numpy.typing import NDArray
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
+    PAIRS,
     Sampling,
     add_tangents,
     alpha_change,
@@ -39,9 +39,9 @@ from mvest.mechanics.element import (
     strain_derivative,
     strains,
 )
-from mvest.mechanics.law.linear import EdgeRotations, LinearLaw
-from mvest.mechanics.parameters import Parameter
-from mvest.typing import FloatArray, IntArray
+from mvest.mechanics.law import Law, Points
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 ENHANCED_ITERATIONS = 12
@@ -49,57 +49,6 @@ ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
 LINEAR = 1e-7
 """Size of an alpha correction that the stress follows linearly, and the tangent not noticeably."""
-
-
-@runtime_checkable
-class Law(Protocol):
-    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`).
-
-    Arrays of points have the axes (element, quadrature point, component). Strain and stress are
-    six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame of the point, strain with engineering
-    shear, stress the second Piola-Kirchhoff one in MPa; ``region (e,)`` counts from 0.
-    """
-
-    def strain(self, green: FloatArray) -> FloatArray:
-        """Strain measure ``(e, q, 6)`` whose rate is damped."""
-
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``, its derivative by ``green``.
-
-        ``previous (e, q, 6)`` is the strain measure at the start of the step and ``rate`` the
-        stiffness-proportional damping over the step, 0 in an equilibrium.
-        """
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kinds of parameter (:data:`mvest.mechanics.parameters.KINDS`) that it knows."""
-
-    def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
-    ) -> FloatArray:
-        """Derivative of the stress ``(e, q, 6)`` by a parameter of region ``which``.
-
-        At fixed strain; ``stress`` is what `response` has given with the same arguments, of which
-        the derivative is often a multiple. InputError if the parameter is none of `kinds`.
-        """
-
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
-        """Change of the stress for a change of the previous strain measure."""
-
-    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
-        """Change of the strain measure for a change of the Green-Lagrange strain."""
 
 
 @dataclass(slots=True, eq=False)
@@ -160,7 +109,7 @@ class Solid:
         self.n_modes = self.polynomials.shape[1]
         self.sampling = _sampling(mesh, reference)
         self.rotations = None
-        if isinstance(law, LinearLaw) and law.corotational:
+        if isinstance(law, BiotLaw) and law.corotational:
             at_rest = strains(mesh.nodes, mesh.elements, self.gradients)[1]
             self.rotations = EdgeRotations(mesh, at_rest)
         self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)
@@ -183,12 +132,12 @@ class Solid:
         if self.rotations is not None:
             green_u, f = self.rotations(x, f)
         if self.n_modes == 0:
-            stress, tangent = self.law.response(green_u, region, previous, rate)
+            stress, tangent = self.law.response(Points(green_u, region, previous, rate))
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
         alpha = self.enhanced_parameters
         for _ in range(ENHANCED_ITERATIONS):
             green = enhanced_strain(green_u, self.direction, self.polynomials, alpha)
-            stress, tangent = self.law.response(green, region, previous, rate)
+            stress, tangent = self.law.response(Points(green, region, previous, rate))
             step = self._alpha_change(stress, tangent)
             size = float(np.abs(step).max(initial=0.0))
             if not np.isfinite(size) or size < ENHANCED_TOLERANCE:
@@ -295,6 +244,63 @@ class Solid:
         return alpha_change(self.direction, self.polynomials, self.volumes, stress, tangent)
 
 
+class EdgeRotations:
+    """Frames of linear tetrahedra that turn with their edges.
+
+    The rotation is that of the matrix of edges from the first node, :math:`A = (x_1 - x_0, x_2 -
+    x_0, x_3 - x_0)`: the polar factor at x times the inverse of that at rest. It is the "polar"
+    form of SOFA's tetrahedra, and not the polar factor of the deformation gradient.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    frames : ndarray
+        ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
+
+    Raises
+    ------
+    InputError
+        If the elements are not linear tetrahedra.
+    """
+
+    def __init__(self, mesh: SolidMesh, frames: FloatArray) -> None:
+        if mesh.element_type != "tet4":
+            raise InputError(
+                f"the corotational law is that of linear tetrahedra (tet4), not {mesh.element_type}"
+            )
+        self._elements = mesh.elements
+        self._start = _polar(self._edges(mesh.nodes))
+        self._frames = frames
+
+    def _edges(self, x: FloatArray) -> FloatArray:
+        corners = x[self._elements]
+        return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+    def __call__(self, x: FloatArray, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Linear strain ``(e, 1, 6)`` in the turned frames, and these ``(e, 1, 3, 3)``.
+
+        Parameters
+        ----------
+        x : ndarray
+            ``(n, 3)`` mm.
+        deformation : ndarray
+            ``(e, 1, 3, 3)`` F in the fibre frame.
+        """
+        rotation = _polar(self._edges(x)) @ np.swapaxes(self._start, 1, 2)
+        frames = rotation[:, None] @ self._frames
+        h = np.swapaxes(frames, 2, 3) @ deformation - np.eye(3)
+        normal = [h[..., i, i] for i in range(3)]
+        shear = [h[..., i, j] + h[..., j, i] for i, j in ((1, 2), (0, 2), (0, 1))]
+        return np.stack(normal + shear, axis=-1), np.ascontiguousarray(frames)
+
+
+def _polar(a: FloatArray) -> FloatArray:
+    """The rotation ``(e, 3, 3)`` that is nearest to each matrix, also where one is inverted."""
+    u, _, v = np.linalg.svd(a)
+    u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
+    return u @ v
+
+
 def kernels_are_compiled() -> bool:
     """Whether the machine code of the kernels lies in numba's cache; if not, first use makes it."""
     place = add_tangents.stats.cache_path
@@ -348,17 +354,7 @@ def _enhanced_direction(mesh: SolidMesh, reference: Element) -> FloatArray:
     # Unit amplitude means unit thickness strain: scale by the length of G^3.
     thickness_vector /= np.linalg.norm(thickness_vector, axis=1, keepdims=True)
     g = np.einsum("ei,eqim->eqm", thickness_vector, frame)
-    dyad = np.stack(
-        [
-            g[..., 0] ** 2,
-            g[..., 1] ** 2,
-            g[..., 2] ** 2,
-            2 * g[..., 1] * g[..., 2],
-            2 * g[..., 0] * g[..., 2],
-            2 * g[..., 0] * g[..., 1],
-        ],
-        axis=-1,
-    )
+    dyad = np.stack([(1 if i == j else 2) * g[..., i] * g[..., j] for i, j in PAIRS], axis=-1)
     ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian)
     return np.ascontiguousarray(ratio[:, :, None] * dyad)
 

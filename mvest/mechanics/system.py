@@ -7,6 +7,7 @@ inertia and mass-proportional damping. The tangent is dr/dx, exact in every term
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,7 @@ from mvest.mechanics.assembly import (
     BlockMatrix,
     SparsityPattern,
     add_forces,
+    add_forces_at,
     adjacency,
     elements_of_nodes,
     scatter_blocks,
@@ -24,8 +26,9 @@ from mvest.mechanics.forces.cables import Cables, Hinge, Ties
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law import Law, Points
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of
-from mvest.mechanics.solid import Law, Solid, SolidState
+from mvest.mechanics.solid import Solid, SolidState
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding
 
@@ -136,8 +139,9 @@ class System:
         self.held[self.fixed_nodes] = True
         if fixed_components is not None:
             self.held |= fixed_components
+        faces = [] if pressure is None else [pressure.faces]
         self._static = SparsityPattern.of(
-            adjacency(self.n, self._static_groups()),
+            adjacency(self.n, [solid.mesh.elements, *faces, *self._attached_nodes()]),
             np.zeros((0, 2), dtype=np.int64) if pressure is None else pressure.rim(),
         )
         self._around = elements_of_nodes(self.n, solid.mesh.elements)
@@ -154,18 +158,14 @@ class System:
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     # -- sparsity ---------------------------------------------------------------------------------
-    def _static_groups(self) -> list[IntArray]:
-        groups = [self.solid.mesh.elements]
-        if self.pressure is not None:
-            groups.append(self.pressure.faces)
-        for part in (
+    def _attached_nodes(self) -> list[IntArray]:
+        """Nodes of the points of cables, hinge and ties."""
+        points = (
             self.cables.patches if self.cables else None,
             self.hinge.points if self.hinge else None,
             self.ties.spans if self.ties else None,
-        ):
-            if part is not None:
-                groups.append(part.nodes)
-        return groups
+        )
+        return [part.nodes for part in points if part is not None]
 
     def _build_pattern(self, hosts: IntArray) -> None:
         """Pattern with contact between the pairs of elements ``hosts (g, 2)``, in their order."""
@@ -176,12 +176,7 @@ class System:
         if self.pressure is not None:
             self._at_faces = self.pattern.within(self.pressure.faces)
             self._at_faces_skew = self.pattern.within_skew(self.pressure.faces)
-        if self.cables is not None:
-            self._at_cables = self.pattern.within(self.cables.patches.nodes)
-        if self.hinge is not None:
-            self._at_hinge = self.pattern.within(self.hinge.points.nodes)
-        if self.ties is not None:
-            self._at_ties = self.pattern.within(self.ties.spans.nodes)
+        self._at_attached = [self.pattern.within(nodes) for nodes in self._attached_nodes()]
         self._at_contact = self.pattern.between(elements[hosts[:, 0]], elements[hosts[:, 1]])
         self._at_diagonal = self.pattern.pointer[:-1]
         free, rows, columns = ~self.held, self.pattern.rows, self.pattern.all_columns
@@ -233,17 +228,11 @@ class System:
         if loads.body_force is not None:
             residual -= loads.body_force
             scale = max(scale, float(np.linalg.norm(loads.body_force)))
-        if self.cables is not None:
-            force = self._cable_forces(self.cables, x, loads)[0]
-            _spread(residual, self.cables.patches, force)
-        if self.hinge is not None:
-            _spread(residual, self.hinge.points, self.hinge.forces(x, loads.hinge))
-        if self.ties is not None and loads.tie_lengths is not None:
-            force, _ = self.ties.forces(x, loads.tie_lengths)
-            _spread(residual, self.ties.spans, force)
+        for points, force, _ in self._attached(x, loads):
+            add_forces_at(residual, points, force)
         if self.contact is not None and pairs is not None:
             points = self.contact.points
-            _spread(residual, points, self.contact.forces(pairs, points(x)))
+            add_forces_at(residual, points, self.contact.forces(pairs, points(x)))
         blocks = self.tangent(x, loads, pairs, state) if tangent else None
         return Evaluation(residual, scale, state, blocks)
 
@@ -270,17 +259,24 @@ class System:
         p = self.factors.pressure * loads.pressure
         if self.pressure is not None and p != 0 and load_stiffness:
             self.pressure.add_tangent(x, -p, self._at_faces, self._at_faces_skew, blocks)
-        if self.cables is not None:
-            stiffness = self._cable_forces(self.cables, x, loads)[1]
-            scatter_blocks(blocks, self._at_cables, self.cables.patches.weights, stiffness)
-        if self.hinge is not None:
-            scatter_blocks(blocks, self._at_hinge, self.hinge.points.weights, self.hinge.blocks)
-        if self.ties is not None and loads.tie_lengths is not None:
-            _, stiffness = self.ties.forces(x, loads.tie_lengths)
-            scatter_blocks(blocks, self._at_ties, self.ties.spans.weights, stiffness)
+        attached = zip(self._at_attached, self._attached(x, loads), strict=False)
+        for at, (points, _, stiffness) in attached:
+            scatter_blocks(blocks, at, points.weights, stiffness)
         if self.contact is not None and pairs is not None and y is not None and slots is not None:
             self.contact.add_tangent(pairs, y, blocks, slots, self._at_contact, self._at_elements)
         return blocks
+
+    def _attached(
+        self, x: FloatArray, loads: Loads
+    ) -> Iterator[tuple[Embedding, FloatArray, FloatArray]]:
+        """Points of cables, hinge and ties, with their internal forces N and stiffness N/mm."""
+        if self.cables is not None:
+            force, stiffness, *_ = self._cable_forces(self.cables, x, loads)
+            yield self.cables.patches, force, stiffness
+        if self.hinge is not None:
+            yield self.hinge.points, self.hinge.forces(x, loads.hinge), self.hinge.blocks
+        if self.ties is not None and loads.tie_lengths is not None:
+            yield self.ties.spans, *self.ties.forces(x, loads.tie_lengths)
 
     def _cable_forces(
         self, cables: Cables, x: FloatArray, loads: Loads
@@ -327,15 +323,8 @@ class System:
             raise InputError(
                 f"parameter {parameter.name!r}: unknown region; the mesh has {', '.join(names)}"
             )
-        return self.solid.law.partial_stress(
-            parameter,
-            state.green,
-            mesh.region,
-            previous,
-            rate,
-            which=names.index(parameter.region),
-            stress=state.stress,
-        )
+        at, which = Points(state.green, mesh.region, previous, rate), names.index(parameter.region)
+        return self.solid.law.partial_stress(parameter, at, which=which, stress=state.stress)
 
     def partial_load(self, parameter: Parameter, x: FloatArray, loads: Loads) -> FloatArray:
         """Partial derivative ``(n, 3)`` of the residual by the parameter, solid's part excluded."""
@@ -355,8 +344,3 @@ class System:
             weights = patches.weights * share[:, None]
             add_forces(out, patches.nodes, weights[:, :, None] * force[:, None, :])
         return out
-
-
-def _spread(out: FloatArray, points: Embedding, force: FloatArray) -> None:
-    """Add forces ``(k, 3)`` N at embedded points to those of the nodes ``out (n, 3)``."""
-    add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])

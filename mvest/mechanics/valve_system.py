@@ -16,15 +16,13 @@ from mvest.errors import InputError
 from mvest.mechanics.forces.cables import Cables, Hinge, TiedPoints
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import ExponentialLaw
-from mvest.mechanics.law.linear import LinearLaw
-from mvest.mechanics.law.moduli import LeafletModuli
-from mvest.mechanics.law.regional import FieldBasis, FieldLaw, RegionalLaw, at_quadrature
-from mvest.mechanics.law.stiffening import PrestretchedLaw, StiffeningLaw
+from mvest.mechanics.law.exponential import ExponentialLaw, StiffeningLaw
+from mvest.mechanics.law.regional import FieldBasis, LeafletLaw, ModulusVariation, at_quadrature
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
-from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
-from mvest.mechanics.solid import Law, Solid
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, MechanicsSettings
+from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray, IntArray
 from mvest.units import mmhg_to_mpa
@@ -59,22 +57,6 @@ class HeldState:
     pressure_mmHg: float
     annulus: FloatArray
     papillary_tips: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ModulusVariation:
-    """How the modulus varies within the leaflets, at the quadrature points of a mesh.
-
-    Attributes
-    ----------
-    modes : mapping
-        Region -> ``(e, q, k)`` modes of its field.
-    given : ndarray or float
-        ``(e, q)`` part of log E_f that is no unknown.
-    """
-
-    modes: Mapping[str, FloatArray]
-    given: FloatArray | float
 
 
 def build_system(
@@ -185,32 +167,18 @@ def material_law(
     MaterialError
         If a modulus is inadmissible.
     """
-    tissues = [_tissue(region, settings, values) for region in mesh.region_names]
-    linear = [t for t in tissues if isinstance(t, LeafletModuli)]
-    exponential = [t for t in tissues if isinstance(t, ExponentialTissue)]
-    alike = len(tissues) in (len(linear), len(exponential))
-    corotational = {settings.tissue[r].law == "corotational" for r in mesh.region_names}
-    if len(corotational) > 1:
+    regions = mesh.region_names
+    kinds = {settings.tissue[region].law for region in regions if region in settings.tissue}
+    if "corotational" in kinds and len(kinds) > 1:
         raise InputError("the corotational law is that of all regions of a mesh, or of none")
-    law: Law
-    if corotational == {True}:
-        law = LinearLaw.of_moduli(linear, corotational=True)
-    elif not alike:
-        law = RegionalLaw(tuple(map(_law_of_one, tissues)), mesh.region)
-    elif linear:
-        law = BiotLaw.of_moduli(linear)
-    else:
-        law = ExponentialLaw.of(exponential)
+    together = [regions] if len(kinds) == 1 and "stiffening" not in kinds else zip(regions)
+    laws = tuple(_law_of(own, settings, values) for own in together)
     prestretch = _prestretch(mesh, settings, values)
-    if np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values):
-        law = PrestretchedLaw(law, prestretch, mesh.region)
-    if variation is None:
-        return law
-    coefficients = {
-        region: np.array([values.get(f"field.{region}.{k}", 0.0) for k in range(own.shape[2])])
-        for region, own in variation.modes.items()
-    }
-    return FieldLaw(law, variation.modes, coefficients, variation.given)
+    stretched = np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values)
+    if variation is None and not stretched and len(laws) == 1:
+        return laws[0]
+    scale = 1.0 if variation is None else variation.scale(values)
+    return LeafletLaw(laws, mesh.region, prestretch, scale, variation)
 
 
 def _prestretch(
@@ -228,34 +196,35 @@ def _prestretch(
     return found
 
 
-def _tissue(
-    region: str, settings: MechanicsSettings, values: Mapping[str, float]
-) -> LeafletModuli | ExponentialTissue | StiffeningLaw:
-    """The law of one region, or what it is made of."""
-    tissue = settings.tissue.get(region)
-    if tissue is not None and tissue.law == "exponential":
-        names = {kind: f"{kind}.{region}" for kind in EXPONENTIAL_KINDS}
-        return tissue.coefficients({k: values[n] for k, n in names.items() if n in values})
-    if tissue is None or f"E_f.{region}" not in values:
-        raise InputError(
-            f"region {region!r} of the mesh has no tissue or modulus; given are "
-            f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
+def _law_of(
+    regions: tuple[str, ...], settings: MechanicsSettings, values: Mapping[str, float]
+) -> Law:
+    """The law of regions whose tissue is of one kind, as of a body of these regions."""
+    for region in regions:
+        tissue = settings.tissue.get(region)
+        if tissue is None or (tissue.law != "exponential" and f"E_f.{region}" not in values):
+            raise InputError(
+                f"region {region!r} of the mesh has no tissue or modulus; given are "
+                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
+            )
+    tissues = [settings.tissue[region] for region in regions]
+
+    def given(region: str, *kinds: str) -> dict[str, float]:
+        return {k: values[f"{k}.{region}"] for k in kinds if f"{k}.{region}" in values}
+
+    if tissues[0].law == "exponential":
+        found = (given(region, *EXPONENTIAL_KINDS) for region in regions)
+        return ExponentialLaw.of(
+            [t.coefficients(own) for t, own in zip(tissues, found, strict=True)]
         )
-    if tissue.law == "stiffening":
-        stiffening = values.get(f"stiffening.{region}", tissue.stiffening)
-        return StiffeningLaw.of(tissue, values[f"E_f.{region}"], stiffening)
-    return tissue.moduli(
-        values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
-    )
-
-
-def _law_of_one(tissue: LeafletModuli | ExponentialTissue | StiffeningLaw) -> Law:
-    """The law of a body of one region."""
-    if isinstance(tissue, StiffeningLaw):
-        return tissue
-    if isinstance(tissue, LeafletModuli):
-        return BiotLaw.of_moduli([tissue])
-    return ExponentialLaw.of([tissue])
+    if tissues[0].law == "stiffening":
+        own = {"stiffening": tissues[0].stiffening, **given(regions[0], "E_f", "stiffening")}
+        return StiffeningLaw.of(tissues[0], **own)
+    moduli = [
+        tissue.moduli(**given(region, "E_f", "ratio", "G"))
+        for tissue, region in zip(tissues, regions, strict=True)
+    ]
+    return BiotLaw.of_moduli(moduli, corotational=tissues[0].law == "corotational")
 
 
 def variation_of(
@@ -279,7 +248,7 @@ def retune(system: System, settings: MechanicsSettings, values: Mapping[str, flo
     """Give a system of a valve other values of its parameters; see `build_system`."""
     assert system.cables is not None
     old = system.solid.law
-    variation = ModulusVariation(old.modes, old.given) if isinstance(old, FieldLaw) else None
+    variation = old.variation if isinstance(old, LeafletLaw) else None
     law = material_law(system.solid.mesh, settings, values, variation)
     system.retune(law, factors_of(system.cables, values))
 
@@ -378,21 +347,14 @@ def boundary_loading(
 ) -> Callable[[float], Loads]:
     """Time -> loads: pressure, annulus and papillary tips of ``pacing`` (default: the closure)."""
     protocol: Pacing = settings.protocol if pacing is None else pacing
-    assert system.hinge is not None
-    start = system.hinge.points(system.solid.mesh.nodes)
     motion = contact_valve.motion
     shift = motion.annulus - motion.annulus[0]
-    copies = len(start) // shift.shape[1]
-    shift = np.tile(shift, (1, copies, 1))
 
     def loading(t: float) -> Loads:
         phase = protocol.phase(t)
-        return Loads(
-            pressure=mmhg_to_mpa(protocol.pressure(t)),
-            tips=_interpolate(motion.phase, motion.papillary_tips, phase),
-            hinge=start + _interpolate(motion.phase, shift, phase),
-            tie_lengths=_tie_lengths(system, phase),
-        )
+        moved = _interpolate(motion.phase, shift, phase)
+        tips = _interpolate(motion.phase, motion.papillary_tips, phase)
+        return _loads(system, protocol.pressure(t), moved, tips, phase)
 
     return loading
 
@@ -407,7 +369,6 @@ def held_loading(
     InputError
         If the frame's annulus or tips are not those of the valve.
     """
-    assert system.hinge is not None
     rest = contact_valve.motion.annulus[0]
     for name, given, own in (
         ("annulus", state.annulus, rest),
@@ -415,23 +376,25 @@ def held_loading(
     ):
         if given.shape != own.shape:
             raise InputError(f"held {name}: shape {given.shape}, expected {own.shape}")
-    start = system.hinge.points(system.solid.mesh.nodes)
-    shift = np.tile(state.annulus - rest, (len(start) // len(rest), 1))
-    loads = Loads(
-        pressure=mmhg_to_mpa(state.pressure_mmHg),
-        tips=state.papillary_tips,
-        hinge=start + shift,
-        tie_lengths=_tie_lengths(system, 1.0),
-    )
+    moved = state.annulus - rest
+    loads = _loads(system, state.pressure_mmHg, moved, state.papillary_tips, 1.0)
     return lambda t: loads
 
 
-def _tie_lengths(system: System, phase: float) -> FloatArray | None:
-    """Lengths ``(k,)`` mm of the ties: from those at rest, without force, to that when closed."""
-    if system.ties is None:
-        return None
-    rest = system.ties.lengths(system.solid.mesh.nodes)
-    return (1 - phase) * rest + phase * system.ties.closed_length
+def _loads(
+    system: System, pressure_mmHg: float, moved: FloatArray, tips: FloatArray, phase: float
+) -> Loads:
+    """Loads with the annulus ``moved (k, 3)`` mm from its place at rest, and tips ``(t, 3)`` mm.
+
+    Ties go from their length at rest, where they are without force, to that in the closed valve.
+    """
+    assert system.hinge is not None
+    nodes, lengths = system.solid.mesh.nodes, None
+    if system.ties is not None:
+        lengths = (1 - phase) * system.ties.lengths(nodes) + phase * system.ties.closed_length
+    start = system.hinge.points(nodes)
+    hinge = start + np.tile(moved, (len(start) // len(moved), 1))
+    return Loads(mmhg_to_mpa(pressure_mmHg), tips, hinge, tie_lengths=lengths)
 
 
 def _interpolate(phases: FloatArray, frames: FloatArray, phase: float) -> FloatArray:

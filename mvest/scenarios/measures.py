@@ -12,13 +12,10 @@ include the enhanced strain of solid-shells, which no displacement has.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.errors import InputError
-from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.scenarios.scenario import plane_of
@@ -139,9 +136,7 @@ def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.eigvalsh(sigma)[..., -1])
 
 
-def peak_stress(
-    system: System, x: FloatArray, changes: Mapping[Parameter, float] | None = None
-) -> Measured:
+def peak_stress(system: System, x: FloatArray) -> Measured:
     """Peak stress of each region in equilibrium, as `Measured` names it; volumes are at rest.
 
     The largest belongs to the insertion of a chord or to the hinge, where the stress grows as the
@@ -153,8 +148,6 @@ def peak_stress(
         Set to its parameters.
     x : ndarray
         ``(n, 3)`` mm nodal positions.
-    changes : mapping, optional
-        Parameter -> by how much it differs from the system's; to first order.
 
     Raises
     ------
@@ -162,12 +155,8 @@ def peak_stress(
         If an element is turned inside out.
     """
     solid = system.solid
-    rest = solid.initial_strain()
-    state = solid.evaluate(x, rest, 0.0)
-    stress = state.stress
-    for parameter, change in (changes or {}).items():
-        stress = stress + change * system.partial_stress(parameter, state, rest, 0.0)
-    values = principal_cauchy(state.green, stress)
+    state = solid.evaluate(x, solid.initial_strain(), 0.0)
+    values = principal_cauchy(state.green, state.stress)
     if not np.isfinite(values).all():
         raise InputError("the stress is not finite: an element is turned inside out")
     mesh = solid.mesh
@@ -211,7 +200,7 @@ def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatAr
         return np.zeros((0, 3)), np.zeros(0)
     y = contact.points(x)
     force = np.linalg.norm(contact.forces(contact.search(y), y), axis=1)
-    return contact.rest, force / contact.areas
+    return contact.sheet.rest, force / contact.sheet.areas
 
 
 def _peaks(values: FloatArray, volumes: FloatArray) -> Measured:
@@ -246,12 +235,7 @@ NEVER_NEGATIVE = ("gap_", "coaptation_", "ap_diameter_", "annulus_", "stress_")
 tension of a leaflet that is under pressure."""
 
 
-def measure_closed(
-    model: ClosureModel,
-    system: System,
-    x: FloatArray,
-    changes: Mapping[Parameter, float] | None = None,
-) -> Measured:
+def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measured:
     """Measure one closed valve of two leaflets.
 
     Parameters
@@ -262,9 +246,6 @@ def measure_closed(
         The model's, set to the parameters at which ``x`` is in equilibrium.
     x : ndarray
         ``(n, 3)`` mm nodal positions.
-    changes : mapping, optional
-        Parameter -> by how much it differs from the system's in ``x``; the law is changed with it
-        to first order.
     """
     valve, surface = model.valve, model.valve.surface
     vertices = model.observed(x)
@@ -281,4 +262,4 @@ def measure_closed(
     measures["coaptation_height_mm"] = measures["coaptation_area_mm2"] / size.commissural_diameter
     measures["ap_diameter_mm"] = size.anteroposterior_diameter
     measures["annulus_circumference_mm"] = size.circumference
-    return measures | peak_stress(system, x, changes)
+    return measures | peak_stress(system, x)

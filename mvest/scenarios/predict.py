@@ -11,9 +11,6 @@ import scipy
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.estimation.estimate import Estimate
-from mvest.estimation.gaussian import Gaussian
-from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.system import System
 from mvest.scenarios.measures import NEVER_NEGATIVE, Measured, measure_closed
 from mvest.typing import FloatArray
 
@@ -101,9 +98,6 @@ class PredictedScenario:
     at_estimate : Sample
     shape : ndarray or None
         ``(n, 3)`` mm, observed vertices at the estimate.
-    first_order : dict
-        Measure -> its standard deviation by the derivative of the closed shape; empty where the
-        valve at the estimate failed.
     samples : tuple of Sample
         Of the posterior, failed ones among them.
     finer : Sample or None
@@ -112,7 +106,6 @@ class PredictedScenario:
 
     at_estimate: Sample
     shape: FloatArray | None
-    first_order: Measured
     samples: tuple[Sample, ...]
     finer: Sample | None = None
 
@@ -165,10 +158,9 @@ class PredictedScenario:
         Returns
         -------
         dict
-            Measure -> its ``estimate``, standard deviations to first order and of the ``samples``,
-            their ``mean`` and 95 % interval (``low``, ``high``), the ``mesh_error`` and the
-            ``wide_`` interval with it, both truths, and whether the intervals hold them; None where
-            one of these is not known.
+            Measure -> its ``estimate``, the ``mean``, ``std`` and 95 % interval (``low``, ``high``)
+            of the ``samples``, the ``mesh_error`` and the ``wide_`` interval with it, both truths,
+            and whether the intervals hold them; None where one of these is not known.
         """
         rows: dict[str, dict[str, float | bool | None]] = {}
         for name, value in self.at_estimate.measures.items():
@@ -176,7 +168,6 @@ class PredictedScenario:
             on_own, on_same = (sample.measures.get(name) for sample in (own, same))
             rows[name] = {
                 "estimate": value,
-                "first_order_std": self.first_order.get(name),
                 **spread,
                 "mesh_error": self.mesh_error(name),
                 "wide_low": low,
@@ -197,22 +188,19 @@ def _inside(low: float, true: float | None, high: float) -> bool | None:
 
 def closed_valve(
     model: ClosureModel, m: FloatArray, *, sensitivities: bool = False
-) -> tuple[Sample, System | None, FloatArray | None, FloatArray | None]:
-    """A closed valve measured: the sample, its system, nodal positions and their derivatives.
+) -> tuple[Sample, FloatArray | None]:
+    """A closed valve measured, and the observed vertices ``(n, 3)`` mm.
 
-    A closure that fails is a failed sample without any of them.
+    A closure that fails is a failed sample without vertices.
     """
     try:
         result = model.close(m, sensitivities=sensitivities)
     except MaterialError as error:
-        return Sample({}, str(error)), None, None, None
-    simulation = result.simulation
-    if not simulation.converged:
-        return Sample({}, simulation.reason.value), None, None, None
-    x = simulation.frames[-1]
-    measures = measure_closed(model, result.system, x)
-    derivatives = simulation.sensitivities[-1] if sensitivities else None
-    return Sample(measures), result.system, x, derivatives
+        return Sample({}, str(error)), None
+    if not result.simulation.converged:
+        return Sample({}, result.simulation.reason.value), None
+    x = result.simulation.frames[-1]
+    return Sample(measure_closed(model, result.system, x)), model.observed(x)
 
 
 def predict_scenario(
@@ -248,11 +236,8 @@ def predict_scenario(
             f"the estimate is of {', '.join(estimate.names)}, the model has "
             f"{', '.join(model.names)}"
         )
-    first, system, x, dx = closed_valve(model, estimate.mean, sensitivities=True)
-    shape, spread = None, {}
-    if system is not None and x is not None and dx is not None:
-        shape = model.observed(x)
-        spread = _first_order(model, system, x, dx, estimate)
+    # With derivatives, which tell the samples where their equilibria are to be expected.
+    first, shape = closed_valve(model, estimate.mean, sensitivities=True)
     start = model.closed
     predicted = []
     for number, m in enumerate(samples):
@@ -262,35 +247,4 @@ def predict_scenario(
         if on_sample is not None:
             on_sample(number)
     check = None if finer is None else closed_valve(finer, estimate.mean)[0]
-    return PredictedScenario(first, shape, spread, tuple(predicted), check)
-
-
-def _first_order(
-    model: ClosureModel, system: System, x: FloatArray, dx: FloatArray, estimate: Estimate
-) -> Measured:
-    """Standard deviations by the derivative: ``sqrt(sum_k (df/dm L_k)^2)`` with ``L L^T = P``.
-
-    The derivative of the shape is exact. Measures that are counted in pixels have none, and are
-    differenced over one standard deviation to either side along it.
-    """
-    root = Gaussian(estimate.mean, estimate.covariance).factor
-    parameters = [
-        Parameter(name, float(value))
-        for name, value in zip(estimate.names, estimate.mean, strict=True)
-    ]
-    variance: Measured = {}
-    for direction in root.T:
-        move = np.tensordot(direction, dx, axes=1)
-        sides = [
-            measure_closed(
-                model,
-                system,
-                x + sign * move,
-                {p: sign * float(d) for p, d in zip(parameters, direction, strict=True)},
-            )
-            for sign in (1.0, -1.0)
-        ]
-        for name, ahead in sides[0].items():
-            slope = 0.5 * (ahead - sides[1][name])
-            variance[name] = variance.get(name, 0.0) + slope**2
-    return {name: float(np.sqrt(value)) for name, value in variance.items()}
+    return PredictedScenario(first, shape, tuple(predicted), check)

@@ -47,9 +47,10 @@ from mvest.mechanics import (
     simulate,
 )
 from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law import Points
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from tests.benchmark import THREADS
 
@@ -139,10 +140,9 @@ class SaintVenantKirchhoff:
         """The Green-Lagrange strain itself; nothing is damped."""
         return green
 
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``."""
+        green = at.green
         stress = (green.reshape(-1, 6) @ self.moduli).reshape(green.shape)
         if self.tangent.shape[:2] != green.shape[:2]:
             self.tangent = np.tile(self.moduli, (*green.shape[:2], 1, 1))
@@ -154,24 +154,14 @@ class SaintVenantKirchhoff:
         return ()
 
     def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
         """No parameter is known."""
         raise InputError(f"parameter {parameter.name!r}: the sheet has none")
 
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Zero: the stress has no history."""
-        return np.zeros_like(green)
+        return np.zeros_like(at.green)
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """The change of the strain itself."""

@@ -123,9 +123,9 @@ def test_frames_converge_with_the_first_order_in_the_time_step():
     assert np.all(np.abs(orders - 1) < 0.15), orders
     found = compare_time_steps(model, (0.0125, 0.00625, 0.003125), np.array([AT, 1.01 * AT]))
     changes = [float(np.sqrt(np.mean((b - a) ** 2))) for a, b in pairwise(frames)]
-    assert [one.change for one in found] == pytest.approx([*changes, None])
-    assert found[0].order == pytest.approx(np.log2(changes[0] / changes[1]))
-    assert [one.unevenness for one in found] == [1.0] * 3
+    assert [one["change"] for one in found] == pytest.approx([*changes, None])
+    assert found[0]["order"] == pytest.approx(np.log2(changes[0] / changes[1]))
+    assert [one["unevenness"] for one in found] == [1.0] * 3
 
 
 def test_time_steps_that_are_not_halves_are_refused():
@@ -142,9 +142,9 @@ def test_a_time_step_that_cannot_be_followed_is_said(monkeypatch):
     monkeypatch.setattr(CycleModel, "frames", frames)
     path = np.array([[3.0], [2.5], [1.0], [0.5]])
     found = compare_time_steps(model_of(), (0.05, 0.025), path)
-    assert [one.reason for one in found] == ["no cycle with the parameters"] * 2
-    assert [one.unevenness for one in found] == [None, None]
-    assert found[0].change == 0.0
+    assert [one["reason"] for one in found] == ["no cycle with the parameters"] * 2
+    assert [one["unevenness"] for one in found] == [None, None]
+    assert found[0]["change"] == 0.0
 
 
 def test_inadmissible_tissue_is_a_failed_prediction(cycle):

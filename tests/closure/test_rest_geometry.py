@@ -75,9 +75,11 @@ def displaced(model, variation, h, start):
         )
         surface = model.contact_valve.surface
         embedded = embed(model.mesh, surface.vertices)
-        system.cables.patches = embedded.average(weights + part("patches"), members)
+        patches = embedded.average(weights + part("patches"), members)
+        system.cables = replace(system.cables, patches=patches)
         system._build_pattern(np.zeros((0, 2), dtype=np.int64))
-    system.cables.rest_length = system.cables.rest_length * (1 + part("rest_length"))
+    rest_length = system.cables.rest_length * (1 + part("rest_length"))
+    system.cables = replace(system.cables, rest_length=rest_length)
     loads = replace(loads, hinge=loads.hinge + part("supports"), tips=loads.tips + part("tips"))
     result = simulate(
         system,

@@ -24,6 +24,33 @@ MATERIALS = {
 }
 
 
+class SaintVenantKirchhoff:
+    """A law of one's own: ``S = C : E`` of each region's material, damped as the strain E."""
+
+    kinds = ("E_f",)
+
+    def __init__(self, materials):
+        self.stiffness = np.array([material.stiffness for material in materials])
+
+    def strain(self, green):
+        return green
+
+    def response(self, at):
+        stiffness = self.stiffness[at.region]
+        strain = at.green + at.rate * (at.green - at.previous)
+        tangent = np.repeat((1 + at.rate) * stiffness[:, None], at.green.shape[1], axis=1)
+        return np.einsum("eij,eqj->eqi", stiffness, strain), tangent
+
+    def partial_stress(self, parameter, at, *, which, stress):
+        return np.where((at.region == which)[:, None, None], stress, 0.0) / parameter.value
+
+    def history_stress(self, at, d_previous):
+        return -at.rate * np.einsum("eij,eqj->eqi", self.stiffness[at.region], d_previous)
+
+    def strain_change(self, green, d_green):
+        return d_green
+
+
 def block_matrix(matrix):
     """A sparse matrix of 3x3 blocks by its symmetric and its skew part."""
     halves = [

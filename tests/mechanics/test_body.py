@@ -10,7 +10,7 @@ import mvest.mechanics.body
 from mvest.errors import GeometryError, InputError, MaterialError, MvestError
 from mvest.mechanics import Parameter, TransverselyIsotropic, box, outer_faces, simulate_body
 from mvest.mechanics.solver import linear_solver
-from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS
+from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SaintVenantKirchhoff
 
 RUBBER = TransverselyIsotropic.isotropic(2.0, 0.45)
 
@@ -144,40 +144,15 @@ def test_half_a_sheet_with_a_plane_of_symmetry_does_what_the_whole_does(static):
     assert np.abs(part.sensitivities[-1]).max() > 1e-3
 
 
-class SaintVenantKirchhoff:
-    """A law of a user's own: ``S = lambda tr(E) I + 2 mu E``, damped as the strain E."""
-
-    kinds = ("E_f",)
-
-    def __init__(self, young, nu):
-        lame, mu = young * nu / ((1 + nu) * (1 - 2 * nu)), young / (2 * (1 + nu))
-        self.young, self.stiffness = young, np.zeros((6, 6))
-        self.stiffness[:3, :3] = lame
-        self.stiffness += mu * np.diag([2.0, 2, 2, 1, 1, 1])
-
-    def strain(self, green):
-        return green
-
-    def response(self, green, region, previous, rate):
-        stress = (green + rate * (green - previous)) @ self.stiffness
-        tangent = np.broadcast_to((1 + rate) * self.stiffness, (*green.shape, 6))
-        return stress, np.ascontiguousarray(tangent)
-
-    def partial_stress(self, parameter, green, region, previous, rate, *, which, stress):
-        return np.where((region == which)[:, None, None], stress, 0.0) / parameter.value
-
-    def history_stress(self, green, region, d_previous, rate):
-        return -rate * d_previous @ self.stiffness
-
-    def strain_change(self, green, d_green):
-        return d_green
+def saint_venant(young):
+    return SaintVenantKirchhoff([TransverselyIsotropic.isotropic(young, 0.45)])
 
 
 @pytest.mark.parametrize("static", [True, False])
 def test_a_law_of_ones_own_takes_the_place_of_the_material(static):
     given = arguments() | {"fibre": (1.0, 0.0, 0.0), "static": static}
     known = simulate_body(**given)
-    law = SaintVenantKirchhoff(2.0, 0.45)
+    law = saint_venant(2.0)
     parameter = [Parameter("E_f.0", 2.0)]
     own = simulate_body(**given | {"material": law}, parameters=parameter)
     assert own.converged
@@ -187,8 +162,7 @@ def test_a_law_of_ones_own_takes_the_place_of_the_material(static):
     assert 1e-5 * lift < difference < 0.05 * lift
     # Its derivative is that of its differences.
     moved = [
-        simulate_body(**given | {"material": SaintVenantKirchhoff(e, 0.45)}).frames[-1]
-        for e in (1.999, 2.001)
+        simulate_body(**given | {"material": saint_venant(e)}).frames[-1] for e in (1.999, 2.001)
     ]
     np.testing.assert_allclose(own.sensitivities[-1, 0], (moved[1] - moved[0]) / 0.002, atol=2e-6)
     assert np.abs(own.sensitivities[-1]).max() > 1e-2
@@ -237,7 +211,7 @@ def broken(name):
         "fixed component not bool": {"fixed_components": np.zeros(nodes.shape)},
         "force of a wrong shape": {"forces": (0.0, 0.0, 1.0)},
         "force not finite": {"forces": lambda t: np.full(nodes.shape, np.inf)},
-        "fibre of a law missing": {"material": SaintVenantKirchhoff(2.0, 0.45)},
+        "fibre of a law missing": {"material": saint_venant(2.0)},
         "fibre missing": {"material": fibre},
         "fibre zero": {"material": fibre, "fibre": (0, 0, 0)},
         "fibre across the layer": {"material": fibre, "fibre": (0, 0, 1)},
@@ -254,17 +228,17 @@ def broken(name):
 
 
 MESSAGES = {
-    "nodes of a wrong shape": (InputError, r"nodes.*\(162, 2\)|nodes.*shape"),
+    "nodes of a wrong shape": (InputError, "nodes: shape"),
     "nodes not finite": (InputError, "nodes.*finite"),
     "unknown element": (InputError, "unknown element 'hex8'; known elements: tet4"),
-    "elements of a wrong width": (InputError, r"\(9, 8\), expected \(m, 18\)"),
-    "no elements": (InputError, r"\(0, 18\)"),
+    "elements of a wrong width": (InputError, r"elements: shape \(9, 8\), expected \(None, 18\)"),
+    "no elements": (InputError, "the mesh has no elements"),
     "element index out of range": (InputError, "98|97"),
     "element index not an integer": (InputError, "integer"),
     "inverted element": (GeometryError, "inverted elements; the worst is element"),
     "unused node": (GeometryError, "belongs to no element"),
-    "fixed node out of range": (InputError, "fixed_nodes must lie between 0 and"),
-    "negative fixed node": (InputError, "fixed_nodes must lie between 0 and"),
+    "fixed node out of range": (InputError, r"fixed_nodes: entry .* expected 0 to"),
+    "negative fixed node": (InputError, r"fixed_nodes: entry .* expected 0 to"),
     "fixed nodes not integers": (InputError, "fixed_nodes.*integers"),
     "face index out of range": (InputError, "pressure_faces"),
     "faces of a wrong width": (InputError, "pressure_faces"),
@@ -272,12 +246,12 @@ MESSAGES = {
     "face pointing inwards": (GeometryError, "points into the solid; reverse its node order"),
     "time step 0": (InputError, "time steps must increase strictly"),
     "times of a wrong shape": (InputError, r"times: shape \(1, 2\)"),
-    "pressure not finite": (InputError, "pressure is not finite"),
-    "pressure table of a wrong shape": (InputError, r"pressure table: shape \(3,\)"),
+    "pressure not finite": (InputError, "pressure table .* is not finite"),
+    "pressure table of a wrong shape": (InputError, r"pressure table .* shape \(3,\)"),
     "pressure table not increasing": (InputError, "increasing times"),
     "fixed component of a wrong shape": (InputError, r"fixed_components: shape \(3, 3\)"),
     "fixed component not bool": (InputError, "fixed_components.* of bool"),
-    "force of a wrong shape": (InputError, r"forces: shape \(3,\), expected finite \(98, 3\) N"),
+    "force of a wrong shape": (InputError, r"forces: shape \(3,\), expected \(98, 3\)"),
     "force not finite": (InputError, r"forces at t = 0.05 s"),
     "fibre of a law missing": (InputError, "fibre is needed"),
     "fibre missing": (InputError, "fibre is needed"),

@@ -36,7 +36,7 @@ from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh
 from mvest.files import write_atomically
 from mvest.mechanics.body import box, outer_faces, simulate_body
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.linear import LinearLaw
+from mvest.mechanics.law import Law
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.settings import (
     ClosureProtocol,
@@ -44,7 +44,6 @@ from mvest.mechanics.settings import (
     MechanicsSettings,
     TissueSettings,
 )
-from mvest.mechanics.solid import Law
 from mvest.mechanics.steps import NewtonSettings, Simulation
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.observation.vertices import FRAMES, Observation
@@ -55,6 +54,7 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
 from tests.exchange.febio.program import FebRun, run_febio
+from tests.mechanics.bodies import SaintVenantKirchhoff
 from tests.places import ROOT
 from tests.tables import markdown, write_text
 from tests.verification.strip import MATERIALS
@@ -153,7 +153,7 @@ def laws() -> pd.DataFrame:
         body = (mesh, lambda x: x == 0, -stress)
         runs = {
             "here": here(*body, material),
-            "here_orthotropic": here(*body, LinearLaw.of([material])),
+            "here_orthotropic": here(*body, SaintVenantKirchhoff([material])),
         } | {kind.replace("-", "_"): there(*body, material, kind) for kind in LAWS}
         strains = {name: last(run)[corner, axes[0]] - 1 for name, run in runs.items()}
         rows.append({"reading": reading, "pulled": pulled, "stress_mpa": stress, "linear": strain}
@@ -186,7 +186,10 @@ def bodies() -> pd.DataFrame:
             body = (block(element, cells, size, lambda x: x[:, 2] == 0), held, pressure)
             rest = body[0].nodes
             own, seconds = timed(partial(here, *body, material))
-            law, run = here(*body, LinearLaw.of([material])), there(*body, material, "orthotropic")
+            law, run = (
+                here(*body, SaintVenantKirchhoff([material])),
+                there(*body, material, "orthotropic"),
+            )
             rows.append({
                 "problem": problem, "element": element, "reading": reading,
                 "febio_element": NAMES[febio_mesh(body[0]).element_type][0],
@@ -233,7 +236,7 @@ def closed(model: ClosureModel, law: bool = False) -> Closed:
     system, _ = model.tuned(GENERIC)
     if law:
         tissue = [model.settings.tissue[name] for name in model.mesh.region_names]
-        system.solid.law = LinearLaw.of(
+        system.solid.law = SaintVenantKirchhoff(
             [one.material(value) for one, value in zip(tissue, GENERIC, strict=True)]
         )
         system.solid.reset()

@@ -5,8 +5,7 @@ The linear law of this project is :math:`\tfrac12 \epsilon : C : \epsilon` of th
 Both have the same stiffness at rest.
 
 ``orthotropic``
-    ``orthotropic elastic``: the same C, of the Green-Lagrange strain
-    (:class:`mvest.mechanics.law.linear.LinearLaw`).
+    ``orthotropic elastic``: the same C, of the Green-Lagrange strain (St. Venant's law).
 ``neo-hookean``
     ``neo-Hookean transiso``: the same moduli in a neo-Hookean form.
 

@@ -26,12 +26,12 @@ The points stay free to turn about each other. With :math:`L = 0` the spring is 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mvest.errors import InputError, require_numbers
-from mvest.typing import BoolArray, FloatArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 
@@ -43,10 +43,11 @@ def cable_force(strain: FloatArray, toe: float) -> tuple[FloatArray, FloatArray]
     return force, np.where(strain >= toe, 1.0, slope)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class Cables:
     """All cables of a valve.
 
-    Parameters
+    Attributes
     ----------
     patches : Embedding
         ``(c,)`` leaflet ends.
@@ -55,26 +56,16 @@ class Cables:
     rest_length, axial_stiffness : ndarray
         ``(c,)`` mm and N.
     toe_strain : float
-    families : dict, optional
+    families : mapping
         Name -> ``(c,)`` bool, which cables belong to it.
     """
 
-    def __init__(
-        self,
-        patches: Embedding,
-        tip: np.ndarray,
-        rest_length: FloatArray,
-        axial_stiffness: FloatArray,
-        toe_strain: float,
-        families: dict[str, BoolArray] | None = None,
-    ) -> None:
-        self.patches = patches
-        self.tip = tip
-        self.rest_length = rest_length
-        self.axial_stiffness = axial_stiffness
-        self.toe_strain = toe_strain
-        tips = range(int(np.max(tip, initial=-1)) + 1)
-        self.parts = {**(families or {}), **{f"tip{k}": np.asarray(tip) == k for k in tips}}
+    patches: Embedding
+    tip: IntArray
+    rest_length: FloatArray
+    axial_stiffness: FloatArray
+    toe_strain: float
+    families: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def members(self, part: str) -> BoolArray:
         """Which cables ``(c,)`` a family or papillary tip (``tip0``, ...) has; empty: all.
@@ -86,11 +77,11 @@ class Cables:
         """
         if not part:
             return np.ones(len(self.rest_length), dtype=np.bool_)
-        if part not in self.parts:
-            raise InputError(
-                f"no chordae {part!r}; known families and tips: {', '.join(self.parts)}"
-            )
-        return self.parts[part]
+        tips = range(int(np.max(self.tip, initial=-1)) + 1)
+        parts = {**self.families, **{f"tip{k}": np.asarray(self.tip) == k for k in tips}}
+        if part not in parts:
+            raise InputError(f"no chordae {part!r}; known families and tips: {', '.join(parts)}")
+        return parts[part]
 
     def factor(self, kind: str, values: Mapping[str, float]) -> FloatArray:
         """Factor ``(c,)`` of each cable: the product of what is called ``kind`` or ``kind.PART``.
@@ -152,6 +143,7 @@ class Cables:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class Hinge:
     """Elastic support of material points: ``k |x - target|^2 / 2`` per point.
 
@@ -159,7 +151,7 @@ class Hinge:
     points on both faces it is a clamp. The stiffness is chosen so high that the support moves by
     micrometres.
 
-    Parameters
+    Attributes
     ----------
     points : Embedding
         ``(h,)``.
@@ -167,9 +159,8 @@ class Hinge:
         ``(h,)`` N/mm.
     """
 
-    def __init__(self, points: Embedding, stiffness: FloatArray) -> None:
-        self.points = points
-        self.stiffness = stiffness
+    points: Embedding
+    stiffness: FloatArray
 
     def forces(self, x: FloatArray, target: FloatArray) -> FloatArray:
         """Internal forces ``(h, 3)`` N at the points."""
@@ -211,47 +202,32 @@ class TiedPoints:
     def within(self, mesh: SolidMesh) -> Ties:
         """The same as springs between points of a mesh."""
         first, second = embed(mesh, self.first), embed(mesh, self.second)
-        return Ties(first, second, self.stiffness, self.length)
+        spans = Embedding(
+            np.concatenate([first.nodes, second.nodes], axis=1),
+            np.concatenate([first.weights, -second.weights], axis=1),
+            np.full(len(first), -1, dtype=np.int64),
+        )
+        return Ties(spans, self.stiffness, self.length)
 
 
-def differences(first: Embedding, second: Embedding) -> Embedding:
-    """The vectors ``(k, 3)`` from the points of ``second`` to those of ``first``.
-
-    As sums over nodes like any embedding, except that the weights of a row sum to zero.
-
-    Raises
-    ------
-    InputError
-        If there are not as many points in both.
-    """
-    if len(first) != len(second):
-        raise InputError(f"ties join {len(first)} points to {len(second)}, expected equally many")
-    return Embedding(
-        np.concatenate([first.nodes, second.nodes], axis=1),
-        np.concatenate([first.weights, -second.weights], axis=1),
-        np.full(len(first), -1, dtype=np.int64),
-    )
-
-
+@dataclass(frozen=True, slots=True, eq=False)
 class Ties:
     """Springs between pairs of material points.
 
-    Parameters
+    Attributes
     ----------
-    first, second : Embedding
-        ``(k,)`` points that are tied, pair by pair.
+    spans : Embedding
+        ``(k,)`` vectors from the second point of each pair to the first: sums over nodes like any
+        embedding, except that the weights of a row sum to zero.
     stiffness : float
         N/mm of each pair.
     closed_length : float
         mm, length without force in the closed valve; at any instant it is part of the loads.
     """
 
-    def __init__(
-        self, first: Embedding, second: Embedding, stiffness: float, closed_length: float = 0.0
-    ) -> None:
-        self.spans = differences(first, second)
-        self.stiffness = stiffness
-        self.closed_length = closed_length
+    spans: Embedding
+    stiffness: float
+    closed_length: float = 0.0
 
     def lengths(self, x: FloatArray) -> FloatArray:
         """Distances ``(k,)`` mm of the tied points at nodal positions ``x (n, 3)``."""

@@ -41,7 +41,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.pair_search import ContactPairs, Passing, search_pairs
+from mvest.mechanics.forces.pair_search import (
+    ContactPairs,
+    Passing,
+    Sheet,
+    approaching,
+    search_pairs,
+)
 from mvest.mechanics.settings import ContactSettings
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding
@@ -71,6 +77,8 @@ class Contact:
 
     Attributes
     ----------
+    sheet : Sheet
+        The points as kernels read them.
     passing : Passing
         Whether sheets pass through each other.
     """
@@ -85,17 +93,22 @@ class Contact:
         settings: ContactSettings,
         skin: float = 1.0,
     ) -> None:
-        self.points = points
-        self.rest = np.ascontiguousarray(rest)
-        self.areas = np.ascontiguousarray(areas)
-        self.thickness = np.ascontiguousarray(thickness)
-        self.triangles = triangles
-        self.settings = settings
-        self.skin = skin
         if len(triangles) == 0:
             raise InputError("contact needs triangles of the sampled midsurface; there are none")
-        self._by_host = np.argsort(points.host, kind="stable")
-        self.passing = Passing(self.rest, self.thickness, triangles, settings, skin)
+        self.points = points
+        self.settings = settings
+        self.skin = skin
+        self.sheet = Sheet(
+            np.ascontiguousarray(rest),
+            np.ascontiguousarray(areas),
+            np.ascontiguousarray(thickness),
+            points.host,
+            np.argsort(points.host, kind="stable"),
+            settings.activation_distance,
+            settings.reference_distance,
+            settings.reference_pressure,
+        )
+        self.passing = Passing(self.sheet, triangles, skin)
 
     def search(self, y: FloatArray) -> ContactPairs:
         """Pairs that can become active while no point moves by more than half the skin.
@@ -105,18 +118,7 @@ class Contact:
         y : ndarray
             ``(k, 3)`` current positions of the points.
         """
-        longest = self.settings.activation_distance * float(self.thickness.max())
-        return search_pairs(
-            y,
-            self.rest,
-            self.thickness,
-            self._by_host,
-            self.points.host,
-            self.settings.activation_distance,
-            self.settings.reference_distance,
-            longest + self.skin,
-            self.skin,
-        )
+        return search_pairs(y, self.sheet, self.skin)
 
     def stale(self, pairs: ContactPairs, y: FloatArray) -> bool:
         """Whether a point has moved so far that the search must be repeated."""
@@ -125,15 +127,7 @@ class Contact:
 
     def forces(self, pairs: ContactPairs, y: FloatArray) -> FloatArray:
         """Energy derivative ``(k, 3)`` N by the positions of the points."""
-        return _forces(
-            y,
-            pairs.first,
-            pairs.second,
-            pairs.reach,
-            pairs.reference,
-            self.areas,
-            self.settings.reference_pressure,
-        )
+        return _forces(y, pairs, self.sheet)
 
     def forces_change(
         self,
@@ -158,34 +152,13 @@ class Contact:
             ``(k,)`` changes of them, mm^2 and mm.
         """
         none = np.zeros(len(y))
-        return _forces_change(
-            y,
-            pairs.first,
-            pairs.second,
-            pairs.reach,
-            pairs.reference,
-            self.areas,
-            self.thickness,
-            self.rest,
-            moved,
-            none if areas is None else areas,
-            none if thickness is None else thickness,
-            self.settings.activation_distance,
-            self.settings.reference_pressure,
-        )
-
-    def energy(self, pairs: ContactPairs, y: FloatArray) -> float:
-        """Contact energy in N mm."""
-        r = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
-        gap = np.maximum(pairs.reach - r, 0.0) / (pairs.reach - pairs.reference)
-        barrier = BARRIER * pairs.reference
-        phi = self.settings.reference_pressure * gap**4 / (2 * np.pi * r)
-        phi *= ((pairs.reference - barrier) / (r - barrier)) ** 2
-        return float(np.sum(self.areas[pairs.first] * self.areas[pairs.second] * phi))
+        d_areas = none if areas is None else areas
+        d_thickness = none if thickness is None else thickness
+        return _forces_change(y, pairs, self.sheet, moved, d_areas, d_thickness)
 
     def touching(self, pairs: ContactPairs, y: FloatArray, margin: float = 0.0) -> BoolArray:
         """Groups ``(g,)`` with a pair whose distance is below ``1 + margin`` times its reach."""
-        return _touching(y, pairs.first, pairs.second, pairs.reach, pairs.start, margin)
+        return _touching(y, pairs, margin)
 
     def add_tangent(
         self,
@@ -209,23 +182,7 @@ class Contact:
             ``(e, w, w)`` positions of the blocks of each host element with itself, negative where
             the mirror image serves.
         """
-        _add_tangent(
-            y,
-            pairs.first,
-            pairs.second,
-            pairs.reach,
-            pairs.reference,
-            pairs.start,
-            self.areas,
-            self.settings.reference_pressure,
-            self.points.weights,
-            self.points.host,
-            self._by_host,
-            data,
-            slot,
-            between,
-            own,
-        )
+        _add_tangent(y, pairs, self.sheet, self.points.weights, data, slot, between, own)
 
     def largest_step(
         self, pairs: ContactPairs, y: FloatArray, dy: FloatArray, *, detect: bool = False
@@ -236,14 +193,12 @@ class Contact:
 
         With ``detect`` collisions are looked for even where distances exclude them.
         """
-        factor = float(
-            _largest_step(y, dy, pairs.first, pairs.second, pairs.reach, pairs.reference)
-        )
+        factor = float(_largest_step(y, dy, pairs))
         return factor * self.passing.free_share(pairs, y, factor * dy, detect=detect)
 
     def active(self, pairs: ContactPairs, y: FloatArray) -> int:
         """Number of pairs within their reach."""
-        return int(_active(y, pairs.first, pairs.second, pairs.reach))
+        return int(_active(y, pairs))
 
     def intersects(self, y: FloatArray) -> bool:
         """Whether triangles of the sampled midsurface intersect at ``y (k, 3)``."""
@@ -267,26 +222,24 @@ def _kernel(r: float, h: float, r0: float, p0: float) -> tuple[float, float]:
     return first, second
 
 
+@nb.njit(cache=True, inline="always")
+def _span(y: FloatArray, i: int, j: int) -> tuple[float, float, float, float]:
+    """Vector from point j to point i, and its square."""
+    d0, d1, d2 = y[i, 0] - y[j, 0], y[i, 1] - y[j, 1], y[i, 2] - y[j, 2]
+    return d0, d1, d2, d0 * d0 + d1 * d1 + d2 * d2
+
+
 @nb.njit(cache=True)
-def _forces(
-    y: FloatArray,
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    reach: FloatArray,
-    reference: FloatArray,
-    areas: FloatArray,
-    p0: float,
-) -> FloatArray:
-    out = np.zeros_like(y)
-    for k in range(len(first)):
-        i, j = first[k], second[k]
-        d0, d1, d2 = y[i, 0] - y[j, 0], y[i, 1] - y[j, 1], y[i, 2] - y[j, 2]
-        rr = d0 * d0 + d1 * d1 + d2 * d2
+def _forces(y: FloatArray, pairs: ContactPairs, sheet: Sheet) -> FloatArray:
+    out, reach = np.zeros_like(y), pairs.reach
+    for k in range(len(reach)):
+        i, j = pairs.first[k], pairs.second[k]
+        d0, d1, d2, rr = _span(y, i, j)
         if rr >= reach[k] * reach[k]:
             continue
         r = np.sqrt(rr)
-        f, _ = _kernel(r, reach[k], reference[k], p0)
-        f *= areas[i] * areas[j] / r
+        f, _ = _kernel(r, reach[k], pairs.reference[k], sheet.pressure)
+        f *= sheet.areas[i] * sheet.areas[j] / r
         out[i, 0] += f * d0
         out[i, 1] += f * d1
         out[i, 2] += f * d2
@@ -299,36 +252,25 @@ def _forces(
 @nb.njit(cache=True)
 def _forces_change(
     y: FloatArray,
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    reach: FloatArray,
-    reference: FloatArray,
-    areas: FloatArray,
-    thickness: FloatArray,
-    rest: FloatArray,
+    pairs: ContactPairs,
+    sheet: Sheet,
     moved: FloatArray,
     d_areas: FloatArray,
     d_thickness: FloatArray,
-    activation: float,
-    p0: float,
 ) -> FloatArray:
-    out = np.zeros_like(y)
-    for k in range(len(first)):
-        i, j, h = first[k], second[k], reach[k]
-        rr = 0.0
-        for c in range(3):
-            rr += (y[i, c] - y[j, c]) ** 2
+    out, areas, thickness = np.zeros_like(y), sheet.areas, sheet.thickness
+    for k in range(len(pairs.first)):
+        i, j, h = pairs.first[k], pairs.second[k], pairs.reach[k]
+        rr = _span(y, i, j)[3]
         if rr >= h * h:
             continue
         r = np.sqrt(rr)
-        value, slope = _kernel(r, h, reference[k], p0)
-        dh = 0.5 * activation * (d_thickness[i] + d_thickness[j])
-        if h < 0.5 * activation * (thickness[i] + thickness[j]):
-            apart, toward = 0.0, 0.0
-            for c in range(3):
-                apart += (rest[i, c] - rest[j, c]) ** 2
-                toward += (rest[i, c] - rest[j, c]) * (moved[i, c] - moved[j, c])
-            dh = h * toward / apart
+        value, slope = _kernel(r, h, pairs.reference[k], sheet.pressure)
+        dh = 0.5 * sheet.activation * (d_thickness[i] + d_thickness[j])
+        if h < 0.5 * sheet.activation * (thickness[i] + thickness[j]):
+            d0, d1, d2, apart = _span(sheet.rest, i, j)
+            m0, m1, m2, _ = _span(moved, i, j)
+            dh = h * (d0 * m0 + d1 * m1 + d2 * m2) / apart
         f = value * (d_areas[i] * areas[j] + areas[i] * d_areas[j])
         f -= areas[i] * areas[j] * (2.0 * value + r * slope) * dh / h
         for c in range(3):
@@ -340,22 +282,17 @@ def _forces_change(
 @nb.njit(cache=True)
 def _add_tangent(
     y: FloatArray,
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    reach: FloatArray,
-    reference: FloatArray,
-    start: IntArray,
-    areas: FloatArray,
-    p0: float,
+    pairs: ContactPairs,
+    sheet: Sheet,
     weights: FloatArray,
-    host: IntArray,
-    by_host: IntArray,
     data: FloatArray,
     slot: IntArray,
     between: NDArray[np.int32],
     own: NDArray[np.int32],
 ) -> None:
     n, n_w = weights.shape
+    first, start, reach, areas = pairs.first, pairs.start, pairs.reach, sheet.areas
+    host, by_host = sheet.host, sheet.by_host
     # The 3x3 block of a pair is symmetric: 00, 11, 22, 12, 02, 01. Components come first, so that
     # the innermost loops run along the nodes.
     at_point = np.zeros((n, 6))
@@ -372,12 +309,11 @@ def _add_tangent(
             i = first[k]
             any_active = False
             while k < start[g + 1] and first[k] == i:
-                j = second[k]
-                d0, d1, d2 = y[i, 0] - y[j, 0], y[i, 1] - y[j, 1], y[i, 2] - y[j, 2]
-                rr = d0 * d0 + d1 * d1 + d2 * d2
+                j = pairs.second[k]
+                d0, d1, d2, rr = _span(y, i, j)
                 if rr < reach[k] * reach[k]:
                     r = np.sqrt(rr)
-                    f1, f2 = _kernel(r, reach[k], reference[k], p0)
+                    f1, f2 = _kernel(r, reach[k], pairs.reference[k], sheet.pressure)
                     a = areas[i] * areas[j]
                     across = a * f1 / r
                     along = (a * f2 - across) / rr
@@ -446,63 +382,38 @@ def _add_symmetric(target: FloatArray, six: FloatArray) -> None:
 
 
 @nb.njit(cache=True)
-def _active(
-    y: FloatArray, first: NDArray[np.int32], second: NDArray[np.int32], reach: FloatArray
-) -> int:
+def _active(y: FloatArray, pairs: ContactPairs) -> int:
     count = 0
-    for k in range(len(first)):
-        i, j = first[k], second[k]
-        rr = (y[i, 0] - y[j, 0]) ** 2 + (y[i, 1] - y[j, 1]) ** 2 + (y[i, 2] - y[j, 2]) ** 2
-        count += int(rr < reach[k] * reach[k])
+    for k in range(len(pairs.first)):
+        rr = _span(y, pairs.first[k], pairs.second[k])[3]
+        count += int(rr < pairs.reach[k] * pairs.reach[k])
     return count
 
 
 @nb.njit(cache=True)
-def _touching(
-    y: FloatArray,
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    reach: FloatArray,
-    start: IntArray,
-    margin: float,
-) -> BoolArray:
+def _touching(y: FloatArray, pairs: ContactPairs, margin: float) -> BoolArray:
+    start = pairs.start
     out = np.zeros(len(start) - 1, dtype=np.bool_)
     for g in range(len(start) - 1):
         for k in range(start[g], start[g + 1]):
-            i, j = first[k], second[k]
-            rr = (y[i, 0] - y[j, 0]) ** 2 + (y[i, 1] - y[j, 1]) ** 2 + (y[i, 2] - y[j, 2]) ** 2
-            if rr < (reach[k] * (1.0 + margin)) ** 2:
+            rr = _span(y, pairs.first[k], pairs.second[k])[3]
+            if rr < (pairs.reach[k] * (1.0 + margin)) ** 2:
                 out[g] = True
                 break
     return out
 
 
 @nb.njit(cache=True)
-def _largest_step(
-    y: FloatArray,
-    dy: FloatArray,
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    reach: FloatArray,
-    reference: FloatArray,
-) -> float:
+def _largest_step(y: FloatArray, dy: FloatArray, pairs: ContactPairs) -> float:
     best = 1.0
-    for k in range(len(first)):
-        i, j = first[k], second[k]
-        rr = 0.0
-        rd = 0.0
-        dd = 0.0
-        for c in range(3):
-            r = y[i, c] - y[j, c]
-            s = dy[i, c] - dy[j, c]
-            rr += r * r
-            rd += r * s
-            dd += s * s
+    for k in range(len(pairs.first)):
+        rr, rd, dd = approaching(y, dy, pairs.first[k], pairs.second[k])
         if rd >= 0.0:
             continue
         # Pairs still apart may come to the reference distance; close ones lose APPROACH.
-        barrier = BARRIER * reference[k]
-        floor = min(barrier + (1.0 - APPROACH) * (np.sqrt(rr) - barrier), reference[k]) ** 2
+        reference = pairs.reference[k]
+        barrier = BARRIER * reference
+        floor = min(barrier + (1.0 - APPROACH) * (np.sqrt(rr) - barrier), reference) ** 2
         # Smallest root of rr + 2 t rd + t^2 dd = floor in (0, best).
         disc = rd * rd - dd * (rr - floor)
         if disc <= 0.0:

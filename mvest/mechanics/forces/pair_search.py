@@ -17,7 +17,7 @@ throughout.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import ipctk
 import numba as nb
@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from mvest.mechanics.settings import ContactSettings
 from mvest.typing import FloatArray, IntArray
 
 NEIGHBOUR = 0.8
@@ -37,8 +36,34 @@ EXPECTED = 72
 """Pairs of a point for which there is room at first."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ContactPairs:
+class Sheet(NamedTuple):
+    """The sampled midsurface, as kernels read it.
+
+    Attributes
+    ----------
+    rest : ndarray
+        ``(k, 3)`` mm, the points at rest.
+    areas, thickness : ndarray
+        ``(k,)`` mm^2 and mm.
+    host, by_host : ndarray
+        ``(k,)`` the element that hosts each point, and the points in the order of their hosts.
+    activation, distance : float
+        Activation and reference distance over the thickness.
+    pressure : float
+        MPa at the reference distance.
+    """
+
+    rest: FloatArray
+    areas: FloatArray
+    thickness: FloatArray
+    host: IntArray
+    by_host: IntArray
+    activation: float
+    distance: float
+    pressure: float
+
+
+class ContactPairs(NamedTuple):
     """Candidate pairs sorted by the elements that host them.
 
     Attributes
@@ -66,80 +91,49 @@ class ContactPairs:
     positions: FloatArray
 
 
-def search_pairs(
-    y: FloatArray,
-    rest: FloatArray,
-    thickness: FloatArray,
-    by_host: IntArray,
-    host: IntArray,
-    activation: float,
-    distance: float,
-    radius: float,
-    skin: float,
-) -> ContactPairs:
+def search_pairs(y: FloatArray, sheet: Sheet, skin: float) -> ContactPairs:
     """Candidate pairs in the order of their hosts, grouped by them.
 
     Parameters
     ----------
-    y, rest : ndarray
-        ``(k, 3)`` mm, points now and at rest.
-    thickness : ndarray
-        ``(k,)`` mm.
-    by_host, host : ndarray
-        ``(k,)`` points in the order of their hosts, and the host of each.
-    activation, distance : float
-        Activation and reference distance over the thickness.
-    radius : float
-        mm, largest reach of all plus ``skin``.
+    y : ndarray
+        ``(k, 3)`` mm, points now.
+    sheet : Sheet
     skin : float
         mm by which the search exceeds the reach of a pair.
     """
     n = len(y)
-    counts, place, first_of, table = _cells(y, by_host, radius / FINENESS)
+    radius = sheet.activation * float(sheet.thickness.max()) + skin
+    cells = _cells(y, sheet.by_host, radius / FINENESS)
     ends = np.zeros(n + 1, dtype=np.int64)
-
-    def write(second: NDArray[np.int32]) -> int:
-        return _candidates(
-            y,
-            rest,
-            by_host,
-            host,
-            counts,
-            place,
-            first_of,
-            table,
-            thickness,
-            activation,
-            distance,
-            radius,
-            skin,
-            ends,
-            second,
-        )
-
     # Large arrays are made here and not in the kernels: numpy has them on huge pages, and their
     # first use would otherwise take longer than the search.
     second = np.empty(EXPECTED * n, dtype=np.int32)
-    count = write(second)
+    count = _candidates(y, sheet, cells, radius, skin, ends, second)
     if count > len(second):
         second = np.empty(count, dtype=np.int32)
-        write(second)
+        _candidates(y, sheet, cells, radius, skin, ends, second)
     points = np.empty((2, count), dtype=np.int32)
     lengths = np.empty((2, count))
-    start, hosts = _grouped(
-        rest, thickness, by_host, host, activation, distance, ends, second, points, lengths
-    )
+    start, hosts = _grouped(sheet, ends, second, points, lengths)
     return ContactPairs(points[0], points[1], lengths[0], lengths[1], start, hosts, y.copy())
 
 
-@nb.njit(cache=True)
-def _cells(
-    y: FloatArray, by_host: IntArray, size: float
-) -> tuple[IntArray, NDArray[np.int32], IntArray, FloatArray]:
-    """Cubes of the given size: their number per axis, cube of each point, first and members.
+class _Cells(NamedTuple):
+    """Cubes of space: their number per axis, the cube of each point, and the members of each.
 
-    The members of a cube come by host; where they are is given besides, one axis after the other.
+    The members of a cube come by host, from ``start``; the ``table (4, k)`` has where they are,
+    one axis after the other, and their numbers.
     """
+
+    counts: IntArray
+    place: NDArray[np.int32]
+    start: IntArray
+    table: FloatArray
+
+
+@nb.njit(cache=True)
+def _cells(y: FloatArray, by_host: IntArray, size: float) -> _Cells:
     n = len(y)
     low = np.array([y[:, c].min() for c in range(3)])
     counts = np.array([int((y[:, c].max() - low[c]) / size) + 1 for c in range(3)])
@@ -159,22 +153,14 @@ def _cells(
             table[c, filled[k]] = y[i, c]
         table[3, filled[k]] = i
         filled[k] += 1
-    return counts, place, start, table
+    return _Cells(counts, place, start, table)
 
 
 @nb.njit(cache=True, error_model="numpy")
 def _candidates(
     y: FloatArray,
-    rest: FloatArray,
-    by_host: IntArray,
-    host: IntArray,
-    counts: IntArray,
-    place: NDArray[np.int32],
-    start: IntArray,
-    table: FloatArray,
-    thickness: FloatArray,
-    activation: float,
-    distance: float,
+    sheet: Sheet,
+    cells: _Cells,
     radius: float,
     skin: float,
     ends: IntArray,
@@ -185,16 +171,17 @@ def _candidates(
     ``ends[p + 1]`` is where the pairs end whose first point is the p-th by host.
     """
     n = len(y)
-    x0, x1, x2 = table[0], table[1], table[2]
+    host, place, start = sheet.host, cells.place, cells.start
+    x0, x1, x2 = cells.table[0], cells.table[1], cells.table[2]
     member, owner = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
     for q in range(n):
-        member[q] = int(table[3, q])
+        member[q] = int(cells.table[3, q])
         owner[q] = host[member[q]]
     near_ones, squares = np.empty(n, dtype=np.int32), np.empty(n)
-    n0, n1, n2 = counts
+    n0, n1, n2 = cells.counts
     limit, count = radius * radius, 0
     for p in range(n):
-        i = by_host[p]
+        i = sheet.by_host[p]
         y0, y1, y2, own = y[i, 0], y[i, 1], y[i, 2], host[i]
         low = max(place[i, 2] - FINENESS, 0)
         high = min(place[i, 2] + FINENESS + 1, n2)
@@ -212,11 +199,11 @@ def _candidates(
                     j = member[near_ones[k]]
                     if host[j] == own and j <= i:
                         continue
-                    mean = 0.5 * (thickness[i] + thickness[j])
-                    reach = _reach(rest, i, j, activation * mean)
+                    mean = 0.5 * (sheet.thickness[i] + sheet.thickness[j])
+                    reach = _reach(sheet.rest, i, j, sheet.activation * mean)
                     # Neighbours that would have to be compressed to half their rest distance
                     # never touch.
-                    if reach <= 0.5 * distance * mean or squares[k] >= (reach + skin) ** 2:
+                    if reach <= 0.5 * sheet.distance * mean or squares[k] >= (reach + skin) ** 2:
                         continue
                     if count < len(second):
                         second[count] = j
@@ -236,18 +223,14 @@ def _reach(rest: FloatArray, i: int, j: int, full: float) -> float:
 
 @nb.njit(cache=True, error_model="numpy")
 def _grouped(
-    rest: FloatArray,
-    thickness: FloatArray,
-    by_host: IntArray,
-    host: IntArray,
-    activation: float,
-    distance: float,
+    sheet: Sheet,
     ends: IntArray,
     second: NDArray[np.int32],
     points: NDArray[np.int32],
     lengths: FloatArray,
 ) -> tuple[IntArray, IntArray]:
     """Write the pairs in the order of both hosts, and their lengths; where groups start, hosts."""
+    host, by_host, thickness = sheet.host, sheet.by_host, sheet.thickness
     n, count = len(by_host), ends[-1]
     place = np.zeros(host.max() + 1, dtype=np.int64)
     start, hosts = np.empty(count + 1, dtype=np.int64), np.empty((count, 2), dtype=np.int64)
@@ -272,12 +255,12 @@ def _grouped(
             for k in range(ends[p], ends[p + 1]):
                 j = second[k]
                 mean = 0.5 * (thickness[i] + thickness[j])
-                full = activation * mean
-                reach = _reach(rest, i, j, full)
+                full = sheet.activation * mean
+                reach = _reach(sheet.rest, i, j, full)
                 at = place[host[j]]
                 place[host[j]] += 1
                 points[0, at], points[1, at] = i, j
-                lengths[0, at], lengths[1, at] = reach, distance * mean * reach / full
+                lengths[0, at], lengths[1, at] = reach, sheet.distance * mean * reach / full
         place[low : high + 1] = 0
         done = after
     start[groups] = count
@@ -308,32 +291,21 @@ class Passing:
 
     Parameters
     ----------
-    rest : ndarray
-        ``(k, 3)`` mm, the points at rest.
-    thickness : ndarray
-        ``(k,)`` mm.
+    sheet : Sheet
     triangles : ndarray
         ``(t, 3)`` of the points.
-    settings : ContactSettings
     skin : float
         mm by which the search for pairs exceeds their reach.
     """
 
-    def __init__(
-        self,
-        rest: FloatArray,
-        thickness: FloatArray,
-        triangles: IntArray,
-        settings: ContactSettings,
-        skin: float,
-    ) -> None:
-        self._triangles = triangles
-        self._near = _near_at_rest(rest, thickness, triangles, settings)
+    def __init__(self, sheet: Sheet, triangles: IntArray, skin: float) -> None:
+        self.triangles = triangles
+        self._near = _near_at_rest(sheet, triangles)
         # A pair that is neither listed nor near at rest has the reference distance for its reach at
         # least.
-        self._unlisted = settings.reference_distance * float(thickness.min()) + skin
+        self._unlisted = sheet.distance * float(sheet.thickness.min()) + skin
         faces = np.asfortranarray(triangles, dtype=np.int32)
-        self.mesh = ipctk.CollisionMesh(np.asfortranarray(rest), ipctk.edges(faces), faces)
+        self.mesh = ipctk.CollisionMesh(np.asfortranarray(sheet.rest), ipctk.edges(faces), faces)
 
     def free_share(
         self, pairs: ContactPairs, y: FloatArray, dy: FloatArray, *, detect: bool = False
@@ -357,7 +329,7 @@ class Passing:
 
     def stays_apart(self, pairs: ContactPairs, y: FloatArray, dy: FloatArray) -> bool:
         """Whether points that are no neighbours are proved too far apart for triangles to meet."""
-        longest = _longest_edges(y, dy, self._triangles)
+        longest = _longest_edges(y, dy, self.triangles)
         moved = np.sqrt(np.max(np.sum((y - pairs.positions) ** 2, axis=1)))
         moved += np.sqrt(np.max(np.sum(dy**2, axis=1)))
         if self._unlisted - 2 * moved <= np.sqrt(0.5) * float(longest.max()):
@@ -374,12 +346,13 @@ class Passing:
 
 
 def _near_at_rest(
-    rest: FloatArray, thickness: FloatArray, triangles: IntArray, settings: ContactSettings
+    sheet: Sheet, triangles: IntArray
 ) -> tuple[NDArray[np.int32], IntArray, IntArray]:
     """Pairs ``(2, p)`` that a search may leave out at any distance, and the neighbours of points.
 
     The neighbours of point i are those from ``start[i]`` to ``start[i + 1]``.
     """
+    rest, thickness = sheet.rest, sheet.thickness
     n = len(rest)
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     step = sparse.coo_array((np.ones(len(edges)), edges.T), shape=(n, n)).tocsr()
@@ -389,7 +362,7 @@ def _near_at_rest(
         reached = (reached @ step).tocsr()
     reached.sort_indices()
     # Their reach is NEIGHBOUR times the distance at rest; beyond this it is the reference distance.
-    share = settings.reference_distance / NEIGHBOUR
+    share = sheet.distance / NEIGHBOUR
     pairs = cKDTree(rest).query_pairs(share * float(thickness.max()), output_type="ndarray")
     apart = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1)
     pairs = pairs[apart < share * 0.5 * thickness[pairs].sum(axis=1)]
@@ -416,6 +389,19 @@ def _longest_edges(y: FloatArray, dy: FloatArray, triangles: IntArray) -> FloatA
     return np.sqrt(out)
 
 
+@nb.njit(cache=True, inline="always")
+def approaching(y: FloatArray, dy: FloatArray, i: int, j: int) -> tuple[float, float, float]:
+    """Square of the vector between two points, its product with its change, and that's square."""
+    rr, rd, dd = 0.0, 0.0, 0.0
+    for c in range(3):
+        r = y[i, c] - y[j, c]
+        s = dy[i, c] - dy[j, c]
+        rr += r * r
+        rd += r * s
+        dd += s * s
+    return rr, rd, dd
+
+
 @nb.njit(cache=True)
 def _stay_apart(
     y: FloatArray,
@@ -429,13 +415,7 @@ def _stay_apart(
     """Whether all pairs but neighbours stay farther apart than those of triangles that meet."""
     for k in range(len(first)):
         i, j = first[k], second[k]
-        rr, rd, dd = 0.0, 0.0, 0.0
-        for c in range(3):
-            r = y[i, c] - y[j, c]
-            s = dy[i, c] - dy[j, c]
-            rr += r * r
-            rd += r * s
-            dd += s * s
+        rr, rd, dd = approaching(y, dy, i, j)
         if rd < 0.0:
             t = min(1.0, -rd / dd)
             rr += t * (2.0 * rd + t * dd)

@@ -1,1 +1,64 @@
-"""Laws of leaflet tissue: moduli in, energy, stress and tangent out."""
+"""How tissue answers strain: what a material law is, and the laws that there are.
+
+Arrays of points have the axes (element, quadrature point, component). Strain and stress are
+six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame of the point, strain with engineering shear,
+stress the second Piola-Kirchhoff one in MPa.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from mvest.mechanics.parameters import Parameter
+from mvest.typing import FloatArray, IntArray
+
+
+class Points(NamedTuple):
+    """The state at the quadrature points of some elements, of which a law is asked.
+
+    Attributes
+    ----------
+    green : ndarray
+        ``(e, q, 6)`` Green-Lagrange strain.
+    region : ndarray
+        ``(e,)`` regions, counted from 0.
+    previous : ndarray
+        ``(e, q, 6)`` strain measure of the law at the start of the step.
+    rate : float
+        Stiffness-proportional damping over the step, ``beta / dt``; 0 in an equilibrium.
+    """
+
+    green: FloatArray
+    region: IntArray
+    previous: FloatArray
+    rate: float
+
+
+@runtime_checkable
+class Law(Protocol):
+    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`)."""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of parameter (:data:`mvest.mechanics.parameters.KINDS`) that it knows."""
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """Strain measure ``(e, q, 6)`` whose rate is damped."""
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """Change of the strain measure for a change of the Green-Lagrange strain."""
+
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``, its derivative by ``green``, MPa."""
+
+    def partial_stress(
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
+    ) -> FloatArray:
+        """Derivative of the stress ``(e, q, 6)`` by a parameter of region ``which``.
+
+        At fixed strain; ``stress`` is what `response` has given at the same points, of which the
+        derivative is often a multiple. InputError if the parameter is none of `kinds`.
+        """
+
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
+        """Change of the stress for a change of the previous strain measure."""

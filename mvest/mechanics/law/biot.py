@@ -25,6 +25,14 @@ Kelvin-Voigt damping (the stiffness-proportional part of Rayleigh damping in its
 adds ``beta d(epsilon)/dt`` to epsilon; with backward Euler
 ``T = C : (epsilon + rate (epsilon - epsilon_n))`` where ``rate = beta / dt``. It neither resists
 nor drives rigid rotation.
+
+The usual corotational tetrahedron, which the paper's simulation has, is linear in a turned frame.
+The force of an element at positions x is that of linear elasticity in a frame that turns with it,
+
+.. math:: f = R K (R^T x - X), \qquad K = V B^T C B,
+
+with R of the element's edges (:class:`mvest.mechanics.solid.EdgeRotations`). The tangent is taken
+at fixed R: :math:`R K R^T`. Neither is exact for a law with an energy.
 """
 
 from __future__ import annotations
@@ -36,6 +44,7 @@ import numba as nb
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
@@ -57,8 +66,6 @@ their norm is the tensor's."""
 class BiotLaw:
     """The law of a body: one stiffness per region, evaluated at all quadrature points at once.
 
-    Arrays of points have the axes (element, quadrature point, component).
-
     Attributes
     ----------
     stiffness : ndarray
@@ -66,10 +73,14 @@ class BiotLaw:
     moduli : tuple of LeafletModuli
         What the stiffness was made of, one per region; empty where it is only known itself, and
         has a scale E_f but no ratio and no G to differentiate by.
+    corotational : bool
+        Whether the strain that it is given is already the linear one, in the turned frame of the
+        element (:class:`mvest.mechanics.solid.EdgeRotations`), and the stress that in this frame.
     """
 
     stiffness: FloatArray
     moduli: tuple[LeafletModuli, ...] = ()
+    corotational: bool = False
 
     @classmethod
     def of(cls, materials: Sequence[TransverselyIsotropic]) -> BiotLaw:
@@ -77,7 +88,7 @@ class BiotLaw:
         return cls(np.ascontiguousarray([m.stiffness for m in materials]))
 
     @classmethod
-    def of_moduli(cls, moduli: Sequence[LeafletModuli]) -> BiotLaw:
+    def of_moduli(cls, moduli: Sequence[LeafletModuli], *, corotational: bool = False) -> BiotLaw:
         """The law with the moduli of each region.
 
         Raises
@@ -86,7 +97,7 @@ class BiotLaw:
             If some are inadmissible.
         """
         law = cls.of([m.material for m in moduli])
-        return cls(law.stiffness, tuple(moduli))
+        return cls(law.stiffness, tuple(moduli), corotational)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -95,56 +106,23 @@ class BiotLaw:
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Biot strain ``(e, q, 6)`` of Green-Lagrange strain ``(e, q, 6)``, both engineering."""
-        return _linear(green, green, 0)
+        return self._map(green, green, 0)
 
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
-
-        Parameters
-        ----------
-        green : ndarray
-            ``(e, q, 6)`` Green-Lagrange strain.
-        region : ndarray
-            ``(e,)``.
-        previous : ndarray
-            ``(e, q, 6)`` Biot strain at the start of the step.
-        rate : float
-            ``beta / dt``, dimensionless; 0 without damping.
-        """
-        return _response(green, region, self.stiffness, previous, rate)
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
+        """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa."""
+        if not self.corotational:
+            return _response(at.green, at.region, self.stiffness, at.previous, at.rate)
+        stiffness = self.stiffness[at.region]
+        strain = (1 + at.rate) * at.green - at.rate * at.previous
+        tangent = np.repeat((1 + at.rate) * stiffness[:, None], at.green.shape[1], axis=1)
+        return np.einsum("eij,eqj->eqi", stiffness, strain), tangent
 
     def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)`` by a parameter of region ``which``, at fixed strain.
-
-        Parameters
-        ----------
-        parameter : Parameter
-        green, region, previous, rate
-            As in `response`.
-        which : int
-            Index of the parameter's region.
-        stress : ndarray
-            ``(e, q, 6)`` what `response` has given.
-
-        Raises
-        ------
-        InputError
-            If the law does not know the parameter.
-        """
+        """Derivative of S ``(e, q, 6)``; InputError if the law does not know the parameter."""
         parameter.require(self.kinds)
-        here = region == which
+        here = at.region == which
         if parameter.kind == "E_f" and (not self.moduli or self.moduli[which].G is None):
             # All moduli follow E_f: S is linear in the scale of C.
             return np.where(here[:, None, None], stress, 0.0) / parameter.value
@@ -152,20 +130,22 @@ class BiotLaw:
             raise InputError(f"parameter {parameter.name!r}: the law has a stiffness, no moduli")
         out = np.zeros_like(stress)
         by = self.moduli[which].stiffness_by(parameter.kind)
-        strain = (1 + rate) * self.strain(green[here]) - rate * previous[here]
-        out[here] = _linear(green[here], strain @ by.T, 1)
+        green, rate = at.green[here], at.rate
+        strain = (1 + rate) * self.strain(green) - rate * at.previous[here]
+        out[here] = self._map(green, strain @ by.T, 1)
         return out
 
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of S ``(e, q, 6)`` for a change of the previous Biot strain: ``-rate L^T C d``."""
-        stress = np.einsum("eij,eqj->eqi", self.stiffness[region], d_previous)
-        return -rate * _linear(green, stress, 1)
+        stress = np.einsum("eij,eqj->eqi", self.stiffness[at.region], d_previous)
+        return -at.rate * self._map(at.green, stress, 1)
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """Change of the Biot strain ``L dE`` ``(e, q, 6)``."""
-        return _linear(green, np.ascontiguousarray(d_green), -1)
+        return self._map(green, np.ascontiguousarray(d_green), -1)
+
+    def _map(self, green: FloatArray, values: FloatArray, power: int) -> FloatArray:
+        return values if self.corotational else _linear(green, values, power)
 
 
 @nb.njit(cache=True, error_model="numpy")

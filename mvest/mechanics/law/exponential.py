@@ -1,4 +1,4 @@
-r"""A fibre-reinforced exponential law of leaflet tissue.
+r"""A fibre-reinforced exponential law of leaflet tissue, and one on the way to it.
 
 With the stretch of the fibres :math:`\lambda = \sqrt{I_4}`, the first invariant of the isochoric
 deformation :math:`\bar I_1 = J^{-2/3} \mathrm{tr}\, C` and :math:`C = I + 2E`,
@@ -36,6 +36,20 @@ Green-Lagrange strain and so leaves rigid rotation alone.
 In a biaxial test a thin sheet is stretched along and across its fibres. The stress across the
 thickness is zero, which decides the stretch of the thickness. From it follows the exponential
 tissue that is as stiff as a linear one where closed leaflets are.
+
+Whether a leaflet has stiffened when it is closed cannot be told beforehand, and moduli that are
+fitted with the wrong law are off. So the stress of one region is that of both laws,
+
+.. math::
+    S = (1 - w) S_{lin} + w S_{exp}, \qquad w = \frac{\alpha}{1 + \alpha},
+
+where the exponential tissue is as stiff as the linear one of the same modulus where it is stretched
+as closed leaflets are (`as_stiff`). The *stiffening* :math:`\alpha` is the ratio of their shares;
+0 is the linear law, and without end the exponential one. Both parts follow the modulus, so that S
+is proportional to it.
+
+Damping is that of the linear law whatever the share, so that the way to the equilibrium does not
+depend on it.
 """
 
 from __future__ import annotations
@@ -43,12 +57,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
-from typing import Protocol
 
 import numba as nb
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Law, Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, TissueSettings
@@ -67,8 +81,6 @@ VISCOUS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 @dataclass(frozen=True, slots=True, eq=False)
 class ExponentialLaw:
     """The law of a body: one set of coefficients per region, all quadrature points at once.
-
-    Arrays of points have the axes (element, quadrature point, component).
 
     Attributes
     ----------
@@ -92,52 +104,24 @@ class ExponentialLaw:
         """The Green-Lagrange strain ``(e, q, 6)`` itself is what is damped."""
         return green
 
-    def energy(self, green: FloatArray, region: IntArray) -> FloatArray:
-        """W ``(e, q)`` MPa of Green-Lagrange strain ``(e, q, 6)``; infinite if turned over."""
-        return _energy(green, region, self.coefficients)
-
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
         """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
 
         A strain of matter that has turned over, where there is no W, can occur during a Newton
         iteration. The response is then that of very stiff linear matter, which is far from any
         equilibrium and leads back.
-
-        Parameters
-        ----------
-        green : ndarray
-            ``(e, q, 6)`` Green-Lagrange strain.
-        region : ndarray
-            ``(e,)``.
-        previous : ndarray
-            ``(e, q, 6)`` Green-Lagrange strain at the start of the step.
-        rate : float
-            ``beta / dt``, dimensionless; 0 without damping.
         """
-        stress, tangent = _response(green, region, self.coefficients)
-        if rate:
-            viscous = rate * self._viscous(region)
-            stress += viscous * (green - previous)
+        stress, tangent = _response(at.green, at.region, self.coefficients)
+        if at.rate:
+            viscous = at.rate * self._viscous(at.region)
+            stress += viscous * (at.green - at.previous)
             tangent[:, :, range(6), range(6)] += viscous
         return stress, tangent
 
     def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
     ) -> FloatArray:
-        """Derivative of S ``(e, q, 6)`` by a coefficient of region ``which``, at fixed strain.
-
-        Damping has no part in it. The arguments are those of
-        :meth:`mvest.mechanics.law.biot.BiotLaw.partial_stress`.
+        """Derivative of S ``(e, q, 6)`` by a coefficient, in which damping has no part.
 
         Raises
         ------
@@ -146,13 +130,11 @@ class ExponentialLaw:
         """
         parameter.require(self.kinds)
         kind = EXPONENTIAL_KINDS.index(parameter.kind)
-        return _partial_stress(green, region, self.coefficients, kind, which)
+        return _partial_stress(at.green, at.region, self.coefficients, kind, which)
 
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of S ``(e, q, 6)`` for a change of the previous strain."""
-        return -rate * self._viscous(region) * d_previous
+        return -at.rate * self._viscous(at.region) * d_previous
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """Change of the damped strain ``(e, q, 6)``, which is that of the Green-Lagrange strain."""
@@ -182,32 +164,10 @@ def _metric(green: FloatArray, h: FloatArray) -> tuple[float, float]:
 
 
 @nb.njit(cache=True)
-def _exponential(q: float) -> tuple[float, float, float]:
-    """exp(q) - 1 and its first two derivatives, a parabola beyond ``MAX_EXPONENT``."""
-    if q <= MAX_EXPONENT:
-        e = np.exp(q)
-        return np.expm1(q), e, e
-    e, d = np.exp(MAX_EXPONENT), q - MAX_EXPONENT
-    return e * (1.0 + d + 0.5 * d * d) - 1.0, e * (1.0 + d), e
-
-
-@nb.njit(cache=True)
-def _energy(green: FloatArray, region: IntArray, coefficients: FloatArray) -> FloatArray:
-    n_e, n_q, _ = green.shape
-    out = np.empty((n_e, n_q))
-    h = np.empty(6)
-    for e in range(n_e):
-        c0, c1, c2, mu, kappa, _ = coefficients[region[e]]
-        for p in range(n_q):
-            det, trace = _metric(green[e, p], h)
-            if det == 0.0:
-                out[e, p] = np.inf
-                continue
-            a = trace * det ** (-1.0 / 3.0) - 3.0
-            x = max(np.sqrt(1.0 + 2.0 * green[e, p, 0]) - 1.0, 0.0)
-            g, _, _ = _exponential(c1 * a * a + c2 * x**4)
-            out[e, p] = c0 * g + 0.5 * mu * a + 0.25 * kappa * (det - 1.0 - np.log(det))
-    return out
+def _exponential(q: float) -> tuple[float, float]:
+    """The first two derivatives of exp(q), which is a parabola beyond ``MAX_EXPONENT``."""
+    e = np.exp(min(q, MAX_EXPONENT))
+    return e * (1.0 + max(q - MAX_EXPONENT, 0.0)), e
 
 
 @nb.njit(cache=True)
@@ -235,7 +195,7 @@ def _response(
                 da[i] = 2.0 * isochoric * ((1.0 if i < 3 else 0.0) - trace / 3.0 * h[i])
             length = np.sqrt(1.0 + 2.0 * green[e, p, 0])
             x = max(length - 1.0, 0.0)
-            _, g1, g2 = _exponential(c1 * a * a + c2 * x**4)
+            g1, g2 = _exponential(c1 * a * a + c2 * x**4)
             q_a, q_f = 2.0 * c1 * a, 4.0 * c2 * x**3 / length
             q_ff = c2 * (12.0 * x * x / length**2 - 4.0 * x**3 / length**3)
             w_a, w_f = 0.5 * mu + c0 * g1 * q_a, c0 * g1 * q_f
@@ -281,7 +241,7 @@ def _partial_stress(
             a = trace * isochoric - 3.0
             length = np.sqrt(1.0 + 2.0 * green[e, p, 0])
             x = max(length - 1.0, 0.0)
-            _, g1, g2 = _exponential(c1 * a * a + c2 * x**4)
+            g1, g2 = _exponential(c1 * a * a + c2 * x**4)
             q_a, fourth = 2.0 * c1 * a, 4.0 * x**3 / length
             by_a, by_f, by_volume = 0.0, 0.0, 0.0
             if kind == 0:
@@ -308,13 +268,7 @@ TOLERANCE = 1e-12
 """Change of the thickness strain at which the stretch of the thickness is found."""
 
 
-class _Stressed(Protocol):
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]: ...
-
-
-def biaxial_stress(law: _Stressed, stretches: FloatArray, region: int = 0) -> FloatArray:
+def biaxial_stress(law: Law, stretches: FloatArray, region: int = 0) -> FloatArray:
     """Nominal stresses ``(n, 2)`` MPa along and across the fibres.
 
     Parameters
@@ -339,7 +293,7 @@ def biaxial_stress(law: _Stressed, stretches: FloatArray, region: int = 0) -> Fl
     where, none = np.full(len(stretches), region), np.zeros_like(green)
     for _ in range(MAX_ITERATIONS):
         green[:, 0, 2] = 0.5 * (thickness**2 - 1)
-        stress, tangent = law.response(green, where, none, 0.0)
+        stress, tangent = law.response(Points(green, where, none, 0.0))
         # In the logarithm of the thickness, which stays positive whatever the step.
         slope = tangent[:, 0, 2, 2] * thickness**2 + 2 * stress[:, 0, 2]
         change = -stress[:, 0, 2] / np.where(slope > 0, slope, tangent[:, 0, 2, 2] * thickness**2)
@@ -376,3 +330,75 @@ def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
     stretches = np.array([CLOSED_STRETCHES])
     wanted = biaxial_stress(BiotLaw.of([linear.moduli(1.0).material]), stretches).mean()
     return float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StiffeningLaw:
+    """The law of a body of one region.
+
+    Attributes
+    ----------
+    linear : BiotLaw
+    exponential : ExponentialLaw
+        As stiff where closed leaflets are stretched.
+    stiffening : float
+        Share of the exponential law over that of the linear one, at least 0.
+    """
+
+    linear: BiotLaw
+    exponential: ExponentialLaw
+    stiffening: float
+
+    @classmethod
+    def of(cls, tissue: TissueSettings, E_f: float, stiffening: float) -> StiffeningLaw:
+        """The law of a tissue of modulus ``E_f`` MPa.
+
+        Raises
+        ------
+        InputError
+            If the tissue has no exponential law, or the stiffening is not a number of at least 0.
+        MaterialError
+            If the modulus is inadmissible.
+        """
+        if not (np.isfinite(stiffening) and stiffening >= 0.0):
+            raise InputError(f"tissue stiffening = {stiffening}, expected >= 0")
+        curve = as_stiff(tissue.coefficients({}), tissue, E_f)
+        return cls(
+            BiotLaw.of_moduli([tissue.moduli(E_f)]), ExponentialLaw.of([curve]), float(stiffening)
+        )
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        return ("E_f", "stiffening")
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """Strain measure of the linear law, ``(e, q, 6)``."""
+        return self.linear.strain(green)
+
+    def response(self, at: Points) -> tuple[FloatArray, FloatArray]:
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)`` MPa."""
+        whole = 1.0 + self.stiffening
+        stress, tangent = self.linear.response(at._replace(rate=at.rate * whole))
+        own, by = self.exponential.response(at._replace(rate=0.0))
+        stress, tangent = stress + self.stiffening * own, tangent + self.stiffening * by
+        return stress / whole, tangent / whole
+
+    def partial_stress(
+        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
+    ) -> FloatArray:
+        """Derivative of S ``(e, q, 6)``; InputError if the law does not know the parameter."""
+        parameter.require(self.kinds)
+        if parameter.kind == "E_f":
+            return stress / parameter.value
+        still = at._replace(rate=0.0)
+        linear, exponential = (law.response(still)[0] for law in (self.linear, self.exponential))
+        return (exponential - linear) / (1.0 + self.stiffening) ** 2
+
+    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
+        """Change of S ``(e, q, 6)`` for a change of the previous strain: of the damping alone."""
+        return self.linear.history_stress(at, d_previous)
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """Change of the strain measure of the linear law."""
+        return self.linear.strain_change(green, d_green)

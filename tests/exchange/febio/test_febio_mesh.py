@@ -11,6 +11,7 @@ import pytest
 from mvest.exchange.febio.document import Control, FebDocument
 from mvest.exchange.febio.mesh import NAMES, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.body import box, outer_faces
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.settings import ExponentialTissue
@@ -205,7 +206,9 @@ def test_the_exponential_is_the_same_where_the_volume_is():
     f = stretched(1, 0.1)
     f /= np.cbrt(np.linalg.det(f))
     c = f.T @ f
-    ours = ExponentialLaw.of([tissue]).response(green(c), np.zeros(1, int), REST, 0.0)[0][0, 0]
+    ours = ExponentialLaw.of([tissue]).response(Points(green(c), np.zeros(1, int), REST, 0.0))[0][
+        0, 0
+    ]
 
     def energy(x):
         values = invariants(x)

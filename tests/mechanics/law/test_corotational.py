@@ -9,7 +9,7 @@ from scipy.linalg import polar
 from mvest.errors import InputError
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.linear import LinearLaw
+from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
@@ -24,7 +24,7 @@ MODULI = LeafletModuli(6.23, 2.651, 0.488, PoissonReading.LITERAL)
 
 def solid(element="tet4", moduli=MODULI):
     mesh = block(element, (3, 2, 1), fibre=(0.8, 0.6, 0), distortion=(0.2, 0.2, 0.1))
-    return Solid(mesh, LinearLaw.of_moduli([moduli], corotational=True))
+    return Solid(mesh, BiotLaw.of_moduli([moduli], corotational=True))
 
 
 def forces(body, x):

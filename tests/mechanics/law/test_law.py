@@ -6,6 +6,7 @@ import pytest
 from mvest.errors import MaterialError
 from mvest.mechanics.forces.cables import Hinge
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.solid import Solid
@@ -210,7 +211,7 @@ def test_stress_is_the_derivative_of_the_energy_also_for_coinciding_stretches():
     green[0, 0] = 0.0  # three equal stretches
     green[0, 1] = [0.1, 0.1, 0.0, 0, 0, 0]  # two equal
     region = np.zeros(4, dtype=int)
-    stress, _ = law.response(green, region, np.zeros_like(green), 0.0)
+    stress, _ = law.response(Points(green, region, np.zeros_like(green), 0.0))
     errors = []
     for h in (1e-2, 5e-3):
         difference = np.empty_like(stress)
@@ -241,7 +242,9 @@ def test_the_term_of_the_non_commuting_stretch_is_there():
     green = np.array([0.1, -0.05, 0.0, 0.0, 0.0, 0.2])
     for name, present in (("A", True), ("isotropic", False)):
         law = BiotLaw.of((MATERIALS[name],))
-        s, _ = law.response(green[None, None], np.zeros(1, dtype=int), np.zeros((1, 1, 6)), 0.0)
+        s, _ = law.response(
+            Points(green[None, None], np.zeros(1, dtype=int), np.zeros((1, 1, 6)), 0.0)
+        )
         s = s[0, 0]
         e = law.strain(green[None, None])[0, 0]
         u = np.eye(3) + 0.5 * np.array(

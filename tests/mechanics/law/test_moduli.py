@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError, MaterialError
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading
 from mvest.mechanics.parameters import Parameter
@@ -81,11 +82,14 @@ def test_derivatives_of_the_stress_agree_with_differences_under_damping(reading,
     def stress(change):
         changed = replace(both[1], **{kind: value + change})
         law = BiotLaw.of_moduli([both[0], changed])
-        return law.response(green, region, previous, 2.0)[0]
+        return law.response(Points(green, region, previous, 2.0))[0]
 
     law = BiotLaw.of_moduli(both)
     exact = law.partial_stress(
-        Parameter(f"{kind}.b", value), green, region, previous, 2.0, which=1, stress=stress(0.0)
+        Parameter(f"{kind}.b", value),
+        Points(green, region, previous, 2.0),
+        which=1,
+        stress=stress(0.0),
     )
     h = 1e-3 * value
     differences = [(stress(s) - stress(-s)) / (2 * s) for s in (4 * h, h)]
@@ -99,5 +103,8 @@ def test_a_law_says_what_it_knows():
     zeros = np.zeros((1, 1, 6))
     with pytest.raises(InputError, match=r"knows E_f\.REGION, ratio\.REGION, G\.REGION"):
         law.partial_stress(
-            Parameter("field.a.0", 0.0), zeros, np.zeros(1, int), zeros, 0.0, which=0, stress=zeros
+            Parameter("field.a.0", 0.0),
+            Points(zeros, np.zeros(1, int), zeros, 0.0),
+            which=0,
+            stress=zeros,
         )

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw, biaxial_stress
-from mvest.mechanics.law.stiffening import PrestretchedLaw
+from mvest.mechanics.law.regional import LeafletLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
 
@@ -21,7 +22,7 @@ NONE = np.zeros_like(GREEN)
 
 
 def prestretched(base=LINEAR, prestretch=PRESTRETCH, region=REGION):
-    return PrestretchedLaw(base, np.asarray(prestretch), region)
+    return LeafletLaw((base,), region, np.asarray(prestretch))
 
 
 def deformation(green):
@@ -49,8 +50,8 @@ def test_cauchy_stress_is_that_of_the_whole_deformation(base):
     G[:, 0, 2, 2] = stretch**-2
     whole = F @ G
     green = six(0.5 * (np.swapaxes(whole, -1, -2) @ whole - np.eye(3)), 2.0)
-    S0 = base.response(green, REGION, NONE, 0.0)[0]
-    S = prestretched(base).response(GREEN, REGION, NONE, 0.0)[0]
+    S0 = base.response(Points(green, REGION, NONE, 0.0))[0]
+    S = prestretched(base).response(Points(GREEN, REGION, NONE, 0.0))[0]
 
     def cauchy(F, S):
         full = np.empty((*S.shape[:2], 3, 3))
@@ -75,8 +76,8 @@ def test_without_prestretch_it_is_the_law_itself():
     law = prestretched(prestretch=[1.0, 1.0])
     previous = LINEAR.strain(0.5 * GREEN)
     for one, other in zip(
-        law.response(GREEN, REGION, previous, 0.7),
-        LINEAR.response(GREEN, REGION, previous, 0.7),
+        law.response(Points(GREEN, REGION, previous, 0.7)),
+        LINEAR.response(Points(GREEN, REGION, previous, 0.7)),
         strict=True,
     ):
         np.testing.assert_array_equal(one, other)
@@ -86,8 +87,8 @@ def test_at_rest_it_pulls_and_damping_does_not():
     law = prestretched()
     rest = law.strain(NONE)
     assert np.abs(rest).max() > 0.02
-    damped = law.response(NONE, REGION, rest, 0.7)[0]
-    still = law.response(NONE, REGION, rest, 0.0)[0]
+    damped = law.response(Points(NONE, REGION, rest, 0.7))[0]
+    still = law.response(Points(NONE, REGION, rest, 0.0))[0]
     np.testing.assert_allclose(damped, still, atol=1e-12)
     longer = REGION == 0
     assert np.all(still[longer][..., :2] > 0)
@@ -100,16 +101,16 @@ def test_derivatives_agree_with_differences(base):
     previous = law.strain(0.5 * GREEN)
 
     def stress(green=GREEN, before=previous, own=law):
-        return own.response(green, REGION, before, rate)[0]
+        return own.response(Points(green, REGION, before, rate))[0]
 
-    tangent = law.response(GREEN, REGION, previous, rate)[1]
+    tangent = law.response(Points(GREEN, REGION, previous, rate))[1]
     for i in range(6):
         step = h * np.eye(6)[i]
         by = (stress(GREEN + step) - stress(GREEN - step)) / (2 * h)
         np.testing.assert_allclose(tangent[..., i], by, atol=1e-6 * np.abs(tangent).max())
     change = RNG.standard_normal(GREEN.shape)
     by = (stress(before=previous + h * change) - stress(before=previous - h * change)) / (2 * h)
-    found = law.history_stress(GREEN, REGION, change, rate)
+    found = law.history_stress(Points(GREEN, REGION, GREEN, rate), change)
     np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
     by = (law.strain(GREEN + h * change) - law.strain(GREEN - h * change)) / (2 * h)
     np.testing.assert_allclose(law.strain_change(GREEN, change), by, atol=1e-7 * np.abs(by).max())
@@ -122,27 +123,30 @@ def test_derivative_by_a_prestretch_agrees_with_differences(base, which):
 
     def stress(step):
         moved = PRESTRETCH + step * np.eye(2)[which]
-        return prestretched(base, moved).response(GREEN, REGION, NONE, 0.0)[0]
+        return prestretched(base, moved).response(Points(GREEN, REGION, NONE, 0.0))[0]
 
     by = (stress(h) - stress(-h)) / (2 * h)
     law = prestretched(base)
     name = Parameter("prestretch.anterior", PRESTRETCH[which])
     given = {"which": which, "stress": stress(0.0)}
-    found = law.partial_stress(name, GREEN, REGION, NONE, 0.0, **given)
+    found = law.partial_stress(name, Points(GREEN, REGION, NONE, 0.0), **given)
     np.testing.assert_allclose(found, by, atol=1e-6 * np.abs(by).max())
     assert not found[which != REGION].any()
     with pytest.raises(InputError, match="at an equilibrium only"):
-        law.partial_stress(name, GREEN, REGION, NONE, 0.7, **given)
+        law.partial_stress(name, Points(GREEN, REGION, NONE, 0.7), **given)
 
 
 def test_derivative_by_a_modulus_agrees_with_differences():
     def stress(E):
         base = BiotLaw.of_moduli([TISSUE.moduli(E), TISSUE.moduli(2.0)])
-        return prestretched(base).response(GREEN, REGION, NONE, 0.0)[0]
+        return prestretched(base).response(Points(GREEN, REGION, NONE, 0.0))[0]
 
     by = (stress(5.0 + 1e-6) - stress(5.0 - 1e-6)) / 2e-6
     found = prestretched().partial_stress(
-        Parameter("E_f.anterior", 5.0), GREEN, REGION, NONE, 0.0, which=0, stress=stress(5.0)
+        Parameter("E_f.anterior", 5.0),
+        Points(GREEN, REGION, NONE, 0.0),
+        which=0,
+        stress=stress(5.0),
     )
     np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
 

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
+from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import (
     CLOSED_STRETCHES,
     ExponentialLaw,
+    StiffeningLaw,
     as_stiff,
     biaxial_stress,
 )
-from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
 
@@ -27,22 +28,22 @@ RATE = 0.7
 
 def stress(stiffening, E_f=E, green=GREEN, previous=PREVIOUS, rate=RATE):
     law = StiffeningLaw.of(TISSUE, E_f, stiffening)
-    return law.response(green, REGION, previous, rate)[0]
+    return law.response(Points(green, REGION, previous, rate))[0]
 
 
 def partial(name, stiffening, value):
     law = StiffeningLaw.of(TISSUE, E, stiffening)
-    found = law.response(GREEN, REGION, PREVIOUS, RATE)[0]
+    found = law.response(Points(GREEN, REGION, PREVIOUS, RATE))[0]
     by = Parameter(name, value)
-    return law.partial_stress(by, GREEN, REGION, PREVIOUS, RATE, which=0, stress=found)
+    return law.partial_stress(by, Points(GREEN, REGION, PREVIOUS, RATE), which=0, stress=found)
 
 
 def test_without_stiffening_it_is_the_linear_law():
     linear = BiotLaw.of_moduli([TISSUE.moduli(E)])
     law = StiffeningLaw.of(TISSUE, E, 0.0)
     for one, other in zip(
-        law.response(GREEN, REGION, PREVIOUS, RATE),
-        linear.response(GREEN, REGION, PREVIOUS, RATE),
+        law.response(Points(GREEN, REGION, PREVIOUS, RATE)),
+        linear.response(Points(GREEN, REGION, PREVIOUS, RATE)),
         strict=True,
     ):
         np.testing.assert_array_equal(one, other)
@@ -50,7 +51,7 @@ def test_without_stiffening_it_is_the_linear_law():
 
 def test_its_limit_is_the_exponential_law():
     exponential = ExponentialLaw.of([as_stiff(CURVE, TISSUE, E)])
-    wanted = exponential.response(GREEN, REGION, GREEN, 0.0)[0]
+    wanted = exponential.response(Points(GREEN, REGION, GREEN, 0.0))[0]
     # Of the linear law a millionth is left.
     np.testing.assert_allclose(stress(1e6, rate=0.0), wanted, atol=2e-6 * np.abs(wanted).max())
 
@@ -67,7 +68,7 @@ def test_closed_leaflets_are_as_stiff_whatever_the_share(stiffening):
 @pytest.mark.parametrize("stiffening", [0.0, 0.3, 5.0])
 def test_derivatives_agree_with_differences(stiffening):
     law = StiffeningLaw.of(TISSUE, E, stiffening)
-    _, tangent = law.response(GREEN, REGION, PREVIOUS, RATE)
+    _, tangent = law.response(Points(GREEN, REGION, PREVIOUS, RATE))
     h = 1e-6
     for i in range(6):
         step = h * np.eye(6)[i]
@@ -88,8 +89,8 @@ def test_derivatives_agree_with_differences(stiffening):
 def test_damping_is_that_of_the_linear_law(stiffening):
     linear = BiotLaw.of_moduli([TISSUE.moduli(E)])
     alone = (
-        linear.response(GREEN, REGION, PREVIOUS, RATE)[0]
-        - linear.response(GREEN, REGION, PREVIOUS, 0.0)[0]
+        linear.response(Points(GREEN, REGION, PREVIOUS, RATE))[0]
+        - linear.response(Points(GREEN, REGION, PREVIOUS, 0.0))[0]
     )
     damped = stress(stiffening) - stress(stiffening, rate=0.0)
     np.testing.assert_allclose(damped, alone, atol=1e-10 * np.abs(alone).max())
@@ -97,7 +98,9 @@ def test_damping_is_that_of_the_linear_law(stiffening):
     law = StiffeningLaw.of(TISSUE, E, stiffening)
     by = (stress(stiffening, previous=PREVIOUS + change) - stress(stiffening)).ravel()
     np.testing.assert_allclose(
-        law.history_stress(GREEN, REGION, change, RATE).ravel(), by, atol=1e-9 * np.abs(by).max()
+        law.history_stress(Points(GREEN, REGION, GREEN, RATE), change).ravel(),
+        by,
+        atol=1e-9 * np.abs(by).max(),
     )
 
 
@@ -106,7 +109,10 @@ def test_what_it_does_not_know_is_refused():
     assert law.kinds == ("E_f", "stiffening")
     with pytest.raises(InputError, match=r"knows E_f\.REGION, stiffening\.REGION"):
         law.partial_stress(
-            Parameter("ratio.anterior", 2.6), GREEN, REGION, PREVIOUS, RATE, which=0, stress=GREEN
+            Parameter("ratio.anterior", 2.6),
+            Points(GREEN, REGION, PREVIOUS, RATE),
+            which=0,
+            stress=GREEN,
         )
     with pytest.raises(InputError, match=r"tissue stiffening = -0\.1"):
         StiffeningLaw.of(TISSUE, E, -0.1)
