@@ -129,7 +129,7 @@ def _table(rest: list[str]) -> int:
 
 def _sync(rest: list[str]) -> int:
     """Bring MLflow to the state of folders of outputs."""
-    from experiments.runner.tracking.log import sync
+    from experiments.runner.tracking import sync
 
     parser = Parser("mvest sync", description=COMMANDS["sync"])
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="outputs if none")
@@ -145,7 +145,7 @@ def _dashboard(rest: list[str]) -> int:
     import webbrowser
 
     from experiments.common.schema import require_within
-    from experiments.runner.tracking.dashboard import last_sweep, serving
+    from experiments.runner.dashboard import last_sweep, serving
     from mvest.quantities import within
 
     parser = Parser("mvest dashboard", description=COMMANDS["dashboard"])
@@ -165,8 +165,8 @@ def _dashboard(rest: list[str]) -> int:
 
 def _worker(rest: list[str]) -> int:
     """Run a shard of a sweep; what becomes of its jobs is recorded, and no failure of this."""
-    from experiments.runner.execution.engine import execute
-    from experiments.runner.planning.plan import Plan
+    from experiments.runner.engine import execute
+    from experiments.runner.plan import Plan
 
     parser = Parser("mvest worker", description=COMMANDS["worker"])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the sweep, in outputs/")

@@ -17,7 +17,7 @@ from experiments.common.schema import (
     require_within,
 )
 from experiments.common.study import load_settings, study_names
-from experiments.runner.execution.cluster import EngineSettings
+from experiments.runner.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION, range_of

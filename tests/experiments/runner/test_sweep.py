@@ -18,13 +18,10 @@ import pytest
 import yaml
 
 from experiments.results.keep import records_of
-from experiments.runner import plugins, sweep
-from experiments.runner.execution import engine, guard
-from experiments.runner.jobs import limits
-from experiments.runner.jobs.request import Request
-from experiments.runner.planning import progress
-from experiments.runner.planning.plan import Plan, PlannedJob
-from experiments.runner.planning.progress import SweepBar
+from experiments.runner import engine, jobs, plugins, sweep
+from experiments.runner.jobs import Request
+from experiments.runner.plan import Plan
+from experiments.runner.sweep import SweepBar
 from experiments.studies import twin
 from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import sha256_of
@@ -38,18 +35,18 @@ QUICK = ("hydra.launcher.n_jobs=1", "tracking.enabled=false")
 def run(run, monkeypatch):
     """Run a sweep in an empty folder: exit status, standard output and error."""
     fake = Path(__file__).with_name("fake_worker.py")
-    monkeypatch.setattr(guard, "WORKER", (sys.executable, str(fake)))
-    for name in guard.THREAD_VARIABLES:
+    monkeypatch.setattr(engine, "WORKER", (sys.executable, str(fake)))
+    for name in engine.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
-    guard.own_worker.cache_clear()
+    engine.own_worker.cache_clear()
 
     def call(*arguments):
         options = [one for one in arguments if one.startswith("-")]
         return run(*options, *QUICK, *(one for one in arguments if one not in options))
 
     yield call
-    guard.own_worker().close()
-    guard.own_worker.cache_clear()
+    engine.own_worker().close()
+    engine.own_worker.cache_clear()
     for worker in engine._idle.pop(str(Path.cwd()), ()):
         worker.close()
 
@@ -269,7 +266,7 @@ def test_a_sweep_s_own_grids_are_not_left_out_by_another_sweeper(run):
 def test_a_cluster_s_package_takes_no_signals_away():
     code = """
 import signal
-from experiments.runner.execution.cluster import EngineSettings, require_engine
+from experiments.runner.cluster import EngineSettings, require_engine
 before = signal.getsignal(signal.SIGINT)
 require_engine(EngineSettings(cluster="SLURMCluster"))
 assert signal.getsignal(signal.SIGINT) is before
@@ -456,7 +453,7 @@ def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
 
     monkeypatch.setattr(twin, "STUDY", replace(twin.STUDY, run=hog))
     resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    limit = round(resident / limits.GB + 0.2, 2)
+    limit = round(resident / jobs.GB + 0.2, 2)
     before = resource.getrlimit(resource.RLIMIT_DATA)
     status, _, err = run("experiment=debug", f"memory_limit_gb={limit}")
     assert status == 1
@@ -489,20 +486,20 @@ def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
     assert out.startswith("said: converged")
 
 
-def planned(seed: int) -> PlannedJob:
+def planned(seed: int) -> Request:
     values = {"factors": {"seed": seed}, "force": False, "seed": seed}
-    return PlannedJob(Request(values, f"{seed}" * 64, Path(f"{seed}")))
+    return Request(values, f"{seed}" * 64, Path(f"{seed}"))
 
 
 def test_the_bar_counts_and_names_failures(monkeypatch, capsys):
-    true = progress.tqdm
+    true = sweep.tqdm
     shown = io.StringIO()
 
     def visible(**settings):
         return true(**{**settings, "disable": False, "file": shown})
 
     visible.write, visible.format_interval = true.write, true.format_interval
-    monkeypatch.setattr(progress, "tqdm", visible)
+    monkeypatch.setattr(sweep, "tqdm", visible)
     with SweepBar("trial", 5, 3, 1) as bar:
         bar.ended(planned(1), made_up(status="converged"))
         bar.ended(planned(2), made_up(status="failed", reason="it buckled"))
@@ -550,10 +547,7 @@ def worker_of(folder: Path) -> int:
             try:
                 here = (place / "cwd").readlink() == folder
                 busy = here and (place / "fd" / "1").readlink().name == "log.txt"
-                if (
-                    busy
-                    and b"experiments.runner.execution.worker" in (place / "cmdline").read_bytes()
-                ):
+                if busy and b"experiments.runner.job" in (place / "cmdline").read_bytes():
                     return int(place.name)
             except OSError:
                 continue

@@ -20,8 +20,7 @@ from uuid import uuid4
 
 from experiments.common.records.record import Record
 from experiments.interruption import ASKING
-from experiments.runner.jobs.folder import write_failure
-from experiments.runner.jobs.request import Request
+from experiments.runner.jobs import Request, write_failure
 from mvest.errors import ConfigurationError
 from mvest.files import require_writable
 from mvest.processes import environment, python

@@ -1,34 +1,83 @@
-"""One run of one configuration: build, simulate, estimate, write down."""
+"""One run of one configuration: refuse what is wrong, build, simulate, estimate, write down.
+
+As a program it runs jobs one after the other for the process that started it (`engine`): requests
+are lines of JSON on standard input, answers lines of JSON on standard output. What a job itself
+prints, crashes of compiled code included, goes to the log in its folder.
+"""
 
 from __future__ import annotations
 
+import faulthandler
+import gc
+import json
+import os
+import sys
 import time
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from experiments.common.building.closure import mechanics_of
 from experiments.common.building.twin import require_room
 from experiments.common.config import hash_of
 from experiments.common.records.record import Record
 from experiments.common.records.writer import words_of, write_results
 from experiments.common.schema import build
-from experiments.common.study import Job, Results, Study, load_study
+from experiments.common.study import Check, Job, Results, Study, load_study, study_names
+from experiments.interruption import raised
 from experiments.results.keep import arrays_of
-from experiments.runner.execution.guard import run_apart
-from experiments.runner.jobs.folder import (
+from experiments.runner.engine import run_apart
+from experiments.runner.jobs import (
+    LOG,
     UNWRITTEN,
+    Request,
     attempt,
+    default_memory_gb,
+    held_memory,
     last_record,
     mark_done,
     replace_record,
     usable_record,
     write_hydra,
 )
-from experiments.runner.jobs.limits import default_memory_gb, held_memory
-from experiments.runner.jobs.request import Request
-from mvest.errors import InputError, message_of
+from experiments.runner.tracking import require_no_password
+from mvest.errors import ConfigurationError, InputError, MvestError, message_of
 from mvest.reading.text import one_line
+
+
+def require_admissible(values: Mapping[str, Any]) -> None:
+    """Refuse settings that no job could run with.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible; the message names it.
+    """
+    require_no_password(values["tracking"]["uri"])
+    mechanics_of(values)
+    load_study(values["study"]).require(values)
+
+
+def require_checks(values: Mapping[str, Any]) -> tuple[Check, ...]:
+    """What ``check=true`` says of a study.
+
+    Raises
+    ------
+    ConfigurationError
+        If it has nothing to say of studies of this kind.
+    """
+    checks = load_study(values["study"]).checks()
+    if not checks:
+        kinds = ", ".join(name for name in study_names() if load_study(name).checks())
+        raise ConfigurationError(
+            f"experiment {values['name']}: check=true has nothing to say of a study of the kind "
+            f"{values['study']}; expected one of {kinds}"
+        )
+    return checks
 
 
 def run_job(request: Request) -> Record:
@@ -124,3 +173,53 @@ def _tell(record: Record, folder: Path) -> None:
     print(f"Written to {folder}")
     if (page := folder / "report.html").is_file():
         print(f"Report: {page}")
+
+
+def main() -> None:
+    """Answer requests until the input is closed."""
+    requests, answers = (os.fdopen(os.dup(k), "rw"[k], encoding="utf-8") for k in (0, 1))
+    # Neither what a job prints nor a program that it starts may reach these two.
+    nothing, terminal = os.open(os.devnull, os.O_RDWR), os.dup(2)
+    os.dup2(nothing, 0)
+    os.dup2(nothing, 1)
+    faulthandler.enable()
+    with suppress(OSError):  # the system kills this process first when memory runs out
+        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
+    # Asked to stop, it removes its temporary files.
+    with suppress(KeyboardInterrupt), raised():
+        for line in requests:
+            order = json.loads(line)
+            memory_gb, aloud = order.pop("memory_gb"), order.pop("aloud")
+            request = Request.from_json(order)
+            with (request.folder / LOG).open("wb") as log:
+                for stream in (1,) if aloud else (1, 2):
+                    os.dup2(log.fileno(), stream)
+            answered = answer(request, memory_gb)
+            with suppress(OSError):  # the log's disk is full
+                sys.stdout.flush()
+            os.dup2(nothing, 1)
+            os.dup2(terminal, 2)
+            answers.write(json.dumps(answered) + "\n")
+            answers.flush()
+            # What a job leaves behind goes before the next; what stays is not looked through again.
+            gc.collect()
+            gc.freeze()
+
+
+def answer(request: Request, memory_gb: float) -> dict[str, Any]:
+    """Run a job; the ``reason`` is None if it wrote its record.
+
+    ``refused`` says that the request is wrong, and that this process may run another one.
+    """
+    try:
+        compute(request, memory_gb)
+    except Exception as error:
+        # Whatever it is costs its own job; the traceback is in the log.
+        traceback.print_exception(error, file=sys.stdout)
+        reason = one_line(message_of(error))
+        return {"reason": reason, "refused": isinstance(error, MvestError)}
+    return {"reason": None, "refused": False}
+
+
+if __name__ == "__main__":
+    main()

@@ -22,13 +22,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from experiments.common.config import hash_of, plain
 from experiments.results.publish import as_configured, publish_as
-from experiments.runner.jobs.limits import TIME_LIMIT_S
-from experiments.runner.jobs.request import Request
-from experiments.runner.planning.plan import Plan, PlannedJob
+from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
+from experiments.runner.plan import Plan, earlier
 from mvest.errors import ConfigurationError
-
-HASH_DIGITS = 16
-"""Digits of its hash by which a job's folder is named."""
 
 SUBDIR = "hydra.sweep.subdir"
 """The setting by which a user names the folders of jobs otherwise."""
@@ -96,7 +92,7 @@ def make_plan(
     named = any(line.partition("=")[0] == SUBDIR for line in typed["hydra"])
     compose = _Composer(config, loader, reuse=not named)
     varied = _varied(config, typed["task"], jobs, loader)
-    planned: list[PlannedJob] = []
+    planned: list[Request] = []
     common: dict[str, Any] = {}
     for number, overrides in enumerate(jobs, first):
         composed = compose(overrides)
@@ -124,15 +120,14 @@ def make_plan(
         }
         folder = Path(str(composed.hydra.sweep.dir)) / subdir
         published = publish_as(values, overrides, swept)
-        planned.append(
-            PlannedJob.of(Request(values, config_hash, folder, published, tuple(overrides)))
-        )
+        planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
     sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
         name=str(config.name),
         folder=Path(str(config.hydra.sweep.dir)),
         sweep=sweep,
         jobs=tuple(planned),
+        before=earlier(planned),
         workers=workers,
         publish=as_configured(config) if config.publish and sweep else None,
     )

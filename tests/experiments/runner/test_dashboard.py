@@ -16,9 +16,9 @@ from urllib.parse import unquote
 
 import pytest
 
-from experiments.runner.tracking import dashboard
+from experiments.runner import dashboard
 from mvest.errors import InputError
-from tests.experiments.runner.tracking import screenshot
+from tests.experiments.runner import screenshot
 from tests.places import ROOT
 from tests.processes import until
 

@@ -15,8 +15,8 @@ from experiments.common.cases.blind import SECRET
 from experiments.common.config import hash_of, register, require_in_range
 from experiments.common.schema import build
 from experiments.common.study import Job, Result
-from experiments.runner.jobs.limits import TIME_LIMIT_S
-from experiments.runner.planning.compose import expand, make_plan
+from experiments.runner.compose import expand, make_plan
+from experiments.runner.jobs import TIME_LIMIT_S
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
