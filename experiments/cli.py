@@ -179,7 +179,7 @@ def _worker(rest: list[str]) -> int:
     plan = Plan.read(parsed.folder, look=False)
     # Every N-th job of the list, whatever is done: no two shards share one.
     jobs = plan.jobs[first - 1 :: step]
-    ended = [execute(job.request, plan.written_ns) for job in jobs]
+    ended = [execute(job, plan.written_ns) for job in jobs]
     failed = sum(not record.converged for record in ended)
     print(f"shard {parsed.shard}: {len(jobs)} jobs, {failed} without an estimate")
     return 0

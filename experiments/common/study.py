@@ -139,18 +139,6 @@ class Results:
             raise KeyError(name)
         return joined(parts) if len(self.records) > 1 else next(iter(parts.values()))
 
-    def estimates(self) -> list[dict[str, Any]]:
-        """A row for each unknown of each estimate, with its run and the factors of the run.
-
-        See `EstimateRecord.rows`.
-        """
-        return [
-            {"run": one.row, "experiment": one.experiment, **one.factors, **row}
-            for one in self.records.values()
-            for estimate in one.estimates
-            for row in estimate.rows()
-        ]
-
 
 def _nothing(*_: Any) -> None:
     """Nothing more is done."""

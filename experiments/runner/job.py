@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.building.closure import mechanics_of
-from experiments.common.building.twin import require_room
 from experiments.common.config import hash_of
 from experiments.common.records.record import Record
 from experiments.common.records.writer import words_of, write_results
@@ -122,7 +121,6 @@ def compute(request: Request, memory_gb: float) -> None:
     MemoryError
         If it needs more memory; the message states the limit.
     """
-    require_room(request.values, memory_gb)
     with held_memory(memory_gb):
         write_hydra(request)
         study = load_study(request.values["study"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import fields
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -259,31 +260,20 @@ def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: 
     started : float
         Seconds since the epoch.
     """
-    mesh = result.mesh
-    return Record(
-        version=VERSION,
-        study=values["study"],
-        experiment=values["name"],
-        title=values["title"],
-        row=result.row or values["row"],
-        table=values["table"],
-        status=result.status,
-        reason=result.reason,
-        detail=result.detail,
-        parameters=result.parameters or tuple(values["parameters"]),
-        factors=dict(values["factors"]),
-        seconds_total=time.time() - started,
-        forward_solves=result.forward_solves,
-        model=result.model or model_of_values(values),
-        mesh=mesh,
-        provenance=here_and_now(
-            config_hash, "none" if mesh is None else mesh.sha256, values["seed"]
+    found = {one.name: getattr(result, one.name) for one in fields(result) if one.name != "arrays"}
+    stated = {
+        "experiment": values["name"],
+        "row": result.row or values["row"],
+        "parameters": result.parameters or tuple(values["parameters"]),
+        "model": result.model or model_of_values(values),
+        "tables": {name: table.plain() for name, table in result.tables.items()},
+        "seconds_total": time.time() - started,
+        "provenance": here_and_now(
+            config_hash, "none" if result.mesh is None else result.mesh.sha256, values["seed"]
         ),
-        estimates=result.estimates,
-        numbers=result.numbers,
-        tables={name: table.plain() for name, table in result.tables.items()},
-        gate=result.gate,
-    )
+    }
+    configured = {name: values[name] for name in ("study", "title", "table", "factors")}
+    return Record(version=VERSION, **configured, **{**found, **stated})
 
 
 def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:

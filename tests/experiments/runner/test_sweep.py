@@ -318,12 +318,6 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(run, monkeypatch):
 
 
 WRONG = [
-    (("sweep=debug", "hydra.launcher.scheduler_file=nope.json"), "nope.json: no such file"),
-    (
-        ("sweep=debug", "hydra.launcher.tls={ca_file: file, cert: file, key: nope}"),
-        "hydra.launcher.tls.key = nope: no such file",
-    ),
-    (("sweep=debug", "hydra.launcher.tls={ca_file: file}"), "tls: expected ca_file, cert, key"),
     (
         ("sweep=debug", "hydra.launcher.cluster=LocalCluster", "hydra.launcher.address=tcp://a:1"),
         "hydra.launcher: address and cluster, expected one of them",
