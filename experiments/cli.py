@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.common.places import EXPERIMENTS
-from experiments.console import Parser
-from experiments.interruption import interruptible
+from experiments.console import Parser, interruptible
 from mvest import __version__
 from mvest.errors import ConfigurationError, InputError
 

@@ -21,8 +21,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.schema import build, schema
-from experiments.console import Parser
-from experiments.interruption import interruptible
+from experiments.console import Parser, interruptible
 from mvest.cases.writer import require_new, write_case
 from mvest.errors import ConfigurationError
 from mvest.exchange import exporting, importing

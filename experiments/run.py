@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.config import register
 from experiments.common.places import CONF
-from experiments.interruption import TRACEBACKS, interruptible
+from experiments.console import TRACEBACKS, interruptible
 from experiments.runner.jobs import RESULT, FailedRunError, Request, nothing_empty
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from mvest.errors import ConfigurationError, MvestError

@@ -1,4 +1,4 @@
-"""What a single run says while it works: each forward solve, each step of a filter, what is left.
+"""What a single run reports while it works: forward solves, steps of a filter, what is left.
 
 On a terminal a bar moves besides. Lines go to standard error, which in a sweep is the job's log.
 """
@@ -39,7 +39,7 @@ def duration(seconds: float) -> str:
 
 
 class SolveBar:
-    """Tells the forward solves and the steps of a filter; a bar moves with their time steps.
+    """Reports forward solves and steps of a filter; a bar moves with the time steps of a solve.
 
     How many solves a filter will need is not known beforehand: a typical number is expected, and
     after that one more at a time.
@@ -48,7 +48,7 @@ class SolveBar:
     ----------
     title : str
     steps : int
-        Time steps of one solve; 0 where a model tells of none, and no bar is drawn.
+        Time steps of one solve; 0 where a model reports none, and no bar is drawn.
     solves : int
         Expected number of solves.
     names : sequence of str, optional
@@ -56,21 +56,13 @@ class SolveBar:
     """
 
     def __init__(self, title: str, steps: int, solves: int, names: Sequence[str] = ()) -> None:
-        self._title, self._steps, self._names = title, steps, tuple(names)
-        self._expected = solves
-        self._solve = self._steps_made = 0
-        self._last = math.inf
+        self._title, self._names, self._expected = title, tuple(names), solves
+        self._solve, self._solving, self._last = 0, 0.0, math.inf
         self._before: tuple[FloatArray, float] | None = None
         self._began = self._solve_began = self._now = self._said = time.monotonic()
-        self._solving = 0.0
-        self._compiling = not kernels_are_compiled()
-        self._bar = tqdm(
-            total=steps * solves,
-            desc=title,
-            unit="step",
-            disable=None if steps else True,
-            leave=False,
-        )
+        hidden = None if steps else True
+        self._bar = tqdm(total=steps, desc=title, unit="step", disable=hidden, leave=False)
+        self._steps_made = 0
 
     def __enter__(self) -> SolveBar:
         announce_compilation(f"the {self._title}")
@@ -86,17 +78,10 @@ class SolveBar:
         if time_s <= self._last:
             self._end_solve()
             self._solve += 1
-            # A solve that stopped early has skipped the steps it did not make.
-            self._bar.update((self._solve - 1) * self._steps - self._bar.n)
+            self._bar.reset()
+            self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
         self._last, self._now = time_s, time.monotonic()
         self._steps_made += 1
-        if self._compiling:
-            self._compiling = False
-            spent = duration(self._now - self._began)
-            say(f"compiled after {spent}; {self._title}, forward solve 1 is under way")
-        if self._bar.total is not None and self._bar.n >= self._bar.total:
-            self._bar.total += self._steps
-        self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
         self._bar.update(1)
 
     def iterate(self, number: int, m: FloatArray, objective: float) -> None:
@@ -118,7 +103,7 @@ class SolveBar:
         )
 
     def _end_solve(self) -> None:
-        """Tell the forward solve that has ended, if there is one that was not told."""
+        """Report the forward solve that has ended, if there is one that was not reported."""
         if not self._steps_made:
             return
         spent = self._now - self._solve_began

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import uuid4
 
 from experiments.common.records.record import Record
-from experiments.interruption import ASKING
+from experiments.console import ASKING
 from experiments.runner.jobs import Request, write_failure
 from mvest.errors import ConfigurationError
 from mvest.files import require_writable
@@ -49,9 +49,6 @@ DASK = {
     "distributed.worker.memory.terminate": False,
 }
 """Settings of dask for jobs in processes of their own."""
-
-AT_ONCE = 500
-"""Jobs that are sent to dask's scheduler in one message."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +107,6 @@ def run_on_dask(
             at_a_time=settings.jobs if settings.cluster == LOCAL else 1,
             key=[(group, k) for k in range(len(requests))],
             pure=False,
-            batch_size=AT_ONCE,
         )
         places = {future.key: k for k, future in enumerate(futures)}
         for future, record in as_completed(futures, with_results=True, raise_errors=False):

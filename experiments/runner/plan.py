@@ -108,13 +108,9 @@ class Plan:
                 )
 
     def write(self) -> Plan:
-        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written.
-
-        Of the configurations the first one is written whole, of the others what differs.
-        """
+        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written."""
         self.folder.mkdir(parents=True, exist_ok=True)
         created = time.gmtime()
-        first = self.jobs[0].values
         jobs = [
             job.to_json()
             | {
@@ -122,8 +118,6 @@ class Plan:
                 "folder": os.path.relpath(job.folder, self.folder),
                 "name": name,
                 "factors": job.values["factors"],
-                "values": {k: v for k, v in job.values.items() if v is not first.get(k, job)},
-                "without": [key for key in first if key not in job.values],
             }
             for job, name in zip(self.jobs, self.names(), strict=True)
         ]
@@ -148,7 +142,6 @@ class Plan:
                 "publish": self.publish,
                 # Paths in a configuration are relative to where the command was typed.
                 "directory": Path.cwd(),
-                "values": first,
                 "jobs": jobs,
             },
         )
@@ -174,10 +167,9 @@ class Plan:
             if not os.access(directory, os.X_OK):
                 raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
             os.chdir(directory)
-            first = data["values"]
             requests = [
                 Request(
-                    {k: v for k, v in first.items() if k not in job["without"]} | job["values"],
+                    job["values"],
                     job["config_hash"],
                     place.parent / job["folder"],
                     job["publish_as"],

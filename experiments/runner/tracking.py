@@ -156,8 +156,9 @@ def sync(outputs: Path) -> int:
         try:
             if ARTIFACTS not in path.parts and path.parent not in swept:
                 read = read_mapping(path if path.name == PLAN else path.with_name(CONFIG))
-                swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
-                counts += _log(path.parent, outputs, read.get("values", read))
+                jobs = read.get("jobs", ())
+                swept |= {path.parent / job["folder"] for job in jobs}
+                counts += _log(path.parent, outputs, jobs[0]["values"] if jobs else read)
         except (MvestError, OSError, KeyError) as error:
             counts["left"] += _left_out(path, error)
     print(f"{outputs}: {counts['added']} runs added to MLflow, {counts['there']} were there")
