@@ -16,7 +16,6 @@ import time
 import traceback
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -149,7 +148,7 @@ def _computed(study: Study[Any], job: Job[Any], request: Request) -> Record:
     if hash_of(request.values) != request.config_hash:
         # Nobody can say of which content it is the result.
         reason = "a file or folder that the settings name was changed before the job ended"
-        result = replace(result, status="failed", reason=reason)
+        result = result.model_copy(update={"status": "failed", "reason": reason})
     return replace_record(request, result, started)
 
 

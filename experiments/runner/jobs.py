@@ -51,7 +51,7 @@ SHARE, GB = 0.8, 2**30
 PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Request:
     """One composed configuration and where it is run.
 
