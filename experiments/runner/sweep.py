@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
-from experiments.common.progress import SAY, announce_compilation, duration
+from experiments.common.progress import PartBar, announce_compilation, say
 from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
 from experiments.results.estimates import sweep_table
@@ -139,10 +135,13 @@ def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]
     announce_compilation("the first jobs")
     ends = run_jobs(jobs, settings, min(plan.workers, len(jobs)), plan.written_ns)
     try:
-        with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
+        with PartBar(plan.name, len(jobs), "job", plan.workers) as bar:
             for k, record in ends:
-                ended[jobs[k].config_hash] = record
-                bar.ended(jobs[k], record)
+                job = jobs[k]
+                ended[job.config_hash] = record
+                if not record.converged:
+                    say(f"failed: {job.label}: {record.reason} ({job.folder})")
+                bar.step(seconds=record.seconds_total)
     except KeyboardInterrupt:
         ends.close()
         collected(plan, ended)
@@ -154,60 +153,6 @@ def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]
             file=sys.stderr,
         )
     return ended
-
-
-class SweepBar(AbstractContextManager["SweepBar"]):
-    """A bar with counts and the time left, and a line for each failure.
-
-    Where no terminal is there for a bar, a line is printed now and then.
-
-    Parameters
-    ----------
-    name : str
-        Of the sweep.
-    skipped, total : int
-        Jobs that were done before, and jobs that will run.
-    workers : int
-        Jobs that run at a time.
-    """
-
-    def __init__(self, name: str, skipped: int, total: int, workers: int) -> None:
-        self._name, self._skipped, self._total, self._workers = name, skipped, total, workers
-        self._failed = 0
-        self._seconds: list[float] = []
-        self._said = time.monotonic() - SAY
-        # A bar knows no workers: the first job of eight would be an eighth of the pace.
-        form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
-        self._bar = tqdm(total=total, desc=name, disable=None, bar_format=form)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def ended(self, job: Request, record: Record) -> None:
-        """Count a job that has ended."""
-        self._seconds.append(record.seconds_total)
-        if not record.converged:
-            self._failed += 1
-            text = f"failed: {job.label}: {record.reason} ({job.folder})"
-            tqdm.write(text, file=sys.stderr)
-        done = len(self._seconds) - self._failed
-        state = f"{done} done, {self._failed} failed, {self._skipped} skipped"
-        state += f", about {duration(self.left())} left"
-        self._bar.set_postfix_str(state, refresh=False)
-        self._bar.update(1)
-        now = time.monotonic()
-        if self._bar.disable and len(self._seconds) < self._total and now - self._said > SAY:
-            self._said = now
-            print(f"{self._name}: {state}", file=sys.stderr)
-
-    def left(self) -> float:
-        """Seconds until the last job ends.
-
-        The others take as long as those that have ended, one by one at each worker. The jobs that
-        run now are partly done, and at the end workers wait for the last job: half a job each.
-        """
-        left = self._total - len(self._seconds)
-        return left / max(1, min(self._workers, left)) * fmean(self._seconds)
 
 
 def collect_sweep(folder: Path) -> int:

@@ -47,9 +47,6 @@ SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
 FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 """Files that MLflow keeps a copy of; of a figure the picture, not its PDF."""
 
-MANY = 1000
-"""Jobs of a sweep above which each is a run of its own only where ``tracking.runs`` asks for it."""
-
 Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
 """Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
 
@@ -178,7 +175,6 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     is_sweep = (folder / PLAN).is_file()
     alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
     plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
-    each = len(plan["jobs"]) <= MANY if tracking.get("runs") is None else tracking["runs"]
     words = typed(word for job in plan["jobs"] for word in job["overrides"])
     entries, rows, factors = [], [], []
     for job in plan["jobs"]:
@@ -186,7 +182,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
         try:
             if (place / RESULT).is_file():
                 own = read_mapping(place / CONFIG)
-                entries.append(_job(place, job.get("name")) if each else None)
+                entries.append(_job(place, job.get("name")))
                 rows.append(columns(own, words))
                 factors.append(leaves(job["factors"], own["parameters"]))
         except MvestError as error:

@@ -99,3 +99,20 @@ def test_pieces_are_told_now_and_then_where_no_terminal_is_there(clock, capsys) 
         "prediction: 4 of 10 closures, 01:20 elapsed, about 02:00 left",
         "prediction: done in 01:20",
     ]
+
+
+@pytest.mark.parametrize("workers", [1, 2, 8])
+def test_the_time_left_is_right_within_a_factor_of_two_from_the_third_job_on(workers):
+    # Jobs of 60 s to 180 s in a fixed disorder; each worker takes the next one as it is free.
+    seconds = [60.0 + 120.0 * ((k * 37) % 64) / 63 for k in range(64)]
+    free, ends = [0.0] * workers, []
+    for spent in seconds:
+        began = free.pop(free.index(min(free)))
+        free.append(began + spent)
+        ends.append((began + spent, spent))
+    last = max(free)
+    with PartBar("trial", len(ends), "job", workers) as bar:
+        for count, (now, spent) in enumerate(sorted(ends), 1):
+            bar.step(seconds=spent)
+            if 3 <= count <= len(ends) - workers:
+                assert 0.5 < bar.left() / (last - now) < 2.0
