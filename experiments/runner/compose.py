@@ -7,7 +7,9 @@ grid and takes the place of a grid's own choices.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,13 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from tqdm import tqdm
 
 from experiments.common.config import hash_of, plain
 from experiments.results.publish import as_configured, publish_as
-from experiments.runner.jobs import TIME_LIMIT_S, Request
+from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
 from experiments.runner.plan import Plan, earlier
 from mvest.errors import ConfigurationError
 
@@ -87,12 +89,30 @@ def make_plan(
     typed: Any = OmegaConf.to_container(config.hydra.overrides.task)
     parser = OverridesParser.create(config_loader=loader)
     varied = _varied(config, typed, jobs, parser)
+    named: Any = OmegaConf.to_container(config.hydra.sweep)
+    by_hash = named["subdir"] == "${config_hash:}"
+    parse = cache(lambda line: parser.parse_overrides([line])[0])
+    is_group = cache(lambda name: bool(loader.get_group_options(name)))
+    merged: dict[tuple[str, ...], DictConfig] = {}
     planned: list[Request] = []
     for number, overrides in enumerate(tqdm(jobs, "composing", disable=None, leave=False), first):
-        composed = loader.load_sweep_config(config, list(overrides))
-        HydraConfig.instance().set_config(composed)
+        parsed = {one.get_key_element(): one for one in map(parse, overrides)}
+        # Hydra merges files for a tenth of a second. What it merges follows from all but the
+        # values; those are set in what was merged for an earlier job that sets the same ones.
+        settings = [
+            one for one in parsed.values() if _sets_value(one) and not is_group(one.key_or_group)
+        ]
+        kind = tuple(
+            str(one.key_or_group if one in settings else one.input_line) for one in parsed.values()
+        )
+        if kind in merged:
+            for one in settings:
+                OmegaConf.update(merged[kind], one.key_or_group, one.value())
+        else:
+            merged[kind] = loader.load_sweep_config(config, list(overrides))
+            HydraConfig.instance().set_config(merged[kind])
+        composed = merged[kind]
         values = plain(composed)
-        parsed = {one.get_key_element(): one for one in parser.parse_overrides(list(overrides))}
         # Null takes the limit away; the default holds where nothing is said.
         if values["time_limit_s"] is None and "time_limit_s" not in parsed:
             values["time_limit_s"] = TIME_LIMIT_S
@@ -100,11 +120,19 @@ def make_plan(
             **{key: _factor(one) for key, one in parsed.items() if key in varied},
             **values["factors"],
         }
+        # Many configurations fit into memory where they share what is alike in them.
+        shared = planned[0].values if planned else {}
+        for key in values.keys() & shared.keys():
+            # 1 and 1.0 are not written alike.
+            if json.dumps(values[key]) == json.dumps(shared[key]):
+                values[key] = shared[key]
+        config_hash = hash_of(values)
         with read_write(composed.hydra), open_dict(composed.hydra):
             composed.hydra.job.id = composed.hydra.job.num = number
-        folder = Path(str(composed.hydra.sweep.dir)) / str(composed.hydra.sweep.subdir)
+        subdir = config_hash[:HASH_DIGITS] if by_hash else str(composed.hydra.sweep.subdir)
+        folder = Path(str(composed.hydra.sweep.dir)) / subdir
         published = publish_as(values, overrides, swept)
-        planned.append(Request(values, hash_of(values), folder, published, tuple(overrides)))
+        planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
     sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
         name=str(config.name),
@@ -131,6 +159,12 @@ def _grids(config: DictConfig) -> list[dict[str, Any]]:
     if not listed or not all(isinstance(grid, dict) for grid in listed):
         raise ConfigurationError("hydra.sweeper.params: expected a grid or a list of grids")
     return listed
+
+
+def _sets_value(override: Override) -> bool:
+    """Whether an override sets a single value of a setting, and merges nothing."""
+    changes = override.type == OverrideType.CHANGE and override.package is None
+    return changes and not isinstance(override.value(), dict)
 
 
 def _varied(

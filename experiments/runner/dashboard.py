@@ -47,9 +47,8 @@ def last_sweep(outputs: Path) -> tuple[str, str, str]:
     if not plans:
         raise InputError(f"{outputs} holds no sweep; run one, or name another folder")
     plan, sweep = read_mapping(plans[-1]), plans[-1].parent.name
-    values = plan["jobs"][0]["values"]
-    name = str(values["name"])
-    with opened(values["tracking"]["uri"], outputs, name) as place:
+    name = str(plan["values"]["name"])
+    with opened(plan["values"]["tracking"]["uri"], outputs, name) as place:
         whole = runs_of(name, f"tags.sweep_id = '{plan['sweep_id']}'")
         if not whole:
             raise InputError(f"{sweep} is not in {place}; `mvest sync {outputs}` logs it")

@@ -108,7 +108,10 @@ class Plan:
                 )
 
     def write(self) -> Plan:
-        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written."""
+        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written.
+
+        Of the configurations the first one is written whole, of the others what differs.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         created = time.gmtime()
         jobs = [
@@ -118,6 +121,8 @@ class Plan:
                 "folder": os.path.relpath(job.folder, self.folder),
                 "name": name,
                 "factors": job.values["factors"],
+                "values": {k: v for k, v in job.values.items() if v is not self.common.get(k, job)},
+                "without": [key for key in self.common if key not in job.values],
             }
             for job, name in zip(self.jobs, self.names(), strict=True)
         ]
@@ -142,6 +147,7 @@ class Plan:
                 "publish": self.publish,
                 # Paths in a configuration are relative to where the command was typed.
                 "directory": Path.cwd(),
+                "values": self.common,
                 "jobs": jobs,
             },
         )
@@ -167,9 +173,10 @@ class Plan:
             if not os.access(directory, os.X_OK):
                 raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
             os.chdir(directory)
+            common = data["values"]
             requests = [
                 Request(
-                    job["values"],
+                    {k: v for k, v in common.items() if k not in job["without"]} | job["values"],
                     job["config_hash"],
                     place.parent / job["folder"],
                     job["publish_as"],

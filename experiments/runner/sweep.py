@@ -117,7 +117,10 @@ def launch(
     ended = _run(plan, batch, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
     returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
-    log_sweep(plan.folder, plan.common)
+    # Ten thousand records are not kept while they are logged.
+    folder, common = plan.folder, plan.common
+    del ended, found, plan, batch
+    log_sweep(folder, common)
     done = [one.return_value for one in returned if one.status == JobStatus.COMPLETED]
     if sweeper not in GIVEN_ONCE and any(map(math.isnan, done)):
         raise ConfigurationError(

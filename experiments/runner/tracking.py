@@ -47,6 +47,9 @@ SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
 FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 """Files that MLflow keeps a copy of; of a figure the picture, not its PDF."""
 
+MANY = 1000
+"""Jobs of a sweep above which only the sweep as a whole is a run."""
+
 Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
 """Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
 
@@ -153,9 +156,8 @@ def sync(outputs: Path) -> int:
         try:
             if ARTIFACTS not in path.parts and path.parent not in swept:
                 read = read_mapping(path if path.name == PLAN else path.with_name(CONFIG))
-                jobs = read.get("jobs", ())
-                swept |= {path.parent / job["folder"] for job in jobs}
-                counts += _log(path.parent, outputs, jobs[0]["values"] if jobs else read)
+                swept |= {path.parent / job["folder"] for job in read.get("jobs", ())}
+                counts += _log(path.parent, outputs, read.get("values", read))
         except (MvestError, OSError, KeyError) as error:
             counts["left"] += _left_out(path, error)
     print(f"{outputs}: {counts['added']} runs added to MLflow, {counts['there']} were there")
@@ -175,6 +177,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     is_sweep = (folder / PLAN).is_file()
     alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
     plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
+    each = len(plan["jobs"]) <= MANY
     words = typed(word for job in plan["jobs"] for word in job["overrides"])
     entries, rows, factors = [], [], []
     for job in plan["jobs"]:
@@ -182,7 +185,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
         try:
             if (place / RESULT).is_file():
                 own = read_mapping(place / CONFIG)
-                entries.append(_job(place, job.get("name")))
+                entries.append(_job(place, job.get("name")) if each else None)
                 rows.append(columns(own, words))
                 factors.append(leaves(job["factors"], own["parameters"]))
         except MvestError as error:

@@ -18,7 +18,7 @@ import pytest
 
 from experiments.cli import main
 from experiments.common.records.record import Record, write_record
-from experiments.runner import compared
+from experiments.runner import compared, tracking
 from experiments.runner.compared import implausible, metrics
 from experiments.runner.dashboard import last_sweep
 from experiments.runner.jobs import Request, mark_done
@@ -376,6 +376,16 @@ def test_the_comparison_hides_what_failed_or_makes_no_sense(tmp_path, monkeypatc
     # Too many are listed, by the same choice.
     monkeypatch.setattr("experiments.runner.dashboard.MOST", 1)
     assert "plausible%20%3D%20%27yes%27" in last_sweep(tmp_path)[1]
+
+
+def test_of_very_many_jobs_only_the_whole_is_a_run(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(tracking, "MANY", 1)
+    folder = make_sweep(tmp_path, a=started(5.0, 3.0), b=started(4.0, 3.0))
+    log_sweep(folder, make_config(tmp_path))
+    whole = whole_of(tmp_path)
+    assert jobs_in(tmp_path) == {}
+    assert whole.data.params["filter.initial"] == "[5,3],[4,3]"
+    assert last_sweep(tmp_path)[1].endswith(f"/runs/{whole.info.run_id}")
 
 
 # --- `mvest sync`, and stores that fail ---------------------------------------------------------
