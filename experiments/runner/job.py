@@ -148,7 +148,7 @@ def _computed(study: Study[Any], job: Job[Any], request: Request) -> Record:
     if hash_of(request.values) != request.config_hash:
         # Nobody can say of which content it is the result.
         reason = "a file or folder that the settings name was changed before the job ended"
-        result = result.model_copy(update={"status": "failed", "reason": reason})
+        result = result.changed(status="failed", reason=reason)
     return replace_record(request, result, started)
 
 

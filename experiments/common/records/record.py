@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -182,6 +182,11 @@ class Result(Frozen):
     parameters: tuple[str, ...] = ()
     model: Model | None = None
     gate: str | None = None
+
+    def changed(self, **values: Any) -> Self:
+        """The same with other values, checked like the first ones."""
+        known = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**known, **values})
 
     def table_of(self, name: str = "") -> Table:
         """One of its tables.

@@ -138,7 +138,7 @@ def run_imaging(job: Job[Settings]) -> Result:
         "model_sha256": sha256_of(path),
     }
     done = [*([] if store.given else ["trained"]), *(["tested"] if settings.evaluate else [])]
-    return replace(tested, numbers={**about, **tested.numbers}, reason=" and ".join(done))
+    return tested.changed(numbers={**about, **tested.numbers}, reason=" and ".join(done))
 
 
 # -- what is found in held-out volumes ------------------------------------------------------------
