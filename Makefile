@@ -92,7 +92,7 @@ dashboard: $(INSTALLED) ## MLflow's pages, on the comparison of the last sweep (
 	$(BIN)/mvest dashboard $(if $(PORT),--port $(PORT))
 
 screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium)
-	$(BIN)/python -m tests.experiments.runner.tracking.screenshot
+	$(BIN)/python -m tests.experiments.runner.screenshot
 
 slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'

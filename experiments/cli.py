@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.common.places import EXPERIMENTS
-from experiments.console import Parser
-from experiments.interruption import interruptible
+from experiments.console import Parser, interruptible
 from mvest import __version__
 from mvest.errors import ConfigurationError, InputError
 
@@ -129,7 +128,7 @@ def _table(rest: list[str]) -> int:
 
 def _sync(rest: list[str]) -> int:
     """Bring MLflow to the state of folders of outputs."""
-    from experiments.runner.tracking.log import sync
+    from experiments.runner.tracking import sync
 
     parser = Parser("mvest sync", description=COMMANDS["sync"])
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="outputs if none")
@@ -145,7 +144,7 @@ def _dashboard(rest: list[str]) -> int:
     import webbrowser
 
     from experiments.common.schema import require_within
-    from experiments.runner.tracking.dashboard import last_sweep, serving
+    from experiments.runner.dashboard import last_sweep, serving
     from mvest.quantities import within
 
     parser = Parser("mvest dashboard", description=COMMANDS["dashboard"])
@@ -165,8 +164,8 @@ def _dashboard(rest: list[str]) -> int:
 
 def _worker(rest: list[str]) -> int:
     """Run a shard of a sweep; what becomes of its jobs is recorded, and no failure of this."""
-    from experiments.runner.execution.engine import execute
-    from experiments.runner.planning.plan import Plan
+    from experiments.runner.engine import execute
+    from experiments.runner.plan import Plan
 
     parser = Parser("mvest worker", description=COMMANDS["worker"])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the sweep, in outputs/")
@@ -179,7 +178,7 @@ def _worker(rest: list[str]) -> int:
     plan = Plan.read(parsed.folder, look=False)
     # Every N-th job of the list, whatever is done: no two shards share one.
     jobs = plan.jobs[first - 1 :: step]
-    ended = [execute(job.request, plan.written_ns) for job in jobs]
+    ended = [execute(job, plan.written_ns) for job in jobs]
     failed = sum(not record.converged for record in ended)
     print(f"shard {parsed.shard}: {len(jobs)} jobs, {failed} without an estimate")
     return 0

@@ -1,14 +1,141 @@
-"""The parser of the console's words."""
+"""How a command ends: in one line where it is refused, or stopped by Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+import atexit
+import functools
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import NoReturn, ParamSpec
+
+from mvest.errors import MvestError, message_of
+
+P = ParamSpec("P")
+
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that ask a process to stop."""
+
+TRACEBACKS = "HYDRA_FULL_ERROR"
+"""Environment variable with which a user asks for tracebacks."""
+
+AGAIN_S = 0.01
+"""Until a signal is sent again that Python has dropped."""
+
+
+class Interruption(KeyboardInterrupt):
+    """A signal has asked this process to stop.
+
+    Parameters
+    ----------
+    number : int
+        Of the signal.
+
+    Attributes
+    ----------
+    status : int
+        Exit status of a command that was stopped by it, as a shell counts: 130 after Ctrl-C, 143
+        after SIGTERM, 129 after SIGHUP.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.status = 128 + number
+
+
+@contextmanager
+def raised() -> Iterator[None]:
+    """Raise the first signal that asks to stop as an `Interruption`, where the main thread is.
+
+    While that is dealt with, another SIGTERM or SIGHUP is no news: schedulers send several. Another
+    Ctrl-C ends the process at once, as a kill would, which leaves nothing half-written either. A
+    signal that is ignored, as ``nohup`` has it, stays so. Python drops what is raised in a weak
+    reference's callback or a ``__del__``; such a signal is sent again.
+    """
+    unraisable = sys.unraisablehook
+    before = {number: signal.getsignal(number) for number in ASKING}
+    asked = False
+
+    def ask(number: int, _: FrameType | None) -> None:
+        nonlocal asked
+        if not asked:
+            asked = True
+            atexit.register(_ignore)
+            raise Interruption(number)
+        if number == signal.SIGINT:
+            os._exit(128 + number)
+
+    def again(number: int) -> None:
+        nonlocal asked
+        asked = False
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+    def dropped(lost: sys.UnraisableHookArgs) -> None:
+        if isinstance(lost.exc_value, Interruption):
+            threading.Timer(AGAIN_S, again, (lost.exc_value.status - 128,)).start()
+        else:
+            unraisable(lost)
+
+    sys.unraisablehook = dropped
+    for number, handler in before.items():
+        if handler != signal.SIG_IGN:
+            signal.signal(number, ask)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = unraisable
+        # Whoever was asked to stop, here or within, is about to end; another signal may come until
+        # then.
+        for number, handler in before.items():
+            if not asked and signal.getsignal(number) is ask:
+                signal.signal(number, handler)
+
+
+def _ignore() -> None:
+    """Let no signal change the exit status of an interpreter that takes itself apart."""
+    for number in ASKING:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def interruptible(command: Callable[P, int]) -> Callable[P, int]:
+    """A command that returns an exit status, also where it is refused or asked to stop."""
+
+    @functools.wraps(command)
+    def stopped(*given: P.args, **named: P.kwargs) -> int:
+        with raised():
+            try:
+                status = command(*given, **named)
+                sys.stdout.flush()
+                return status
+            except BrokenPipeError:
+                # Whoever reads the output has seen enough, as `head` does.
+                with suppress(OSError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                return 128 + signal.SIGPIPE
+            except (MvestError, OSError) as error:
+                if TRACEBACKS in os.environ:
+                    raise
+                print(f"error: {message_of(error).splitlines()[0]}", file=sys.stderr)
+                return 2
+            except KeyboardInterrupt as error:
+                print(
+                    "interrupted: what is finished is kept, and the same command goes on from "
+                    "there",
+                    file=sys.stderr,
+                )
+                return error.status if isinstance(error, Interruption) else 128 + signal.SIGINT
+
+    return stopped
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that says what is wrong in one line, as everything here does."""
+    """A parser of a command's words that refuses wrong ones in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Say it and leave with status 2."""
+        """Print it and leave with status 2."""
         self.exit(2, f"error: {message}\n")

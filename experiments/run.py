@@ -27,9 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.config import register
 from experiments.common.places import CONF
-from experiments.interruption import TRACEBACKS, interruptible
-from experiments.runner.jobs.folder import RESULT, FailedRunError, nothing_empty
-from experiments.runner.jobs.request import Request
+from experiments.console import TRACEBACKS, interruptible
+from experiments.runner.jobs import RESULT, FailedRunError, Request, nothing_empty
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from mvest.errors import ConfigurationError, MvestError
 
@@ -94,18 +93,17 @@ def run_alone(config: DictConfig) -> float:
     """
     # Imports every study, for seconds: not where only help is asked for.
     from experiments.results.publish import publish_run
-    from experiments.runner.execution.check import require_admissible, require_checks
-    from experiments.runner.execution.job import run_job
-    from experiments.runner.planning.plan import Plan, PlannedJob
-    from experiments.runner.sweep import objective_of
-    from experiments.runner.tracking.log import log_run
+    from experiments.runner.compared import metrics
+    from experiments.runner.job import require_admissible, require_checks, run_job
+    from experiments.runner.plan import Plan, earlier
+    from experiments.runner.tracking import log_run
 
     with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
         request = Request.of(config)
         values, folder = request.values, request.folder
         require_admissible(values)
         if config.dry_run:
-            plan = Plan(str(values["name"]), folder.parent, {}, (PlannedJob.of(request),), 1)
+            plan = Plan(str(values["name"]), folder.parent, {}, (request,), earlier([request]))
             print(plan.summary(), plan.listing(), sep="\n")
             return math.nan
         if config.check:
@@ -118,7 +116,7 @@ def run_alone(config: DictConfig) -> float:
         if not record.converged:
             detail = f" ({record.detail})" if record.detail else ""
             raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")
-        return objective_of(record, config.objective)
+        return metrics(record)[0].get(config.objective, math.nan)
 
 
 def _require_options(arguments: Sequence[str]) -> None:

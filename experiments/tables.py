@@ -18,7 +18,7 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from experiments.interruption import interruptible
+from experiments.console import interruptible
 from experiments.results.keep import RECORDS, regenerate
 from experiments.sweeps.collected import read_sweeps
 from experiments.sweeps.report import write_sweep

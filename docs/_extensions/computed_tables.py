@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from study_pages import comment_of
 
-from experiments.common.config import PARTS, Config
+from experiments.common.config import Config
 from experiments.common.schema import ranges
 from experiments.common.study import load_settings, study_names
 from experiments.results.keep import records_of
@@ -67,7 +67,7 @@ def setting_groups() -> str:
 def setting_ranges() -> str:
     """What settings may be, by the kinds of quantities."""
     found: dict[tuple[str, ...], set[str]] = {}
-    for kind in [*PARTS["valve"], *PARTS["mechanics"], Config, *map(load_settings, study_names())]:
+    for kind in [Config, *map(load_settings, study_names())]:
         for key, within in ranges(kind):
             bounds = {type(one).__name__: one for one in within.metadata}
             unit, _, why = (within.description or "").rpartition("; ")

@@ -7,7 +7,7 @@ its own `Settings`. Everything else is declared here.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import PurePath
 from typing import Annotated, Any, TypeAlias
@@ -18,7 +18,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from experiments.common.building.closure import ValveFolder, folder_hash
+from experiments.common.building.closure import ValveSettings, folder_hash
 from experiments.common.schema import (
     BY_PARAMETER,
     NOT_HASHED,
@@ -60,7 +60,6 @@ from mvest.quantities import (
     Value,
     Values,
 )
-from mvest.valve.anatomy.dimensions import TemplateParameters
 
 GROUP = "study"
 """The configuration group of the studies."""
@@ -167,12 +166,11 @@ class Tracking:
 
     enabled: bool = True
     uri: str | None = None
-    runs: bool | None = None  # whether each job of a sweep is a run; null: of up to 1000 jobs
 
 
 @dataclass(frozen=True, kw_only=True)
-class Discretisation:
-    """What the mechanics are computed on."""
+class Mechanics(MechanicsSettings):
+    """The mechanics, and what they are computed on."""
 
     element: str = "hex18"
     reading: str = "A"  # Poisson option of every region
@@ -192,9 +190,9 @@ class Config:
     paper: Paper | None = None
     parameters: tuple[str, ...] = MISSING
     fixed: ByParameter = field(default_factory=dict)
-    valve: Any = None
+    valve: ValveSettings = field(default_factory=ValveSettings)
     mesh: Mesh = field(default_factory=Mesh)
-    mechanics: Any = None
+    mechanics: Mechanics
     filter: FilterSettings = field(default_factory=FilterSettings)
     observation: Observation = field(default_factory=Observation)
     truth: Truth = field(default_factory=Truth)
@@ -222,13 +220,6 @@ class Config:
     sweep: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
     paths: Annotated[Paths, NOT_HASHED] = field(default_factory=Paths)
     tracking: Annotated[Tracking, NOT_HASHED] = field(default_factory=Tracking)
-
-
-PARTS: Mapping[str, tuple[type, ...]] = {
-    "valve": (TemplateParameters, ValveFolder),
-    "mechanics": (MechanicsSettings, Discretisation),
-}
-"""Parts of a configuration that join settings of the library with those of the experiments."""
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -283,12 +274,9 @@ def require_in_range(values: Mapping[str, Any]) -> None:
         One line with the setting, its value and the range.
     """
     _require_names(values)
+    kinds = _kinds(values.get("study"))
     for name, value in values.items():
-        for kind in _kinds(values.get("study")).get(name, (Any,)):
-            part = value
-            if name in PARTS:
-                part = {k: v for k, v in value.items() if k in kind.__dataclass_fields__}
-            require_admissible_values(kind, part, name, range_of)
+        require_admissible_values(kinds.get(name, Any), value, name, range_of)
     for part, key in (("truth", "values"), ("filter", "initial")):
         given = (values.get(part) or {}).get(key)
         for parameter, value in zip(values.get("parameters") or (), given or (), strict=False):
@@ -319,7 +307,7 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
 def _with_contents(study: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
     kinds = _kinds(study)
     return {
-        name: with_contents(kinds[name][0], value, values) if name in kinds else value
+        name: with_contents(kinds[name], value, values) if name in kinds else value
         for name, value in values.items()
     }
 
@@ -329,18 +317,17 @@ def _not_hashed(study: str | None) -> tuple[str, ...]:
     """Dotted names of the settings that change no number of a study's results."""
     return tuple(
         name
-        for top, kinds in _kinds(study).items()
-        for kind in kinds
+        for top, kind in _kinds(study).items()
         for name, mark in marks_in(kind, top)
         if mark is NOT_HASHED
     )
 
 
 @cache
-def _kinds(study: str | None) -> dict[str, tuple[Any, ...]]:
-    """Setting of a study at the top -> its type, or the types that it joins."""
+def _kinds(study: str | None) -> dict[str, Any]:
+    """Setting of a study at the top -> its type."""
     own = hints_of(load_settings(study)) if study in study_names() else {}
-    return {name: (kind,) for name, kind in {**hints_of(Config), **own}.items()} | dict(PARTS)
+    return {**hints_of(Config), **own}
 
 
 def _package_model() -> str | None:
@@ -364,17 +351,12 @@ class StudySource(ConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """The schema of a study: what every study has, and what its own settings add."""
         name = _study_of(config_path)
-        node = schema(Config, load_settings(name))
-        parts = [
-            (part, kind, field(default_factory=kind))
-            for part, classes in PARTS.items()
-            for kind in [schema(*classes)]
-        ]
-        whole = make_dataclass(f"{name}_study", [("study", str, name), *parts], bases=(node,))
+        config = OmegaConf.structured(schema(Config, load_settings(name)))
+        config.study = name
         return ConfigResult(
             provider=self.provider,
             path=self.full_path(),
-            config=OmegaConf.structured(whole),
+            config=config,
             header={"package": "_global_"},
         )
 

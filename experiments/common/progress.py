@@ -1,4 +1,4 @@
-"""What a single run says while it works: each forward solve, each step of a filter, what is left.
+"""What a single run reports while it works: forward solves, steps of a filter, what is left.
 
 On a terminal a bar moves besides. Lines go to standard error, which in a sweep is the job's log.
 """
@@ -39,7 +39,7 @@ def duration(seconds: float) -> str:
 
 
 class SolveBar:
-    """Tells the forward solves and the steps of a filter; a bar moves with their time steps.
+    """Reports forward solves and steps of a filter; a bar moves with the time steps of a solve.
 
     How many solves a filter will need is not known beforehand: a typical number is expected, and
     after that one more at a time.
@@ -48,7 +48,7 @@ class SolveBar:
     ----------
     title : str
     steps : int
-        Time steps of one solve; 0 where a model tells of none, and no bar is drawn.
+        Time steps of one solve; 0 where a model reports none, and no bar is drawn.
     solves : int
         Expected number of solves.
     names : sequence of str, optional
@@ -56,21 +56,13 @@ class SolveBar:
     """
 
     def __init__(self, title: str, steps: int, solves: int, names: Sequence[str] = ()) -> None:
-        self._title, self._steps, self._names = title, steps, tuple(names)
-        self._expected = solves
-        self._solve = self._steps_made = 0
-        self._last = math.inf
+        self._title, self._names, self._expected = title, tuple(names), solves
+        self._solve, self._solving, self._last = 0, 0.0, math.inf
         self._before: tuple[FloatArray, float] | None = None
         self._began = self._solve_began = self._now = self._said = time.monotonic()
-        self._solving = 0.0
-        self._compiling = not kernels_are_compiled()
-        self._bar = tqdm(
-            total=steps * solves,
-            desc=title,
-            unit="step",
-            disable=None if steps else True,
-            leave=False,
-        )
+        hidden = None if steps else True
+        self._bar = tqdm(total=steps, desc=title, unit="step", disable=hidden, leave=False)
+        self._steps_made = 0
 
     def __enter__(self) -> SolveBar:
         announce_compilation(f"the {self._title}")
@@ -86,17 +78,10 @@ class SolveBar:
         if time_s <= self._last:
             self._end_solve()
             self._solve += 1
-            # A solve that stopped early has skipped the steps it did not make.
-            self._bar.update((self._solve - 1) * self._steps - self._bar.n)
+            self._bar.reset()
+            self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
         self._last, self._now = time_s, time.monotonic()
         self._steps_made += 1
-        if self._compiling:
-            self._compiling = False
-            spent = duration(self._now - self._began)
-            say(f"compiled after {spent}; {self._title}, forward solve 1 is under way")
-        if self._bar.total is not None and self._bar.n >= self._bar.total:
-            self._bar.total += self._steps
-        self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
         self._bar.update(1)
 
     def iterate(self, number: int, m: FloatArray, objective: float) -> None:
@@ -118,7 +103,7 @@ class SolveBar:
         )
 
     def _end_solve(self) -> None:
-        """Tell the forward solve that has ended, if there is one that was not told."""
+        """Report the forward solve that has ended, if there is one that was not reported."""
         if not self._steps_made:
             return
         spent = self._now - self._solve_began
@@ -154,13 +139,17 @@ class PartBar:
     total : int
         Pieces; 0 where only the first one that is done says how many there are.
     unit : str
+    workers : int
+        Pieces that are worked on at a time.
     """
 
-    def __init__(self, title: str, total: int, unit: str) -> None:
-        self._title, self._total, self._unit = title, total, unit
-        self._done = 0
-        self._began = self._said = time.monotonic()
-        self._bar = tqdm(total=total, desc=title, unit=unit, disable=None, leave=False)
+    def __init__(self, title: str, total: int, unit: str, workers: int = 1) -> None:
+        self._title, self._total, self._unit, self._workers = title, total, unit, workers
+        self._done, self._spent = 0, 0.0
+        self._began = self._said = self._last = time.monotonic()
+        # tqdm knows no workers: the first piece of eight would be an eighth of the pace.
+        form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
+        self._bar = tqdm(total=total, desc=title, disable=None, leave=False, bar_format=form)
 
     def __enter__(self) -> PartBar:
         return self
@@ -170,21 +159,34 @@ class PartBar:
         if kind is None:
             say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
 
-    def step(self, total: int | None = None) -> None:
-        """One more piece is done, of as many as are there if ``total`` says so."""
+    def step(self, total: int | None = None, seconds: float | None = None) -> None:
+        """One more piece is done, of ``total`` if that is given; it took ``seconds``, if given."""
+        now = time.monotonic()
+        self._spent += now - self._last if seconds is None else seconds
+        self._last = now
         self._done += 1
         if total is not None:
             self._total = self._bar.total = total
+        left = f"about {duration(self.left())} left"
+        self._bar.set_postfix_str(left, refresh=False)
         self._bar.update(1)
-        now = time.monotonic()
         if self._bar.disable and now - self._said > SAY:
             self._said = now
-            spent = now - self._began
-            left = duration(spent / self._done * (self._total - self._done))
+            elapsed = duration(now - self._began)
             say(
-                f"{self._title}: {self._done} of {self._total} {self._unit}s, "
-                f"{duration(spent)} elapsed, about {left} left"
+                f"{self._title}: {self._done} of {self._total} {self._unit}s, {elapsed} elapsed, "
+                f"{left}"
             )
+
+    def left(self) -> float:
+        """Seconds until the last piece is done.
+
+        The others take as long as those that are done, one by one at each worker. The pieces that
+        are under way are partly done, and at the end workers wait for the last one: half a piece
+        each.
+        """
+        left = self._total - self._done
+        return left / max(1, min(self._workers, left)) * self._spent / self._done
 
 
 def say(text: str) -> None:

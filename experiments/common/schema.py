@@ -245,15 +245,18 @@ def schema(*classes: type) -> type:
     for cls in classes:
         hints = typing.get_type_hints(cls)
         for field in dataclasses.fields(cls):
-            default = dataclasses.field(default_factory=partial(_default, field))
-            fields[field.name] = (field.name, _config_type(hints[field.name]), default)
+            kind = _config_type(hints[field.name])
+            default = dataclasses.field(default_factory=partial(_default, field, kind))
+            fields[field.name] = (field.name, kind, default)
     return dataclasses.make_dataclass(f"{classes[0].__name__}Config", list(fields.values()))
 
 
-def _default(field: dataclasses.Field[Any]) -> Any:
+def _default(field: dataclasses.Field[Any], kind: Any) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return _config_value(field.default_factory())
-    return MISSING if field.default is dataclasses.MISSING else _config_value(field.default)
+    if field.default is dataclasses.MISSING:
+        return kind() if _is_schema(kind) else MISSING
+    return _config_value(field.default)
 
 
 def _config_type(hint: Any) -> Any:

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import experiments.studies
-from experiments.common.records.record import Mesh, Model, Number, Record, Status
+from experiments.common.records.record import Record
+from experiments.common.records.record import Result as Result
 from mvest.errors import ConfigurationError
-from mvest.problem.record import EstimateRecord
 from mvest.reporting.tables import Table, joined
 
 if TYPE_CHECKING:
@@ -49,51 +49,6 @@ class Job(Generic[S]):
     settings: S
     folder: Path
     config_hash: str = "none"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
-    """What a study returns. Everything that tables and figures show is in it.
-
-    Attributes
-    ----------
-    tables : mapping of str to Table
-        Tidy tables by name; the one called ``""`` is the study's main table.
-    numbers : mapping
-        Single values by name, with the unit at the end of the name; MLflow gets those that are
-        numbers.
-    estimates : tuple of EstimateRecord
-    arrays : mapping
-        Written beside the record, for figures.
-    status : {"converged", "failed"}
-    reason, detail : str
-        Why the run ended.
-    mesh : Mesh or None
-    forward_solves : int
-    row : str
-        What tables call this run, where the data say it and not the configuration.
-    parameters : tuple of str
-        Likewise.
-    model : Model or None
-        Likewise.
-    gate : str or None
-        What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
-        study uses none of the configured anatomies.
-    """
-
-    tables: Mapping[str, Table] = field(default_factory=dict)
-    numbers: Mapping[str, Number] = field(default_factory=dict)
-    estimates: tuple[EstimateRecord, ...] = ()
-    arrays: Mapping[str, Any] = field(default_factory=dict)
-    status: Status = "converged"
-    reason: str = "completed"
-    detail: str = ""
-    mesh: Mesh | None = None
-    forward_solves: int = 0
-    row: str = ""
-    parameters: tuple[str, ...] = ()
-    model: Model | None = None
-    gate: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

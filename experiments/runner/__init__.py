@@ -1,4 +1,5 @@
 """How a study is run: alone, in a sweep, on a cluster, tracked.
 
-Each room imports those named before it: jobs, planning, collecting, tracking, execution.
+Each module imports those named before it: jobs, plan, compose, compared, tracking, dashboard,
+cluster, engine, job.
 """

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
@@ -58,7 +59,7 @@ class GridSweeper(Sweeper):
         MvestError, HydraException, OmegaConfBaseException
             If the request is wrong.
         """
-        from experiments.runner.planning.compose import expand
+        from experiments.runner.compose import expand
 
         assert self._parts is not None
         context, config, launcher = self._parts
@@ -77,20 +78,18 @@ class JobLauncher(Launcher):
     Parameters
     ----------
     **settings
-        Those of `experiments.runner.execution.engine.EngineSettings`, read from the configuration.
+        Those of `experiments.runner.cluster.EngineSettings`, read from the configuration.
     """
 
     def __init__(self, **settings: Any) -> None:
-        self._sweep: Any = None
+        self._given: tuple[DictConfig, ConfigLoader] | None = None
+        self._jobs: Any = ()
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
         """Keep what Hydra has to say about the sweep."""
-        # Imports every study, for seconds: not where only help is asked for.
-        from experiments.runner.sweep import SweepRun
-
-        self._sweep = SweepRun(hydra_context.config_loader, config)
+        self._given = config, hydra_context.config_loader
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
@@ -102,7 +101,11 @@ class JobLauncher(Launcher):
         MvestError, HydraException, OmegaConfBaseException
             If the request is wrong; nothing is run then.
         """
-        returned: Sequence[JobReturn] = self._sweep.launch(job_overrides, initial_job_idx)
+        # Imports every study, for seconds: not where only help is asked for.
+        from experiments.runner.sweep import launch
+
+        assert self._given is not None
+        returned, self._jobs = launch(*self._given, job_overrides, initial_job_idx, self._jobs)
         return returned
 
 

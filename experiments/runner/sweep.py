@@ -13,21 +13,19 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.common.progress import announce_compilation
-from experiments.common.records.metrics import metrics
+from experiments.common.progress import PartBar, announce_compilation, say
 from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
 from experiments.results.estimates import sweep_table
 from experiments.results.publish import publish_runs, publish_sweep
-from experiments.runner.collecting.collect import NOT_RUN, collect
-from experiments.runner.execution.check import require_admissible, require_checks
-from experiments.runner.execution.cluster import EngineSettings, require_engine
-from experiments.runner.execution.engine import run_jobs
-from experiments.runner.jobs.folder import FailedRunError, last_record, nothing_empty
-from experiments.runner.planning.compose import make_plan
-from experiments.runner.planning.plan import Plan, PlannedJob
-from experiments.runner.planning.progress import SweepBar
-from experiments.runner.tracking.log import SWEEP, log_sweep
+from experiments.runner.cluster import EngineSettings, require_engine
+from experiments.runner.compared import metrics
+from experiments.runner.compose import make_plan
+from experiments.runner.engine import run_jobs
+from experiments.runner.job import require_admissible, require_checks
+from experiments.runner.jobs import FailedRunError, Request, last_record, nothing_empty
+from experiments.runner.plan import NOT_RUN, Plan, earlier
+from experiments.runner.tracking import SWEEP, log_sweep
 from experiments.sweeps.collected import Sweep, write_sweep_file
 from experiments.sweeps.report import text_of, write_sweep
 from mvest.errors import ConfigurationError, MvestError
@@ -43,111 +41,110 @@ GIVEN_ONCE = (PLANNED, "basic")
 """Sweepers that know all their jobs beforehand; others may try a job twice."""
 
 
-class SweepRun:
-    """A sweep, whose jobs come in one batch or in several.
+def launch(
+    config: DictConfig,
+    loader: ConfigLoader,
+    overrides: Sequence[Sequence[str]],
+    first: int,
+    before: Sequence[Request] = (),
+) -> tuple[list[JobReturn], tuple[Request, ...]]:
+    """Compose the jobs of a batch, refuse a wrong one before anything is written, and run them.
 
     Parameters
     ----------
-    loader : ConfigLoader
-        Hydra's.
     config : DictConfig
         The sweep's own configuration, with Hydra's part.
+    loader : ConfigLoader
+        Hydra's.
+    overrides : sequence of sequence of str
+        Those of each job.
+    first : int
+        Number of the first of them in the sweep.
+    before : sequence of Request
+        Jobs of earlier batches of the same sweep.
+
+    Returns
+    -------
+    list of JobReturn
+        One for each job, with its objective; none where jobs were only planned or checked.
+    tuple of Request
+        All jobs of the sweep so far.
+
+    Raises
+    ------
+    MvestError, HydraException, OmegaConfBaseException
+        If the request is wrong.
     """
-
-    def __init__(self, loader: ConfigLoader, config: DictConfig) -> None:
-        self._loader, self._config = loader, config
-        self._jobs: dict[str, PlannedJob] = {}
-
-    def launch(self, overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
-        """Find out what jobs mean, refuse a wrong one before anything is written, and run them.
-
-        Parameters
-        ----------
-        overrides : sequence of sequence of str
-            Those of each job.
-        first : int
-            Number of the first of them in the sweep.
-
-        Returns
-        -------
-        list of JobReturn
-            One for each job, with its objective; none where jobs were only planned or checked.
-
-        Raises
-        ------
-        MvestError, HydraException, OmegaConfBaseException
-            If the request is wrong.
-        """
-        config = self._config
-        launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
-        launcher.pop("_target_")
-        require_admissible_values(EngineSettings, launcher, "hydra.launcher")
-        settings = build(EngineSettings, launcher)
-        require_engine(settings)
-        sweeper = str(config.hydra.runtime.choices["hydra/sweeper"])
-        if config.sweep and sweeper != PLANNED:
-            raise ConfigurationError(f"hydra/sweeper={sweeper} knows no grid of sweep=NAME")
-        later = [name for name in ("dry_run", "check", "detach") if config[name]]
-        if later and sweeper not in GIVEN_ONCE:
-            raise ConfigurationError(
-                f"{later[0]}=true: hydra/sweeper={sweeper} finds its jobs by running"
-            )
-        batch = make_plan(config, self._loader, overrides, first, settings.at_a_time)
-        if sweeper in GIVEN_ONCE:
-            batch.require_different()
-        for job in batch.jobs:
-            _check(job)
-        if config.dry_run:
-            print(batch.summary(), batch.listing(), sep="\n")
-            return []
-        if config.check:
-            _run_checks(batch)
-            return []
-        # What became of the jobs of earlier batches is on disk.
-        self._jobs = {key: PlannedJob.of(job.request) for key, job in self._jobs.items()}
-        self._jobs |= {job.request.config_hash: job for job in batch.jobs}
-        plan = replace(batch, jobs=tuple(self._jobs.values()))
-        with nothing_empty(plan.folder, Path(config.paths.outputs)):
-            require_writable(plan.folder)
-            plan = plan.write()
-            OmegaConf.save(config, plan.folder / MULTIRUN)
-        print(batch.summary())
-        if config.detach and batch.to_run:
-            print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
-            print(f"`mvest collect {plan.folder}` writes what became of them")
-            return []
-        ended = _run(plan, batch, settings)
-        found = {job.hash: job.record for job in finish(plan, ended).jobs}
-        returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
-        # Ten thousand records are not kept while they are logged.
-        folder, common = plan.folder, plan.common
-        self._jobs = {key: PlannedJob(job.request) for key, job in self._jobs.items()}
-        del ended, found, plan, batch
-        log_sweep(folder, common)
-        done = [one.return_value for one in returned if one.status == JobStatus.COMPLETED]
-        if sweeper not in GIVEN_ONCE and any(map(math.isnan, done)):
-            raise ConfigurationError(
-                f"objective = {config.objective}: a job has no such number (MLflow shows all names)"
-            )
-        return returned
+    launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
+    launcher.pop("_target_")
+    require_admissible_values(EngineSettings, launcher, "hydra.launcher")
+    settings = build(EngineSettings, launcher)
+    require_engine(settings)
+    sweeper = str(config.hydra.runtime.choices["hydra/sweeper"])
+    if config.sweep and sweeper != PLANNED:
+        raise ConfigurationError(f"hydra/sweeper={sweeper} knows no grid of sweep=NAME")
+    later = [name for name in ("dry_run", "check", "detach") if config[name]]
+    if later and sweeper not in GIVEN_ONCE:
+        raise ConfigurationError(
+            f"{later[0]}=true: hydra/sweeper={sweeper} finds its jobs by running"
+        )
+    batch = make_plan(config, loader, overrides, first, settings.at_a_time)
+    if sweeper in GIVEN_ONCE:
+        batch.require_different()
+    for job in batch.jobs:
+        try:
+            require_admissible(job.values)
+        except MvestError as error:
+            raise ConfigurationError(f"{error} (job {' '.join(job.overrides)})") from error
+    if config.dry_run:
+        print(batch.summary(), batch.listing(), sep="\n")
+        return [], ()
+    if config.check:
+        _run_checks(batch)
+        return [], ()
+    jobs = tuple({job.config_hash: job for job in (*before, *batch.jobs)}.values())
+    # What became of the jobs of earlier batches is on disk.
+    plan = replace(batch, jobs=jobs, before={**earlier(before), **batch.before})
+    with nothing_empty(plan.folder, Path(config.paths.outputs)):
+        require_writable(plan.folder)
+        plan = plan.write()
+        OmegaConf.save(config, plan.folder / MULTIRUN)
+    print(batch.summary())
+    if config.detach and batch.to_run:
+        print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
+        print(f"`mvest collect {plan.folder}` writes what became of them")
+        return [], jobs
+    ended = _run(plan, batch, settings)
+    found = {job.hash: job.record for job in finish(plan, ended).jobs}
+    returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
+    # Ten thousand records are not kept while they are logged.
+    folder, common = plan.folder, plan.common
+    del ended, found, plan, batch
+    log_sweep(folder, common)
+    done = [one.return_value for one in returned if one.status == JobStatus.COMPLETED]
+    if sweeper not in GIVEN_ONCE and any(map(math.isnan, done)):
+        raise ConfigurationError(
+            f"objective = {config.objective}: a job has no such number (MLflow shows all names)"
+        )
+    return returned, jobs
 
 
 def _run(plan: Plan, batch: Plan, settings: EngineSettings) -> dict[str, Record]:
     """Run the jobs of a batch that are not done; returns heads of their records, by hash."""
     ended: dict[str, Record] = {}
-    left = {job.request.config_hash: job for job in batch.to_run}
-    if not left:
+    jobs = list({job.config_hash: job for job in batch.to_run}.values())
+    if not jobs:
         return ended
     announce_compilation("the first jobs")
-    jobs = list(left.values())
-    ends = run_jobs(
-        [job.request for job in jobs], settings, min(plan.workers, len(jobs)), plan.written_ns
-    )
+    ends = run_jobs(jobs, settings, min(plan.workers, len(jobs)), plan.written_ns)
     try:
-        with SweepBar(plan.name, len(plan.jobs) - len(jobs), len(jobs), plan.workers) as bar:
+        with PartBar(plan.name, len(jobs), "job", plan.workers) as bar:
             for k, record in ends:
-                ended[jobs[k].request.config_hash] = record
-                bar.ended(jobs[k], record)
+                job = jobs[k]
+                ended[job.config_hash] = record
+                if not record.converged:
+                    say(f"failed: {job.label}: {record.reason} ({job.folder})")
+                bar.step(seconds=record.seconds_total)
     except KeyboardInterrupt:
         ends.close()
         collected(plan, ended)
@@ -196,13 +193,13 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     write_atomically(plan.folder / TABLE, sweep_table(found).to_parquet())
     publish_runs(
         (
-            job.request.publish_as,
-            last_record(job.folder, job.request.config_hash),
+            job.publish_as,
+            last_record(job.folder, job.config_hash),
             job.folder,
             Path(job.values["paths"]["results"]),
         )
         for job in plan.jobs
-        if job.request.publish_as
+        if job.publish_as
     )
     results = plan.common["paths"]["results"]
     if plan.publish and all(one.reason != NOT_RUN for one in found.records):
@@ -214,50 +211,32 @@ def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
 
 def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     """Write ``sweep.json`` and say in a line how the sweep ended."""
-    path = plan.folder / SWEEP
-    found = collect(plan, ended)
+    path, left = plan.folder / SWEEP, {job.config_hash for job in plan.to_run}
+    found = plan.collect(ended)
     write_sweep_file(path, found)
-    print(_outcome(plan, found))
+    before = sum(job.config_hash not in left for job in plan.jobs)
+    failed = [record for record in found.records if not record.converged]
+    missing = sum(record.reason == NOT_RUN for record in failed)
+    print(
+        f"{plan.name}: {len(plan.jobs) - len(failed)} of {len(plan.jobs)} jobs done"
+        + (f" ({before} before)" if before else "")
+        + f", {len(failed) - missing} without an estimate"
+        + (f", {missing} not finished" if missing else "")
+    )
     print(f"Written to {path}")
     return found
 
 
-def _returned(job: PlannedJob, record: Record, objective: str) -> JobReturn:
+def _returned(job: Request, record: Record, objective: str) -> JobReturn:
     """What Hydra is told of a job."""
-    returned = JobReturn(overrides=job.request.overrides, working_dir=str(job.folder))
+    returned = JobReturn(overrides=job.overrides, working_dir=str(job.folder))
     returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
     returned.return_value = (
-        objective_of(record, objective)
+        metrics(record)[0].get(objective, math.nan)
         if record.converged
         else FailedRunError(f"{record.reason} (recorded in {job.folder})")
     )
     return returned
-
-
-def objective_of(record: Record, name: str) -> float:
-    """A number of a record, by the name that MLflow shows; NaN where it has none."""
-    return metrics(record)[0].get(name, math.nan)
-
-
-def _outcome(plan: Plan, found: Sweep) -> str:
-    """How a sweep ended, in one line."""
-    total, before = len(plan.jobs), sum(not job.to_run for job in plan.jobs)
-    failed = [record for record in found.records if not record.converged]
-    missing = sum(record.reason == NOT_RUN for record in failed)
-    parts = [
-        f"{total - len(failed)} of {total} jobs done" + (f" ({before} before)" if before else ""),
-        f"{len(failed) - missing} without an estimate",
-        *([f"{missing} not finished"] if missing else []),
-    ]
-    return f"{plan.name}: {', '.join(parts)}"
-
-
-def _check(job: PlannedJob) -> None:
-    """Refuse a job that could not run, saying which one it is."""
-    try:
-        require_admissible(job.values)
-    except MvestError as error:
-        raise ConfigurationError(f"{error} (job {' '.join(job.request.overrides)})") from error
 
 
 def _run_checks(plan: Plan) -> None:

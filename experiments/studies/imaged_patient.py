@@ -143,8 +143,7 @@ def run_imaged_patient(job: Job[Settings]) -> Result:
         for one in each
     ]
     lost = main if isinstance(main, str) else ""
-    return replace(
-        run,
+    return run.changed(
         tables={"chordae": table(ratios)} if ratios else {},
         numbers={"anatomies_drawn": hidden["anatomies_drawn"]},
         arrays={} if lost else run.arrays,

@@ -140,7 +140,7 @@ def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, see
     numbers |= {f"paper_{own.region}_MPa": value for own, value in paper}
     distances = zip(("generic", "personalised"), patient.paper_distance_mm, strict=False)
     numbers |= {f"paper_{which}_mm": value for which, value in distances}
-    return replace(estimated, tables={}, numbers=numbers, estimates=(estimate,), arrays=arrays)
+    return estimated.changed(tables={}, numbers=numbers, estimates=(estimate,), arrays=arrays)
 
 
 def _to_truth(

@@ -86,7 +86,7 @@ def run_surfaces(job: Job[Settings]) -> Result:
     truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
     about = {"case": patient.name, "seed": job.values["seed"]}
     revealed = estimate.model_copy(update=about).with_truth(truth)
-    return replace(found, tables={}, numbers=numbers, estimates=(revealed,), arrays={}, row="")
+    return found.changed(tables={}, numbers=numbers, estimates=(revealed,), arrays={}, row="")
 
 
 def surface_error(found: Frame, true: Frame) -> dict[str, Number]:

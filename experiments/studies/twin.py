@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from experiments.common.building.filters import build_filter, observation_variance
 from experiments.common.building.gate import gate_of
-from experiments.common.building.twin import Twin, TwinExpectation, build_twin, estimate_twin
+from experiments.common.building.twin import Twin, build_twin, estimate_twin, expect_twin
 from experiments.common.progress import SolveBar
 from experiments.common.records.record import Mesh, model_of_values
 from experiments.common.study import Job, Result, Results, Study
@@ -253,7 +253,7 @@ STUDY = Study(
         "valve": "The fitted valve, open and closed. Simulated.",
     },
     latex=("table1",),
-    checks=lambda: (TwinExpectation(),),
+    checks=lambda: (expect_twin,),
     require=require_twin,
     keeps_failures=True,
 )

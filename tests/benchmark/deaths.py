@@ -40,8 +40,8 @@ FAKE = str(ROOT / "tests" / "experiments" / "runner" / "fake_worker.py")
 
 INSTEAD = f"""
 import sys
-from experiments.runner.execution import guard
-guard.WORKER = (sys.executable, {FAKE!r})
+from experiments.runner import engine
+engine.WORKER = (sys.executable, {FAKE!r})
 """
 
 MAIN = "from experiments.run import main; main()"

@@ -26,7 +26,7 @@ STARTS = {
 } | {
     f"imports of a job, {name}": [
         "-c",
-        f"import experiments.runner.execution.job, experiments.studies.{name}.study",
+        f"import experiments.runner.job, experiments.studies.{name}.study",
     ]
     for name in study_names()
 }

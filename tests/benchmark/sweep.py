@@ -28,9 +28,9 @@ RUN = """
 import json, resource, sys
 from pathlib import Path
 from experiments.run import main
-from experiments.runner.execution import guard
+from experiments.runner import engine
 fake, seeds = sys.argv[1:]
-guard.WORKER = (sys.executable, fake)
+engine.WORKER = (sys.executable, fake)
 sys.argv[1:] = ["-m", "experiment=debug", f"seed=range(0,{seeds})", "hydra.launcher.n_jobs=2"]
 status = main()
 used = resource.getrusage(resource.RUSAGE_SELF)

@@ -127,7 +127,7 @@ def test_words_alone_load_nothing(arguments, tmp_path):
 def test_an_estimate_loads_neither_tables_nor_figures_nor_cases(tmp_path):
     code = (
         "import sys\nimport experiments.run\n"
-        "from experiments.runner.execution import check, job\n"
+        "from experiments.runner import job\n"
         "from experiments.common.study import load_study\nload_study('twin')\n"
         "heavy = {'matplotlib', 'pandas', 'mlflow', 'mvest.personalisation.chain'}\n"
         "heavy &= set(sys.modules)\n"

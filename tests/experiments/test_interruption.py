@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from experiments.interruption import ASKING, Interruption, interruptible, raised
+from experiments.console import ASKING, Interruption, interruptible, raised
 from tests.processes import linux
 
 

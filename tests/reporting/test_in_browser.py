@@ -13,7 +13,7 @@ from PIL import Image
 from experiments.tables import write_report
 from mvest.reporting.case.report import report
 from tests.experiments.results.test_report import publish_sweep
-from tests.experiments.runner.tracking.screenshot import look_at
+from tests.experiments.runner.screenshot import look_at
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep
 from tests.reporting.case.made_up_case import (
     LINE,

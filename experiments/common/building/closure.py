@@ -36,8 +36,8 @@ UNSTRUCTURED_SURFACE = (112, 29)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ValveFolder:
-    """A case whose anatomy is taken instead of the template's."""
+class ValveSettings(TemplateParameters):
+    """The template's parameters, or a case whose anatomy is taken instead."""
 
     folder: Annotated[str | None, NOT_HASHED] = None  # with case.yaml
     folder_sha256: str | None = "${valve_folder:}"  # of what lies there

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,8 @@ from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import Values
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
-from mvest.elements import ELEMENTS
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.prediction import ObservationModel, Prediction, SharedStart
+from mvest.estimation.prediction import ObservationModel, SharedStart
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
@@ -48,17 +47,9 @@ from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
 from mvest.problem.stored import Extrapolated, Store, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
-from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface, Valve
-
-BASE_GB = 0.4
-"""Of a job on the smallest mesh, its libraries included."""
-
-GB_A_NODE = 40e-6
-"""Most of it the factor of the tangent of a closed valve. Closures on hex18 had peaks of 0.37, 0.55
-and 0.99 GB at 4896, 10 000 and 24 600 nodes: 0.2 GB and 33 kB a node."""
 
 
 def build_truth(
@@ -146,41 +137,6 @@ def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
 def _cells(mesh: Values) -> dict[str, Any]:
     """What decides a structured mesh besides its element."""
     return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
-
-
-def require_room(values: Mapping[str, Any], limit_gb: float) -> None:
-    """Refuse structured meshes whose closure needs more memory than a job may have.
-
-    Raises
-    ------
-    ConfigurationError
-        If one does; the message names it.
-    """
-    element, truth = values["mechanics"]["element"], values["truth"]
-    meshes = {
-        "mesh": (element, values["mesh"]),
-        "truth": (truth["element"] or element, truth_mesh(values["mesh"], truth)),
-    }
-    if "personal" in values:
-        meshes["personal.mesh"] = element, {"layers": 1, **values["personal"]["mesh"]}
-    for name, (kind, mesh) in meshes.items():
-        if mesh["source"] != "structured" or kind not in ELEMENTS:
-            continue
-        cells = mesh["columns"], mesh["rows"], mesh["layers"]
-        needed = expected_memory_gb(kind, *cells)
-        if needed > limit_gb:
-            raise ConfigurationError(
-                f"{name}: {' x '.join(map(str, cells))} cells of {kind} need about {needed:.3g} GB,"
-                f" more than the {limit_gb:.3g} GB that a job may have (memory_limit_gb)"
-            )
-
-
-def expected_memory_gb(element: str, columns: int, rows: int, layers: int = 1) -> float:
-    """Peak of a job that closes a valve on a structured mesh, which grows with its nodes."""
-    nodes = ELEMENTS[element].node_coordinates.T
-    around, along, through = (np.unique(coordinate).size - 1 for coordinate in nodes)
-    count = around * columns * (along * rows + 1) * (through * layers + 1)
-    return BASE_GB + GB_A_NODE * float(count)
 
 
 MADE_BY = (closure_model, truth_mechanics, truth_mesh)
@@ -370,43 +326,23 @@ def _require_tissue(
                 _ = tissue.moduli(values[f"E_f.{region}"], *own).material  # refuses what is none
 
 
-OF_THE_MODEL = ("valve", "mesh", "mechanics", "parameters", "fixed", "guided")
-"""Parts of a configuration on which a closure depends, besides where it is computed."""
-
-
-@dataclass(slots=True)
-class TwinExpectation:
-    """Answers for synthetic studies; jobs of a sweep that begin alike share their closure."""
-
-    _known: dict[str, Prediction] = field(default_factory=dict)
-
-    def __call__(self, config: Mapping[str, Any], _folder: Path | None = None) -> str:
-        """The answer for one configuration."""
-        twin = build_twin(config)
-        start = twin.problem.start
-        observed = config["observation"]
-        key = config_hash(
-            {part: config[part] for part in OF_THE_MODEL}
-            | {"at": start.tolist(), "observed": [observed["columns"], observed["rows"]]}
-        )
-        with SolveBar(config["name"], len(twin.model.settings.protocol.steps()), 1) as bar:
-            twin.model.on_step = bar.step
-            if key not in self._known:
-                self._known[key] = SharedStart(twin.model, start)(start)
-        first = self._known[key]
-
-        def model(m: FloatArray) -> Prediction:
-            return first if np.array_equal(m, start) else Prediction.failed("not the start")
-
-        title = f"{config['name']}, {config['row']}"
-        data = twin.observe(model, start, np.random.default_rng(0))
-        if data.observation is None:
-            return unknown_text(title, first.reason)
-        std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
-        noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
-        return expectation_text(
-            title, expect(replace(twin.problem, model=model), data.observation), noise
-        )
+def expect_twin(config: Values, _folder: Path | None = None) -> str:
+    """What ``check=true`` says of a synthetic study: the answer of the Fisher information."""
+    twin = build_twin(config)
+    start = twin.problem.start
+    model = SharedStart(twin.model, start)
+    with SolveBar(config["name"], len(twin.model.settings.protocol.steps()), 1) as bar:
+        twin.model.on_step = bar.step
+        first = model(start)
+    title = f"{config['name']}, {config['row']}"
+    data = twin.observe(model, start, np.random.default_rng(0))
+    if data.observation is None:
+        return unknown_text(title, first.reason)
+    std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
+    noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
+    return expectation_text(
+        title, expect(replace(twin.problem, model=model), data.observation), noise
+    )
 
 
 def noise_words(known: str, std_mm: Sequence[float], length_mm: float) -> str:

@@ -21,14 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.cases.own_case import case_result, read_configured, run_case, run_volume
+from experiments.common.cases.own_case import read_configured, run_case, run_volume
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
-from experiments.common.records.record import NOT_GATED, Mesh, Model
+from experiments.common.records.record import NOT_GATED
 from experiments.common.schema import build
 from experiments.common.study import Result
 from mvest.errors import InputError, MvestError
 from mvest.files import write_atomically
-from mvest.problem.record import EstimateRecord
 from mvest.processes import environment, python, run
 from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.documents import read_mapping
@@ -131,13 +130,7 @@ def read_estimate(folder: Path) -> Result:
         If it left nothing.
     """
     left, arrays = read_mapping(folder / ESTIMATE), folder / ARRAYS
-    return case_result(
-        EstimateRecord.model_validate(left["estimate"]),
-        Mesh.model_validate(left["mesh"]),
-        Model.model_validate(left["model"]),
-        left["gate"],
-        read_npz(arrays) if arrays.is_file() else {},
-    )
+    return Result(**left, arrays=read_npz(arrays) if arrays.is_file() else {})
 
 
 def write_estimate(folder: Path, result: Result) -> None:
@@ -145,11 +138,7 @@ def write_estimate(folder: Path, result: Result) -> None:
     if result.arrays:
         arrays: dict[str, Any] = dict(result.arrays)
         write_atomically(folder / ARRAYS, partial(np.savez_compressed, **arrays))
-    assert result.mesh is not None
-    assert result.model is not None
-    left = {"estimate": result.estimates[0], "mesh": result.mesh, "model": result.model}
-    plain = {name: part.model_dump(mode="json") for name, part in left.items()}
-    write_json(folder / ESTIMATE, {**plain, "gate": result.gate})
+    write_json(folder / ESTIMATE, result.model_dump(mode="json"))
 
 
 def main() -> int:

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from experiments.common.building.closure import mechanics_of, mesh_store
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
@@ -41,7 +40,7 @@ from mvest.personalisation.settings import (
     Treatment,
     with_stiffening,
 )
-from mvest.problem.record import EstimateRecord, Row
+from mvest.problem.record import Row
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 
@@ -103,18 +102,26 @@ def run_case(
             case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
         )
     grid, noise = settings.mesh, case.uncertainty.typical_mm
-    return case_result(
-        record_of_case(fit, gate=has_passed(gate), images=images),
-        Mesh.of(fit.mesh),
-        Model(
+    estimate = record_of_case(fit, gate=has_passed(gate), images=images)
+    return Result(
+        tables={"": unknown_table(estimate.unknowns), "frames": frame_table(estimate.frames)},
+        estimates=(estimate,),
+        arrays=arrays_of_case(fit),
+        status=estimate.status,
+        reason=estimate.reason,
+        detail=estimate.detail,
+        mesh=Mesh.of(fit.mesh),
+        forward_solves=estimate.forward_solves or 0,
+        row=estimate.case,
+        parameters=tuple(modulus.name for modulus in estimate.moduli),
+        model=Model(
             element=fit.mesh.element_type,
             cells=(grid.columns, grid.rows, 1),
             source=grid.source,
             filter="iterated",
             noise_mm=noise,
         ),
-        gate,
-        arrays_of_case(fit),
+        gate=gate,
     )
 
 
@@ -163,30 +170,6 @@ def find_valve(
                 f"{nothing}; the best candidate, not accepted, is drawn in {drawn}",
                 nothing.candidate,
             ) from nothing
-
-
-def case_result(
-    estimate: EstimateRecord,
-    mesh: Mesh,
-    model: Model,
-    gate: str | None,
-    arrays: Mapping[str, Any],
-) -> Result:
-    """The result of a run that estimated one case."""
-    return Result(
-        tables={"": unknown_table(estimate.unknowns), "frames": frame_table(estimate.frames)},
-        estimates=(estimate,),
-        arrays=arrays,
-        status=estimate.status,
-        reason=estimate.reason,
-        detail=estimate.detail,
-        mesh=mesh,
-        forward_solves=estimate.forward_solves or 0,
-        row=estimate.case,
-        parameters=tuple(modulus.name for modulus in estimate.moduli),
-        model=model,
-        gate=gate,
-    )
 
 
 def case_words(record: Record) -> str:

@@ -1,6 +1,6 @@
 """The record of a run: what ``result.json`` and the kept records in ``results/`` hold.
 
-A study returns a `Result`; everything else that a record says is stamped once, by the runner.
+A study returns a `Result`; what a record says besides is stamped once, by the runner.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from mvest.errors import InputError
 from mvest.files import PREFIX, sha256_of, write_atomically
@@ -24,7 +24,6 @@ from mvest.reading.text import one_line
 from mvest.reporting.tables import Table
 
 if TYPE_CHECKING:
-    from experiments.common.study import Result
     from mvest.valve.mesh.solid_mesh import SolidMesh
 
 VERSION = 3
@@ -136,57 +135,58 @@ class Model(Frozen):
     noise_mm: float | None = None
 
 
-class Record(Frozen):
-    """A finished run: what ``result.json`` and the kept records in ``results/`` hold.
+def _plain(tables: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: one.plain() if isinstance(one, Table) else one for k, one in tables.items()}
+
+
+class Result(Frozen):
+    """What a study returns. Everything that tables and figures show is in it.
 
     Attributes
     ----------
-    version : int
-        Of this layout.
-    study, experiment, title, row, table : str
-        Its study, its configuration, and what tables call it.
+    tables : mapping of str to Table
+        Tidy tables by name, kept as plain data (`table_of`); the one called ``""`` is the study's
+        main table.
+    numbers : mapping
+        Single values by name, with the unit at the end of the name; MLflow gets those that are
+        numbers.
+    estimates : tuple of EstimateRecord
+    arrays : mapping
+        Written beside the record, for figures; not part of it.
     status : {"converged", "failed"}
     reason, detail : str
         Why the run ended.
-    parameters : tuple of str
-    factors : mapping
-        What is varied in this job of a sweep, by name.
-    seconds_total : float
-        From the start of the job to its record.
-    forward_solves : int
-    model : Model or None
     mesh : Mesh or None
-    provenance : Provenance
-    estimates : tuple of EstimateRecord
-    numbers : mapping
-        Single values by name, with the unit at the end of the name.
-    tables : mapping
-        Name -> plain data of a `mvest.reporting.tables.Table`.
+    forward_solves : int
+    row : str
+        What tables call this run, where the data say it and not the configuration.
+    parameters : tuple of str
+        Likewise.
+    model : Model or None
+        Likewise.
     gate : str or None
         What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
         study uses none of the configured anatomies.
     """
 
-    version: int
-    study: str
-    experiment: str
-    title: str
-    row: str
-    table: str
-    status: Status
-    reason: str
-    detail: str
-    parameters: tuple[str, ...]
-    factors: Mapping[str, Any]
-    seconds_total: float
-    forward_solves: int
-    model: Model | None
-    mesh: Mesh | None
-    provenance: Provenance
-    estimates: tuple[EstimateRecord, ...] = ()
+    tables: Annotated[Mapping[str, Any], BeforeValidator(_plain)] = {}
     numbers: Mapping[str, Number] = {}
-    tables: Mapping[str, Mapping[str, Any]] = {}
+    estimates: tuple[EstimateRecord, ...] = ()
+    arrays: Annotated[Mapping[str, Any], Field(exclude=True)] = {}
+    status: Status = "converged"
+    reason: str = "completed"
+    detail: str = ""
+    mesh: Mesh | None = None
+    forward_solves: int = 0
+    row: str = ""
+    parameters: tuple[str, ...] = ()
+    model: Model | None = None
     gate: str | None = None
+
+    def changed(self, **values: Any) -> Self:
+        """The same with other values, checked like the first ones."""
+        known = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**known, **values})
 
     def table_of(self, name: str = "") -> Table:
         """One of its tables.
@@ -196,12 +196,38 @@ class Record(Frozen):
         KeyError
             If it has none of this name.
         """
-        return Table.of_plain(self.tables[name], f"table {name!r} of {self.experiment}")
+        return Table.of_plain(self.tables[name], f"table {name!r}")
 
     @property
     def converged(self) -> bool:
         """Whether the run ended as it should."""
         return self.status == "converged"
+
+
+class Record(Result):
+    """A finished run: what ``result.json`` and the kept records in ``results/`` hold.
+
+    Attributes
+    ----------
+    version : int
+        Of this layout.
+    study, experiment, title, table : str
+        Its study, its configuration, and what tables call it.
+    factors : mapping
+        What is varied in this job of a sweep, by name.
+    seconds_total : float
+        From the start of the job to its record.
+    provenance : Provenance
+    """
+
+    version: int
+    study: str
+    experiment: str
+    title: str
+    table: str
+    factors: Mapping[str, Any]
+    seconds_total: float
+    provenance: Provenance
 
     @property
     def caution(self) -> str:
@@ -259,30 +285,22 @@ def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: 
     started : float
         Seconds since the epoch.
     """
-    mesh = result.mesh
+    found = {name: getattr(result, name) for name in Result.model_fields if name != "arrays"}
+    found["row"] = result.row or values["row"]
+    found["parameters"] = result.parameters or tuple(values["parameters"])
+    found["model"] = result.model or model_of_values(values)
     return Record(
+        **found,
         version=VERSION,
         study=values["study"],
         experiment=values["name"],
         title=values["title"],
-        row=result.row or values["row"],
         table=values["table"],
-        status=result.status,
-        reason=result.reason,
-        detail=result.detail,
-        parameters=result.parameters or tuple(values["parameters"]),
-        factors=dict(values["factors"]),
+        factors=values["factors"],
         seconds_total=time.time() - started,
-        forward_solves=result.forward_solves,
-        model=result.model or model_of_values(values),
-        mesh=mesh,
         provenance=here_and_now(
-            config_hash, "none" if mesh is None else mesh.sha256, values["seed"]
+            config_hash, "none" if result.mesh is None else result.mesh.sha256, values["seed"]
         ),
-        estimates=result.estimates,
-        numbers=result.numbers,
-        tables={name: table.plain() for name, table in result.tables.items()},
-        gate=result.gate,
     )
 
 

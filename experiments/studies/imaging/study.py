@@ -130,7 +130,7 @@ def run_imaging(job: Job[Settings]) -> Result:
         "model_sha256": sha256_of(path),
     }
     done = ["trained"] * (settings.model is None) + ["tested"] * settings.evaluate
-    return replace(tested, numbers={**about, **tested.numbers}, reason=" and ".join(done))
+    return tested.changed(numbers={**about, **tested.numbers}, reason=" and ".join(done))
 
 
 def _held_out(store: ImagingStore, file: Path) -> list[Seen]:

@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 from pydantic.fields import FieldInfo
 
-from experiments.common.config import PARTS, Config, plain, require_in_range
+from experiments.common.config import Config, plain, require_in_range
 from experiments.common.schema import (
     BY_PARAMETER,
     hints_of,
@@ -17,7 +17,7 @@ from experiments.common.schema import (
     require_within,
 )
 from experiments.common.study import load_settings, study_names
-from experiments.runner.execution.cluster import EngineSettings
+from experiments.runner.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION, range_of
@@ -53,7 +53,7 @@ def without_range(kind: object, key: str = "") -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "kind",
-    [Config, *PARTS["valve"], *PARTS["mechanics"], *map(load_settings, study_names())],
+    [Config, *map(load_settings, study_names())],
     ids=lambda kind: f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}",
 )
 def test_every_number_has_a_range(kind: type) -> None:

@@ -5,7 +5,8 @@ import pytest
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError, ValidationError
 
-from experiments.common.config import PARTS
+from experiments.common.building.closure import ValveSettings
+from experiments.common.config import Mechanics
 from experiments.common.schema import build, schema
 from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.learning.training import TrainingSettings
@@ -53,20 +54,20 @@ def test_typos_and_wrong_types_are_refused() -> None:
 
 
 def test_the_librarys_defaults_are_the_configurations() -> None:
-    template = OmegaConf.to_container(OmegaConf.structured(schema(*PARTS["valve"])))
+    template = OmegaConf.to_container(OmegaConf.structured(schema(ValveSettings)))
     assert build(TemplateParameters, template) == TemplateParameters()
     # Dataclasses within dataclasses, and mappings.
     for cls in (PopulationSettings, TrainingSettings):
         made = OmegaConf.to_container(OmegaConf.structured(schema(cls)))
         assert build(cls, made) == cls()
-    mechanics = OmegaConf.structured(schema(*PARTS["mechanics"]))
+    mechanics = OmegaConf.structured(schema(Mechanics))
     mechanics.merge_with({"tissue": {"anterior": {"ratio": 2.0}}})
     tissue = {"anterior": TissueSettings(2.0)}
     assert build(MechanicsSettings, OmegaConf.to_container(mechanics)) == MechanicsSettings(tissue)
 
 
 def test_the_librarys_own_checks_apply() -> None:
-    values = OmegaConf.to_container(OmegaConf.structured(schema(*PARTS["valve"])))
+    values = OmegaConf.to_container(OmegaConf.structured(schema(ValveSettings)))
     values["leaflets"]["edge_thinning"] = 0.0
     with pytest.raises(InputError, match=r"leaflets\.edge_thinning"):
         build(TemplateParameters, values)

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 
 from experiments.common.study import Result, Study
-from experiments.runner.execution import worker
+from experiments.runner import job as worker
 from mvest.problem.record import EstimateRecord, Unknown
 
 

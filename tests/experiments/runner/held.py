@@ -58,13 +58,14 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     from experiments import cli
-    from experiments.runner.execution import guard
 
     if stage() == "logging":
         import mlflow
 
         mlflow.MlflowClient.set_terminated = lambda *_, **__: hold()
-    guard.WORKER = (sys.executable, __file__, "worker")
+    from experiments.runner import engine
+
+    engine.WORKER = (sys.executable, __file__, "worker")
     return cli.main(sys.argv[1:])
 
 

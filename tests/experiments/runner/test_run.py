@@ -323,7 +323,7 @@ FAILURES = {
     "page": ("mvest.reporting.tables.markdown_rows", KeyError("name")),
     "words": ("mvest.reporting.tables.Table.text", "a\ud800".encode),
     "marker": (
-        "experiments.runner.execution.job.mark_done",
+        "experiments.runner.job.mark_done",
         OSError(28, "No space left on device"),
     ),
 }

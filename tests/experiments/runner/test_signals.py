@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.runner.tracking.log import runs_of
-from experiments.runner.tracking.store import opened
+from experiments.runner.tracking import opened, runs_of
 from experiments.sweeps.collected import read_sweep
 from tests.places import ROOT
 from tests.processes import alive, gone, linux, until

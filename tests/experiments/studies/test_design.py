@@ -53,14 +53,14 @@ def made_up(monkeypatch):
 
 def test_all_designs_are_recorded_and_some_are_tried(made_up, tmp_path):
     result = design.run(job(tmp_path))
-    left = result.tables[""].rows
+    left = result.table_of().rows
     assert {row["modulus"] for row in left} == set(MODULI)
     plain_rows = [row for row in left if row["errors"] in KINDS]
     assert len(plain_rows) == len(KINDS) * len(ERRORS_MMHG) * 5 * 2
     assert {row["known"] for row in left} == {
         "", "the pressures", "the chordae", "the displacement",
     }  # fmt: skip
-    tried = result.tables["tried"].rows
+    tried = result.table_of("tried").rows
     corners = list(dict.fromkeys(row["design"] for row in tried))
     assert corners[0] == "one frame"
     assert [one.case for one in result.estimates] == corners

@@ -177,7 +177,7 @@ def test_several_models_estimate_from_what_one_of_them_predicts(tmp_path):
     assert one.estimate == pytest.approx(3.0, abs=4 * one.std)
     assert one.truth == 3.0
     assert other.estimate == pytest.approx(one.estimate / 2, rel=1e-4)
-    rows = result.tables[""].rows
+    rows = result.table_of().rows
     assert rows[1]["apart"] == pytest.approx(-0.5, rel=1e-4)
     assert "runs" not in rows[1]
 

@@ -89,7 +89,7 @@ def test_estimates_from_the_volume_and_from_better_geometries_stand_together(est
     assert [own.estimate for own in better[SEGMENTED].moduli] == [5.4, 2.2]
     assert all(own.truth == TRUTH[own.name] for one in better.values() for own in one.unknowns)
     assert result.numbers == {"anatomies_drawn": 2}
-    assert result.tables["chordae"].values["ratio"] == [1.01, 0.99, 0.96]
+    assert result.table_of("chordae").values["ratio"] == [1.01, 0.99, 0.96]
 
 
 def test_a_better_geometry_that_is_lost_loses_nothing_else(estimated):

@@ -185,13 +185,13 @@ def test_nothing_is_revealed_before_the_estimation_has_ended(
     result = run(values, out)
     assert set(files) == {"estimate.json", "estimate.npz"}
     hidden = json.loads(files["estimate.json"])
+    (before,) = hidden["estimates"]
     # The priors and the settings of the mechanics are given to everyone.
-    del hidden["estimate"]["details"]["settings"]
+    del before["details"]["settings"]
     for value in (6.28, 2.61, *TRUE.values()):
         assert value not in leaves(hidden)
     # What was estimated did not change when the truth came.
     (estimate,) = result.estimates
-    before = hidden["estimate"]
     assert [row.estimate for row in estimate.unknowns] == [
         row["estimate"] for row in before["unknowns"]
     ]

@@ -143,7 +143,8 @@ def test_the_estimator_gets_the_case_and_not_the_truth(job, monkeypatch):
         found = a_result(5.8, 2.1)
         details = {"check": ({"compared": "curvature", "value": 0.1, "limit": 0.25},)}
         update = {"verdict": Verdict(TRUSTWORTHY), "details": details}
-        return replace(found, estimates=(found.estimates[0].model_copy(update=update),))
+        estimates = (found.estimates[0].model_copy(update=update),)
+        return found.model_copy(update={"estimates": estimates})
 
     monkeypatch.setattr(blind, "estimate_blindly", blindly)
     result = run_surfaces(job)

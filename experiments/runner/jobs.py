@@ -1,26 +1,33 @@
-"""The folder of a job: whether it is done, who is at work in it, and why it has no estimate.
+"""One job of the runner: its request, its folder, and what time and memory it may take (Linux).
 
-A job is done when its marker holds the digest of its record, and the record belongs to the
-requested configuration. The marker is written last. A record and its arrays are replaced only when
-their successors are on disk.
+A request is plain data, so that another process can be given it. A job is done when the marker in
+its folder holds the digest of its record, and the record belongs to the requested configuration.
+The marker is written last. A record and its arrays are replaced only when their successors are on
+disk.
 """
 
 from __future__ import annotations
 
+import os
+import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import yaml
 from filelock import AcquireReturnProxy, FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 
-from experiments.common.config import without_places
+from experiments.common.config import hash_of, plain, require_in_range, without_places
 from experiments.common.records.record import Record, adopt_arrays, read_record, stamp, write_record
 from experiments.common.study import Result
-from experiments.runner.jobs.request import Request
+from experiments.results.publish import publish_as
 from mvest.errors import InputError, message_of
 from mvest.files import remove_parts, require_writable, sha256_of, write_atomically
 from mvest.provenance import write_json
@@ -31,6 +38,80 @@ HYDRA = ".hydra"
 
 UNWRITTEN = f"the estimate is in {{}}/{RESULT}, and the same command writes what is missing"
 """What to say where the numbers of a job are on disk and something else could not be written."""
+
+HASH_DIGITS = 16
+"""Digits of its hash by which a job is named."""
+
+TIME_LIMIT_S = 14_400.0
+"""s, default for jobs of sweeps: 50 times the longest of those in ``results/`` (269 s)."""
+
+SHARE, GB = 0.8, 2**30
+"""Of the machine's memory, for all jobs at a time; and bytes, as Slurm counts them."""
+
+PROCESS, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One composed configuration and where it is run.
+
+    Attributes
+    ----------
+    values : dict
+        The resolved configuration.
+    config_hash : str
+        SHA-256 of what in it can change the result.
+    folder : Path
+        Output folder of the job.
+    publish_as : str or None
+        Name of its record in the results; None where they are not to be touched.
+    overrides : tuple of str
+        What was requested in Hydra's syntax.
+
+    Raises
+    ------
+    ConfigurationError
+        If a setting is outside its range.
+    """
+
+    values: dict[str, Any]
+    config_hash: str
+    folder: Path
+    publish_as: str | None = None
+    overrides: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_in_range(self.values)
+
+    @classmethod
+    def of(cls, config: DictConfig) -> Request:
+        """What Hydra composed for the job it is just starting."""
+        hydra, values = HydraConfig.get(), plain(config)
+        overrides = tuple(hydra.overrides.task)
+        published = publish_as(values, overrides, None)
+        return cls(values, hash_of(values), Path(hydra.runtime.output_dir), published, overrides)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Request:
+        """The request that :meth:`to_json` wrote."""
+        typed = tuple(data["overrides"])
+        return cls(**{**data, "folder": Path(data["folder"]), "overrides": typed})
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        data = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**data, "folder": str(self.folder)}
+
+    @property
+    def short_hash(self) -> str:
+        """First digits of the hash of the configuration, by which files name the job."""
+        return self.config_hash[:HASH_DIGITS]
+
+    @property
+    def label(self) -> str:
+        """What sets the job apart, for a line of text."""
+        factors = (f"{name}={value}" for name, value in self.values["factors"].items())
+        return ", ".join(factors) or " ".join(self.overrides)
 
 
 class FailedRunError(Exception):
@@ -216,3 +297,44 @@ def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
                     (folder / LOCK).unlink()
                 for place in (folder, *above):
                     place.rmdir()
+
+
+def default_memory_gb(jobs: int = 1) -> float:
+    """Memory limit (GB) of each of ``jobs`` that run on this machine or in this container."""
+    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    with suppress(OSError):
+        for group in (PROCESS / "cgroup").read_text(encoding="utf-8").splitlines():
+            own = CGROUPS / group.rpartition(":")[2].lstrip("/")
+            for place in (own, *own.parents):
+                with suppress(OSError, ValueError):  # no limit there, or "max"
+                    limits.append(int((place / "memory.max").read_text(encoding="ascii")))
+    return SHARE * min(limits) / max(1, jobs) / GB
+
+
+@contextmanager
+def held_memory(limit_gb: float) -> Iterator[None]:
+    """Limit the memory of this process, and of each program that it starts meanwhile.
+
+    What it has left of its limit at the start may be allocated (``RLIMIT_DATA``). Beyond that it
+    raises a `MemoryError` that states the limit and the peak.
+    """
+    before, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    # Arrow's own allocator would reserve 1 GB for its first string.
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+    with suppress(OSError):
+        pages = (PROCESS / "statm").read_text(encoding="ascii").split()
+        resident, reserved = (int(pages[k]) * resource.getpagesize() for k in (1, 5))
+        allowed = reserved + max(0, int(limit_gb * GB) - resident)
+        soft = allowed if hard == resource.RLIM_INFINITY else min(allowed, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+        # The peak is counted anew; where that is not allowed it is that of all jobs so far.
+        (PROCESS / "clear_refs").write_text("5", encoding="ascii")
+    try:
+        yield
+    except MemoryError as error:
+        resource.setrlimit(resource.RLIMIT_DATA, (before, hard))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / GB
+        text = f"memory limit of {limit_gb:.3g} GB (used: up to {peak:.3g} GB)"
+        raise MemoryError(": ".join(filter(None, [text, str(error).strip()]))) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (before, hard))

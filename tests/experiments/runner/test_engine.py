@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from experiments.sweeps.collected import read_sweep
-from tests.experiments.runner.execution.test_shards import FAKE, WORKER, is_in, runs, until
+from tests.experiments.runner.test_shards import FAKE, WORKER, is_in, runs, until
 from tests.places import ROOT
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
@@ -22,8 +22,8 @@ CLUSTER = ("hydra.launcher.cluster=LocalCluster", "hydra.launcher.jobs=2")
 
 INSTEAD = """
 import sys
-from experiments.runner.execution import guard
-guard.WORKER = (sys.executable, {fake!r})
+from experiments.runner import engine
+engine.WORKER = (sys.executable, {fake!r})
 """
 """What dask's workers load, so that their jobs take no time."""
 

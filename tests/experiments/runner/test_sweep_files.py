@@ -15,8 +15,8 @@ from experiments.common.cases.blind import SECRET
 from experiments.common.config import hash_of, register, require_in_range
 from experiments.common.schema import build
 from experiments.common.study import Job, Result
-from experiments.runner.jobs.limits import TIME_LIMIT_S
-from experiments.runner.planning.compose import expand, make_plan
+from experiments.runner.compose import expand, make_plan
+from experiments.runner.jobs import TIME_LIMIT_S
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
@@ -94,16 +94,16 @@ def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, 
     # Groups, values within what a group chose, and values on the command line.
     said = [f"sweep={name}", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
     plan = make_plan(config, loader, expand(config, said, loader))
-    assert len({job.request.config_hash for job in plan.jobs}) == len(plan.jobs)
+    assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
     for job in plan.jobs[::step]:
-        config_hash, values = composed(*job.request.overrides)
+        config_hash, values = composed(*job.overrides)
         # Which a job by itself does not have.
         values["time_limit_s"] = TIME_LIMIT_S
         # What is varied on the command line is named besides.
         assert values["factors"].items() <= job.values["factors"].items()
         values["factors"] = job.values["factors"]
         assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
-        assert job.request.config_hash == config_hash
+        assert job.config_hash == config_hash
         assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
 
 

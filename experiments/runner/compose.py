@@ -19,19 +19,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from tqdm import tqdm
 
 from experiments.common.config import hash_of, plain
 from experiments.results.publish import as_configured, publish_as
-from experiments.runner.jobs.limits import TIME_LIMIT_S
-from experiments.runner.jobs.request import Request
-from experiments.runner.planning.plan import Plan, PlannedJob
+from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
+from experiments.runner.plan import Plan, earlier
 from mvest.errors import ConfigurationError
-
-HASH_DIGITS = 16
-"""Digits of its hash by which a job's folder is named."""
-
-SUBDIR = "hydra.sweep.subdir"
-"""The setting by which a user names the folders of jobs otherwise."""
 
 
 def expand(config: DictConfig, arguments: Sequence[str], loader: ConfigLoader) -> list[list[str]]:
@@ -92,47 +86,60 @@ def make_plan(
     """
     swept = config.hydra.sweeper.get("params") or {}
     # As they were typed: an interpolation in them means something in a job only.
-    typed: Any = OmegaConf.to_container(config.hydra.overrides)
-    named = any(line.partition("=")[0] == SUBDIR for line in typed["hydra"])
-    compose = _Composer(config, loader, reuse=not named)
-    varied = _varied(config, typed["task"], jobs, loader)
-    planned: list[PlannedJob] = []
-    common: dict[str, Any] = {}
-    for number, overrides in enumerate(jobs, first):
-        composed = compose(overrides)
+    typed: Any = OmegaConf.to_container(config.hydra.overrides.task)
+    parser = OverridesParser.create(config_loader=loader)
+    varied = _varied(config, typed, jobs, parser)
+    named: Any = OmegaConf.to_container(config.hydra.sweep)
+    by_hash = named["subdir"] == "${config_hash:}"
+    parse = cache(lambda line: parser.parse_overrides([line])[0])
+    is_group = cache(lambda name: bool(loader.get_group_options(name)))
+    merged: dict[tuple[str, ...], DictConfig] = {}
+    planned: list[Request] = []
+    for number, overrides in enumerate(tqdm(jobs, "composing", disable=None, leave=False), first):
+        parsed = {one.get_key_element(): one for one in map(parse, overrides)}
+        # Hydra merges files for a tenth of a second. What it merges follows from all but the
+        # values; those are set in what was merged for an earlier job that sets the same ones.
+        settings = [
+            one for one in parsed.values() if _sets_value(one) and not is_group(one.key_or_group)
+        ]
+        kind = tuple(
+            str(one.key_or_group if one in settings else one.input_line) for one in parsed.values()
+        )
+        if kind in merged:
+            for one in settings:
+                OmegaConf.update(merged[kind], one.key_or_group, one.value())
+        else:
+            merged[kind] = loader.load_sweep_config(config, list(overrides))
+            HydraConfig.instance().set_config(merged[kind])
+        composed = merged[kind]
         values = plain(composed)
         # Null takes the limit away; the default holds where nothing is said.
-        if values["time_limit_s"] is None and not any(
-            line.partition("=")[0] == "time_limit_s" for line in overrides
-        ):
+        if values["time_limit_s"] is None and "time_limit_s" not in parsed:
             values["time_limit_s"] = TIME_LIMIT_S
         values["factors"] = {
-            **{key: value for key, value in compose.values.items() if key in varied},
+            **{key: _factor(one) for key, one in parsed.items() if key in varied},
             **values["factors"],
         }
+        # Many configurations fit into memory where they share what is alike in them.
+        shared = planned[0].values if planned else {}
+        for key in values.keys() & shared.keys():
+            # 1 and 1.0 are not written alike.
+            if json.dumps(values[key]) == json.dumps(shared[key]):
+                values[key] = shared[key]
         config_hash = hash_of(values)
-        subdir = config_hash[:HASH_DIGITS]
-        if named:
-            with read_write(composed.hydra), open_dict(composed.hydra):
-                composed.hydra.job.id = composed.hydra.job.num = number
-            subdir = str(composed.hydra.sweep.subdir)
-        # Ten thousand configurations fit into memory where they share what is alike in them.
-        common = common or values
-        values = {
-            key: common[key] if key in common and _same(common[key], value) else value
-            for key, value in values.items()
-        }
+        with read_write(composed.hydra), open_dict(composed.hydra):
+            composed.hydra.job.id = composed.hydra.job.num = number
+        subdir = config_hash[:HASH_DIGITS] if by_hash else str(composed.hydra.sweep.subdir)
         folder = Path(str(composed.hydra.sweep.dir)) / subdir
         published = publish_as(values, overrides, swept)
-        planned.append(
-            PlannedJob.of(Request(values, config_hash, folder, published, tuple(overrides)))
-        )
+        planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
     sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
         name=str(config.name),
         folder=Path(str(config.hydra.sweep.dir)),
         sweep=sweep,
         jobs=tuple(planned),
+        before=earlier(planned),
         workers=workers,
         publish=as_configured(config) if config.publish and sweep else None,
     )
@@ -154,56 +161,19 @@ def _grids(config: DictConfig) -> list[dict[str, Any]]:
     return listed
 
 
-class _Composer:
-    """Composes jobs; those that choose from the same groups differ in values only.
-
-    Hydra merges all files and schemas anew for each job, for a tenth of a second. What it merges
-    follows from the choices of groups; values are set in what was merged for the job before, which
-    set the same ones.
-    """
-
-    def __init__(self, config: DictConfig, loader: ConfigLoader, reuse: bool) -> None:
-        self._config, self._loader, self._reuse = config, loader, reuse
-        parser = OverridesParser.create(config_loader=loader)
-        self._parse = cache(lambda line: parser.parse_overrides([line])[0])
-        self._merged: dict[tuple[str, ...], DictConfig] = {}
-        self.values: dict[str, Any] = {}
-        self._is_group = cache(lambda key: bool(loader.get_group_options(key)))
-
-    def __call__(self, overrides: Sequence[str]) -> DictConfig:
-        """A job's configuration, which the next one may overwrite."""
-        parsed = [self._parse(line) for line in overrides]
-        self.values = {one.get_key_element(): _factor(one) for one in parsed}
-        values = [override for override in parsed if self._sets_value(override)]
-        kind = tuple(str(one.key_or_group if one in values else one.input_line) for one in parsed)
-        composed = self._merged.get(kind) if self._reuse else None
-        if composed is None:
-            composed = self._loader.load_sweep_config(self._config, list(overrides))
-            HydraConfig.instance().set_config(composed)
-            self._merged[kind] = composed
-        else:
-            for override in values:
-                OmegaConf.update(composed, override.key_or_group, override.value())
-        return composed
-
-    def _sets_value(self, override: Override) -> bool:
-        return (
-            override.type == OverrideType.CHANGE
-            and override.package is None
-            # A mapping is merged with what is there.
-            and not isinstance(override.value(), dict)
-            and not self._is_group(override.key_or_group)
-        )
+def _sets_value(override: Override) -> bool:
+    """Whether an override sets a single value of a setting, and merges nothing."""
+    changes = override.type == OverrideType.CHANGE and override.package is None
+    return changes and not isinstance(override.value(), dict)
 
 
 def _varied(
-    config: DictConfig, typed: list[str], jobs: Sequence[Sequence[str]], loader: ConfigLoader
+    config: DictConfig, typed: list[str], jobs: Sequence[Sequence[str]], parser: OverridesParser
 ) -> set[str]:
     """Settings that are varied and that become factors of the jobs.
 
     What a sweep's own grid varies is left out: its configuration names factors itself.
     """
-    parser = OverridesParser.create(config_loader=loader)
     swept = parser.parse_overrides(typed)
     first = set(jobs[0]) if jobs else set()
     lines = {line for overrides in jobs for line in first.symmetric_difference(overrides)}
@@ -217,8 +187,3 @@ def _factor(override: Override) -> Any:
     """The value of an override as a factor: a number, or the text that was typed."""
     value = override.value()
     return value if isinstance(value, int | float) else override.get_value_element_as_str()
-
-
-def _same(one: Any, other: Any) -> bool:
-    """Whether they are written alike; 1 and 1.0 are not."""
-    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)

@@ -12,9 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.parse import quote
 
-from experiments.runner.planning.plan import PLAN
-from experiments.runner.tracking.log import PARENT, runs_of
-from experiments.runner.tracking.store import MANNERS, opened
+from experiments.runner.plan import PLAN
+from experiments.runner.tracking import MANNERS, PARENT, opened, runs_of
 from mvest.errors import InputError
 from mvest.processes import Program, environment, python
 from mvest.reading.documents import read_mapping

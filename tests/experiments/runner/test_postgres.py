@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.records.metrics import metrics
 from experiments.common.records.record import read_record
-from experiments.runner.collecting.compared import HANDFUL
-from tests.experiments.runner.tracking.test_tracking import make_config, make_job
+from experiments.runner.compared import HANDFUL, metrics
+from tests.experiments.runner.test_tracking import make_config, make_job
 from tests.places import ROOT
 
 pytestmark = pytest.mark.slow
@@ -27,7 +26,7 @@ UPLOAD = """
 import json
 import sys
 from pathlib import Path
-from experiments.runner.tracking.log import log_run
+from experiments.runner.tracking import log_run
 config, *jobs = sys.argv[1:]
 for job in jobs:
     log_run(Path(job), json.loads(config))

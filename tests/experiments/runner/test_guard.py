@@ -16,16 +16,16 @@ import pytest
 
 from experiments.common.records.record import VERSION, Record, stamp, write_record
 from experiments.common.study import Result
-from experiments.runner.execution import guard
-from experiments.runner.execution import worker as child
-from experiments.runner.execution.guard import WorkerProcess, run_apart
-from experiments.runner.jobs.folder import (
+from experiments.runner import engine
+from experiments.runner import job as child
+from experiments.runner.engine import WorkerProcess, run_apart
+from experiments.runner.jobs import (
+    Request,
     is_done,
     last_record,
     lock,
     mark_done,
 )
-from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import THREAD_VARIABLES, sealed, write_json
 from tests.places import ROOT
@@ -178,7 +178,7 @@ def test_a_process_that_cannot_be_started_is_one_clear_line(worker, tmp_path, mo
     def fails(*_, **__):
         raise OSError(errno.EMFILE, "Too many open files")
 
-    monkeypatch.setattr(guard, "Program", fails)
+    monkeypatch.setattr(engine, "Program", fails)
     with pytest.raises(InputError) as refused:
         run_apart(request(tmp_path), worker)
     assert str(refused.value) == f"no process for {tmp_path}: Too many open files"
@@ -260,7 +260,7 @@ def test_a_damaged_result_is_none(worker, tmp_path, content):
 
 def test_a_second_process_says_that_it_waits_for_the_folder(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from experiments.runner.jobs.folder import lock\n"
+        "import sys; from pathlib import Path; from experiments.runner.jobs import lock\n"
         "with lock(Path(sys.argv[1])): print('in', flush=True); sys.stdin.read()"
     )
 
@@ -307,7 +307,7 @@ LONG = """
 import os, sys
 from pathlib import Path
 from dataclasses import replace
-from experiments.runner.execution import worker
+from experiments.runner import job as worker
 from experiments.studies import twin
 def run(job):
     Path("pid").write_text(str(os.getpid()))
@@ -322,8 +322,8 @@ worker.main()
 def test_a_process_ends_with_the_one_that_started_it(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
-        "from experiments.runner.execution.guard import WorkerProcess\n"
-        "from tests.experiments.runner.execution.test_guard import request\n"
+        "from experiments.runner.engine import WorkerProcess\n"
+        "from tests.experiments.runner.test_guard import request\n"
         "WorkerProcess((sys.executable, 'long.py')).run(request(Path.cwd()))"
     )
     (tmp_path / "long.py").write_text(LONG)

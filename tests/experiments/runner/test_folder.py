@@ -10,10 +10,10 @@ import yaml
 from experiments.common.records import record as records
 from experiments.common.records.record import FIELDS
 from experiments.common.study import Result
-from experiments.runner.jobs import folder as jobs
-from experiments.runner.jobs.request import Request
+from experiments.runner import jobs
+from experiments.runner.jobs import Request
 from mvest.files import PREFIX
-from tests.experiments.runner.execution import test_guard
+from tests.experiments.runner import test_guard
 
 
 def request(folder: Path, force: bool = False) -> Request:

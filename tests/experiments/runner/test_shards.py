@@ -11,13 +11,13 @@ import pytest
 
 from experiments import cli
 from experiments.run import main
-from experiments.runner.execution import guard
-from experiments.runner.planning.plan import Plan
+from experiments.runner import engine
+from experiments.runner.plan import Plan
 from experiments.sweeps.collected import read_sweep
 from mvest.errors import InputError
 from tests.places import ROOT
 
-FAKE = str(Path(__file__).parents[1] / "fake_worker.py")
+FAKE = str(Path(__file__).parents[0] / "fake_worker.py")
 PLAN = (
     "sweep=debug", "filter.initial=[5,3]", "sweep.small.seed='range(0,12)'", "detach=true",
     "tracking.enabled=false",
@@ -30,8 +30,8 @@ import sys
 # Tests run in the background of a shell inherit that an interrupt is ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from experiments import cli
-from experiments.runner.execution import guard
-guard.WORKER = (sys.executable, sys.argv.pop(1))
+from experiments.runner import engine
+engine.WORKER = (sys.executable, sys.argv.pop(1))
 sys.exit(cli.main(sys.argv[1:]))
 """
 """``mvest`` whose jobs take no time."""
@@ -41,7 +41,7 @@ sys.exit(cli.main(sys.argv[1:]))
 def planned(tmp_path, monkeypatch, capsys):
     """A sweep of twelve jobs, planned in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(guard, "WORKER", (sys.executable, FAKE))
+    monkeypatch.setattr(engine, "WORKER", (sys.executable, FAKE))
     monkeypatch.setattr(sys, "argv", ["experiments.run", *PLAN])
     assert main() == 0
     assert "mvest worker outputs/sweep_debug --shard I/N" in capsys.readouterr().out
@@ -120,12 +120,12 @@ def test_a_plan_is_read_as_it_was_written(planned, monkeypatch, tmp_path):
     assert [job.values["seed"] for job in read.jobs] == list(range(12))
     for job in read.jobs:
         # What names it follows from its configuration, so all of that came through.
-        assert job.request.config_hash[:16] == job.folder.name
-        assert f"seed={job.values['seed']}" in job.request.overrides
+        assert job.config_hash[:16] == job.folder.name
+        assert f"seed={job.values['seed']}" in job.overrides
         assert cli.Path.cwd() == tmp_path
     from experiments.common.config import hash_of
 
-    hashes = [job.request.config_hash for job in read.jobs]
+    hashes = [job.config_hash for job in read.jobs]
     assert [hash_of(job.values) for job in read.jobs] == hashes
     # From wherever it is read, a job finds its files.
     monkeypatch.chdir("/")

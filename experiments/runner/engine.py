@@ -1,6 +1,8 @@
-"""Runs each job in a worker process, so that a crash costs that job and nothing else.
+"""Runs each job in a worker process, so that a crash, too much time or memory cost that job alone.
 
-A worker runs job after job and is replaced after a crash, or when memory or time ran out.
+A worker runs job after job and is replaced after a crash, or when memory or time ran out. The jobs
+of a sweep run on the threads of this process, or on the workers of a dask cluster (`cluster`);
+both call `execute` for each.
 """
 
 from __future__ import annotations
@@ -9,21 +11,24 @@ import atexit
 import json
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from functools import cache, partial
+from pathlib import Path
 from subprocess import PIPE, TimeoutExpired
 from typing import Any
 
-from experiments.common.records.record import Record
-from experiments.runner.jobs.folder import attempt
-from experiments.runner.jobs.limits import default_memory_gb
-from experiments.runner.jobs.request import Request
-from mvest.errors import ConfigurationError, InputError
+from experiments.common.records.record import Record, stamp
+from experiments.common.study import Result
+from experiments.runner.cluster import EngineSettings, run_on_dask
+from experiments.runner.jobs import Request, attempt, default_memory_gb
+from experiments.sweeps.collected import head_of
+from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.processes import Program, ending, environment, python
 from mvest.provenance import THREAD_VARIABLES
 
-WORKER = python("experiments.runner.execution.worker")
+WORKER = python("experiments.runner.job")
 """Command of a process that runs jobs."""
 
 LEAVE_S = 2.0
@@ -136,3 +141,79 @@ def run_apart(
     """
     run = partial((worker or own_worker()).run, request, at_a_time, aloud=aloud)
     return attempt(request, run, asked_ns)
+
+
+def run_jobs(
+    requests: Sequence[Request], settings: EngineSettings, at_a_time: int, asked_ns: int | None
+) -> Generator[tuple[int, Record]]:
+    """Run jobs; yields the position of each and the head of its record, as they end.
+
+    Closing the iterator early, as an interrupt does, ends the jobs that run; nothing is recorded
+    of them.
+
+    Parameters
+    ----------
+    requests : sequence of Request
+    settings : EngineSettings
+    at_a_time : int
+        Jobs that run on one machine beside each other and share its memory.
+    asked_ns : int or None
+        As in `run_apart`.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such cluster, or it cannot be reached.
+    OSError
+        If dask's scheduler is lost.
+    """
+    if settings.elsewhere:
+        yield from run_on_dask(execute, stop_jobs, requests, settings, asked_ns)
+        return
+    pool = ThreadPoolExecutor(min(at_a_time, len(requests)))
+    futures = {
+        pool.submit(execute, request, asked_ns, at_a_time): k for k, request in enumerate(requests)
+    }
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BaseException:
+        stop_jobs()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_idle: dict[str, list[WorkerProcess]] = {}
+"""Folder in which a process works -> those that have no job."""
+
+_busy: set[WorkerProcess] = set()
+
+
+def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -> Record:
+    """Run a job, unless it is done, in a process that this one keeps for its jobs.
+
+    Whatever becomes of the job is in the head of a record that is returned.
+    """
+    idle = _idle.setdefault(str(Path.cwd()), [])
+    try:
+        worker = idle.pop()
+    except IndexError:
+        worker = WorkerProcess()
+    _busy.add(worker)
+    try:
+        record = run_apart(request, worker, asked_ns, at_a_time)
+    except (MvestError, OSError) as error:
+        # Not even a record of the failure could be written.
+        result = Result(status="failed", reason=str(error))
+        record = stamp(request.values, request.config_hash, result, time.time())
+    finally:
+        _busy.remove(worker)
+    idle.append(worker)
+    return head_of(record)
+
+
+def stop_jobs() -> None:
+    """End the jobs that run in processes of this one; nothing is recorded of them."""
+    for worker in list(_busy):
+        worker.stop()

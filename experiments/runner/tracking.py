@@ -1,32 +1,45 @@
 """Logging to MLflow what is on disk: a run, a sweep, or all outputs (``mvest sync``).
 
 A run of the store with the same result is left, one with another is replaced, a missing one added.
+The store's database is made once.
 """
 
 from __future__ import annotations
 
+import logging
+import os
+import re
+import sqlite3
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
 
+from filelock import FileLock
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from experiments.common.records.metrics import implausible, metrics
 from experiments.common.records.record import read_record
-from experiments.runner.collecting.compared import columns, leaves, text_of, together, typed, varied
-from experiments.runner.jobs.folder import CONFIG, RESULT, is_done
-from experiments.runner.planning.plan import PLAN
-from experiments.runner.tracking.store import ARTIFACTS, opened
+from experiments.runner.compared import (
+    Values,
+    columns,
+    implausible,
+    leaves,
+    metrics,
+    text_of,
+    together,
+    typed,
+    varied,
+)
+from experiments.runner.jobs import CONFIG, RESULT, is_done
+from experiments.runner.plan import PLAN
 from experiments.sweeps.collected import read_sweep
-from mvest.errors import MvestError
+from mvest.errors import ConfigurationError, MvestError
 from mvest.files import sha256_of
 from mvest.reading.documents import read_mapping
-
-Values = Mapping[str, Any]
 
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
 """Files of a sweep: its results; and of a run: what was typed."""
@@ -35,13 +48,89 @@ FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 """Files that MLflow keeps a copy of; of a figure the picture, not its PDF."""
 
 MANY = 1000
-"""Jobs of a sweep above which each is a run of its own only where ``tracking.runs`` asks for it."""
+"""Jobs of a sweep above which only the sweep as a whole is a run."""
 
 Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
 """Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
 
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
+
+MANNERS = {
+    # A server that is away is given up after seconds, not MLflow's minutes.
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+}
+"""Settings of MLflow, unless the user has made them; its server inherits them."""
+
+ARTIFACTS, SQLITE = "mlartifacts", "sqlite:///"
+"""Folder of MLflow's copies of files in the outputs; beginning of a local database's address."""
+
+PASSWORD = re.compile(r"://[^/@:]*:[^/@]+@")
+BROKEN = re.compile(r"malformed|not a database|no such (table|column)|out-of-date database schema")
+"""What SQLite and MLflow say of a file that is no database, damaged, or was never finished."""
+
+
+class TrackingError(MvestError):
+    """The store cannot be opened or written."""
+
+
+def require_no_password(uri: str | None) -> None:
+    """Raise a `ConfigurationError` for an address that has a password."""
+    if uri is not None and PASSWORD.search(uri):
+        raise ConfigurationError(
+            "tracking.uri holds a password, which would be written into every config.json; leave "
+            "it out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
+        )
+
+
+@contextmanager
+def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
+    """MLflow, pointed at a store and an experiment, both made if need be; gives the address.
+
+    Raises
+    ------
+    TrackingError
+        If the store cannot be opened, or be written within: one line that names it.
+    """
+    require_no_password(uri)
+    outputs = outputs.resolve()
+    place = uri or f"{SQLITE}{outputs / 'mlflow.db'}"
+    file = Path(place.removeprefix(SQLITE).partition("?")[0])
+    if is_local := place.startswith(SQLITE):  # also for a server that is started elsewhere
+        place = place.replace(str(file), str(file.resolve()))
+    for name, value in MANNERS.items():
+        os.environ.setdefault(name, value)
+    try:
+        import mlflow
+
+        for name in ("alembic", "mlflow"):
+            logging.getLogger(name).setLevel(logging.ERROR)
+        outputs.mkdir(parents=True, exist_ok=True)
+        # Several processes that open a fresh SQLite database at once would break it.
+        with FileLock(outputs / ".mlflow.lock"):
+            if is_local and file.exists() and file.stat().st_size:
+                # MLflow would ask a broken one again for minutes.
+                address = f"{file.resolve().as_uri()}?mode=ro"
+                with closing(sqlite3.connect(address, 1.0, uri=True)) as database:
+                    database.execute("select * from alembic_version, experiments").fetchone()
+            mlflow.set_tracking_uri(place)
+            if mlflow.get_experiment_by_name(experiment) is None:
+                kept = None if place.startswith("http") else (outputs / ARTIFACTS).as_uri()
+                kind = {"mlflow.experimentKind": "custom_model_development"}
+                mlflow.create_experiment(experiment, kept, kind)
+            mlflow.set_experiment(experiment)
+        yield place
+    except MvestError:
+        raise
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        if is_local and BROKEN.search(str(error)):
+            raise TrackingError(f"{file} is broken ({reason}): remove it") from error
+        reason = "database is locked" if "locked" in reason else reason
+        raise TrackingError(f"tracking store {place}: {reason}") from error
 
 
 def log_run(folder: Path, config: Values) -> None:
@@ -88,7 +177,7 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     is_sweep = (folder / PLAN).is_file()
     alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
     plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
-    each = len(plan["jobs"]) <= MANY if tracking.get("runs") is None else tracking["runs"]
+    each = len(plan["jobs"]) <= MANY
     words = typed(word for job in plan["jobs"] for word in job["overrides"])
     entries, rows, factors = [], [], []
     for job in plan["jobs"]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 REPORT = """
-from experiments.runner.jobs.limits import held_memory
+from experiments.runner.jobs import held_memory
 with held_memory(1.5):
     import pandas
     pandas.DataFrame({"name": ["a", "b"]}).to_csv()

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from uuid import uuid4
 
 from experiments.common.records.record import Record
-from experiments.interruption import ASKING
-from experiments.runner.jobs.folder import write_failure
-from experiments.runner.jobs.request import Request
+from experiments.console import ASKING
+from experiments.runner.jobs import Request, write_failure
 from mvest.errors import ConfigurationError
 from mvest.files import require_writable
 from mvest.processes import environment, python
@@ -35,9 +34,6 @@ Execute = Callable[[Request, int | None, int], Record]
 
 LOCAL, LOOPBACK = "LocalCluster", "127.0.0.1"
 """Dask's cluster of this machine, and where it listens."""
-
-WHERE, TLS = ("address", "scheduler_file", "cluster"), ("ca_file", "cert", "key")
-"""Settings that name a cluster; files of a ``tls://`` address."""
 
 CONNECT_S, START_S = 15, 60
 """Seconds within which a scheduler answers, and the first worker on this machine is there."""
@@ -54,9 +50,6 @@ DASK = {
 }
 """Settings of dask for jobs in processes of their own."""
 
-AT_ONCE = 500
-"""Jobs that are sent to dask's scheduler in one message."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineSettings:
@@ -64,8 +57,6 @@ class EngineSettings:
 
     n_jobs: Annotated[int, within(-1024, 1024, "", "jobs; -1: one for each core")] = -1
     address: str | None = None
-    scheduler_file: str | None = None
-    tls: dict[str, str] | None = None
     cluster: str | None = None
     options: dict[str, Any] | None = None
     jobs: Annotated[int, within(1, 100_000, "", "workers")] = 1
@@ -81,7 +72,7 @@ class EngineSettings:
     @property
     def elsewhere(self) -> bool:
         """Whether dask runs the jobs."""
-        return any(getattr(self, name) for name in WHERE)
+        return bool(self.address or self.cluster)
 
 
 def run_on_dask(
@@ -116,7 +107,6 @@ def run_on_dask(
             at_a_time=settings.jobs if settings.cluster == LOCAL else 1,
             key=[(group, k) for k in range(len(requests))],
             pure=False,
-            batch_size=AT_ONCE,
         )
         places = {future.key: k for k, future in enumerate(futures)}
         for future, record in as_completed(futures, with_results=True, raise_errors=False):
@@ -155,19 +145,11 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
     ConfigurationError
         If there is none.
     """
-    from distributed import Client, Security
+    from distributed import Client
 
     with ExitStack() as stack:
         try:
             where: Any = settings.address
-            secure = None
-            if settings.tls:
-                secure = Security(
-                    require_encryption=True,
-                    tls_ca_file=settings.tls["ca_file"],
-                    tls_client_cert=settings.tls["cert"],
-                    tls_client_key=settings.tls["key"],
-                )
             if settings.cluster is not None:
                 where = _cluster(settings.cluster, settings.options or {}, folder)
                 stack.callback(_close, where)
@@ -179,20 +161,12 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
                         where.sync(worker.start)
                 if settings.adapt:
                     where.adapt(minimum=0, maximum=settings.jobs)
-            client = stack.enter_context(
-                Client(
-                    where,
-                    scheduler_file=settings.scheduler_file,
-                    security=secure,
-                    timeout=CONNECT_S,
-                )
-            )
+            client = stack.enter_context(Client(where, timeout=CONNECT_S))
             if settings.cluster == LOCAL:
                 # With wrong options it would start workers without end.
                 client.wait_for_workers(1, START_S)
         except (OSError, RuntimeError, ValueError, TypeError, KeyError, ImportError) as error:
-            name = settings.cluster or settings.address or settings.scheduler_file
-            why = one_line(error, 300)
+            name, why = settings.cluster or settings.address, one_line(error, 300)
             raise ConfigurationError(f"hydra.launcher: no cluster {name}: {why}") from error
         try:
             yield client
@@ -220,16 +194,8 @@ def require_engine(settings: EngineSettings) -> None:
     """
     if settings.n_jobs == 0:
         raise ConfigurationError("hydra.launcher.n_jobs = 0, expected 1 or more; -1: one each core")
-    named = [name for name in WHERE if getattr(settings, name)]
-    if len(named) > 1:
-        raise ConfigurationError(f"hydra.launcher: {' and '.join(named)}, expected one of them")
-    if settings.tls is not None and set(settings.tls) != set(TLS):
-        raise ConfigurationError(f"hydra.launcher.tls: expected {', '.join(TLS)}")
-    files = {f"tls.{name}": file for name, file in (settings.tls or {}).items()}
-    for name, file in {"scheduler_file": settings.scheduler_file, **files}.items():
-        # Dask would wait for the one without end, and name none of the others.
-        if file and not Path(file).is_file():
-            raise ConfigurationError(f"hydra.launcher.{name} = {file}: no such file")
+    if settings.address and settings.cluster:
+        raise ConfigurationError("hydra.launcher: address and cluster, expected one of them")
     if settings.elsewhere:
         try:
             import distributed  # noqa: F401

@@ -17,16 +17,13 @@ import mlflow
 import pytest
 
 from experiments.cli import main
-from experiments.common.records.metrics import implausible, metrics
 from experiments.common.records.record import Record, write_record
-from experiments.runner.collecting import compared
-from experiments.runner.jobs.folder import mark_done
-from experiments.runner.jobs.request import Request
-from experiments.runner.planning.plan import Plan, PlannedJob
-from experiments.runner.tracking import log
-from experiments.runner.tracking.dashboard import last_sweep
-from experiments.runner.tracking.log import log_run, log_sweep, runs_of
-from experiments.runner.tracking.store import opened, require_no_password
+from experiments.runner import compared, tracking
+from experiments.runner.compared import implausible, metrics
+from experiments.runner.dashboard import last_sweep
+from experiments.runner.jobs import Request, mark_done
+from experiments.runner.plan import Plan
+from experiments.runner.tracking import log_run, log_sweep, opened, require_no_password, runs_of
 from experiments.sweeps.collected import Sweep, SweptJob, write_sweep_file
 from mvest.errors import ConfigurationError, InputError
 from mvest.problem.record import EstimateRecord, Spread, Unknown
@@ -155,10 +152,10 @@ def make_sweep(outputs: Path, **jobs: dict) -> Path:
         start = f"[{','.join(f'{value:g}' for value in config['filter']['initial'])}]"
         words = (f"filter.initial={start}", f"seed={config['seed']}", "+experiment=debug")
         request = Request(config, (name * 64)[:64], folder / name, None, words)
-        planned.append(PlannedJob(request))
+        planned.append(request)
         record = make_record((name * 64)[:64], seconds_total=3.0, **changes)
         swept.append(SweptJob(hash=(name * 64)[:16], seed=1, record=record))
-    Plan("debug", folder, {}, tuple(planned), 1).write()
+    Plan("debug", folder, {}, tuple(planned)).write()
     head = {"name": "debug", "title": "A quick check", "parameters": NAMES, "provenance": SOURCE}
     write_sweep_file(folder / "sweep.json", Sweep(**head, jobs=tuple(swept)))
     return folder
@@ -377,21 +374,18 @@ def test_the_comparison_hides_what_failed_or_makes_no_sense(tmp_path, monkeypatc
     assert [name for name, run in jobs.items() if run.info.run_id in page] == ["b", "a"]
     assert "60" in jobs["c"].data.params.get("x", "60"), "it stays in the store"
     # Too many are listed, by the same choice.
-    monkeypatch.setattr("experiments.runner.tracking.dashboard.MOST", 1)
+    monkeypatch.setattr("experiments.runner.dashboard.MOST", 1)
     assert "plausible%20%3D%20%27yes%27" in last_sweep(tmp_path)[1]
 
 
-def test_of_very_many_jobs_only_the_whole_is_a_run_unless_asked(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(log, "MANY", 1)
+def test_of_very_many_jobs_only_the_whole_is_a_run(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(tracking, "MANY", 1)
     folder = make_sweep(tmp_path, a=started(5.0, 3.0), b=started(4.0, 3.0))
     log_sweep(folder, make_config(tmp_path))
     whole = whole_of(tmp_path)
     assert jobs_in(tmp_path) == {}
     assert whole.data.params["filter.initial"] == "[5,3],[4,3]"
     assert last_sweep(tmp_path)[1].endswith(f"/runs/{whole.info.run_id}")
-    asked = {"enabled": True, "uri": None, "runs": True}
-    log_sweep(folder, make_config(tmp_path, tracking=asked))
-    assert set(jobs_in(tmp_path)) == {"a", "b"}
 
 
 # --- `mvest sync`, and stores that fail ---------------------------------------------------------
@@ -487,7 +481,7 @@ def test_a_password_is_not_written_down() -> None:
 
 MAKE = """
 from pathlib import Path
-from experiments.runner.tracking.store import opened
+from experiments.runner.tracking import opened
 with opened(None, Path("fresh"), "debug"):
     pass
 """

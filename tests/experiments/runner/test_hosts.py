@@ -6,7 +6,7 @@ import pytest
 from mlflow.server.security_utils import is_allowed_host_header
 
 from experiments.cli import main
-from experiments.runner.tracking import dashboard
+from experiments.runner import dashboard
 from mvest.errors import InputError
 
 OWN = ("127.0.0.1:5000", "localhost:5000", "[::1]:5000", "mvest.localhost:5000")

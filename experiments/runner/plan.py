@@ -1,0 +1,278 @@
+"""What a sweep will run: its jobs, which are done, how long the others take, what all ended with.
+
+``plan.json`` in the sweep's folder is all that is needed to work on it: by shards under any
+scheduler (`Plan.read`), by MLflow, and by the same command when it goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import uuid
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from experiments.common.progress import duration
+from experiments.common.records.record import Record, here_and_now, stamp
+from experiments.common.study import Result
+from experiments.runner.jobs import Request, last_record
+from experiments.sweeps.collected import Sweep, SweptJob, head_of
+from mvest.errors import ConfigurationError, InputError
+from mvest.provenance import config_hash, git_state, write_json
+from mvest.reading.documents import read_mapping
+from mvest.reading.text import one_line
+
+PLAN = "plan.json"
+"""File in a sweep's folder with the jobs that it consists of."""
+
+NOT_COMMON = ("factors", "paths", "tracking", "sweep")
+"""Settings that jobs do not have in common, or that belong to a machine or the runner."""
+
+NOT_RUN = "not run"
+"""Reason of a job that never began or was interrupted."""
+
+
+def earlier(jobs: Iterable[Request]) -> dict[str, Record]:
+    """Hash of a configuration -> head of the record of the last attempt, of jobs that have one."""
+    records = ((job.config_hash, last_record(job.folder, job.config_hash)) for job in jobs)
+    return {key: head_of(record) for key, record in records if record is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All jobs of a sweep, in order.
+
+    Attributes
+    ----------
+    name : str
+        Of the configuration.
+    folder : Path
+        Of the sweep.
+    sweep : dict
+        The configuration's ``sweep``, empty for jobs swept on the command line.
+    jobs : tuple of Request
+    before : mapping
+        What earlier attempts ended with, see `earlier`.
+    workers : int
+        Jobs that run at a time; 1 where it is not known.
+    publish : bool or None
+        Whether the results take the sweep over; None: they are not to.
+    written_ns : int or None
+        When the plan was written; None: it was not.
+    """
+
+    name: str
+    folder: Path
+    sweep: dict[str, Any]
+    jobs: tuple[Request, ...]
+    before: Mapping[str, Record] = field(default_factory=dict)
+    workers: int = 1
+    publish: bool | None = None
+    written_ns: int | None = None
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """A configuration, for what all jobs share: where to write, track and publish."""
+        return self.jobs[0].values
+
+    @property
+    def done(self) -> dict[str, Record]:
+        """Of the earlier attempts those with a result."""
+        return {key: record for key, record in self.before.items() if record.converged}
+
+    @property
+    def to_run(self) -> list[Request]:
+        """Jobs that are missing, have failed, or are to be run again."""
+        done = self.done
+        return [job for job in self.jobs if job.values["force"] or job.config_hash not in done]
+
+    def require_different(self) -> None:
+        """Refuse a plan with the same job twice, or with two jobs in one folder.
+
+        Raises
+        ------
+        ConfigurationError
+            The message names both.
+        """
+        first: dict[Path, Request] = {}
+        for job in self.jobs:
+            other = first.setdefault(job.folder.resolve(), job)
+            if other is not job:
+                same = other.config_hash == job.config_hash
+                what = "are one and the same" if same else f"have one folder, {job.folder}"
+                raise ConfigurationError(
+                    f"two jobs {what}: {' '.join(other.overrides)} and {' '.join(job.overrides)}"
+                )
+
+    def write(self) -> Plan:
+        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written.
+
+        Of the configurations the first one is written whole, of the others what differs.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        created = time.gmtime()
+        jobs = [
+            job.to_json()
+            | {
+                "hash": job.short_hash,
+                "folder": os.path.relpath(job.folder, self.folder),
+                "name": name,
+                "factors": job.values["factors"],
+                "values": {k: v for k, v in job.values.items() if v is not self.common.get(k, job)},
+                "without": [key for key in self.common if key not in job.values],
+            }
+            for job, name in zip(self.jobs, self.names(), strict=True)
+        ]
+        sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
+        try:
+            before = read_mapping(self.folder / PLAN)
+            # The same jobs, perhaps with more of them, are the same sweep that goes on.
+            if {job["hash"] for job in before["jobs"]} <= {job["hash"] for job in jobs}:
+                sweep_id = before["sweep_id"]
+        except (InputError, KeyError, TypeError):
+            # The first sweep here.
+            pass
+        write_json(
+            self.folder / PLAN,
+            {
+                "sweep": self.sweep.get("name", self.name),
+                "size": self.sweep.get("size"),
+                "sweep_id": sweep_id,
+                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", created),
+                "name": self.name,
+                "settings": self.sweep,
+                "publish": self.publish,
+                # Paths in a configuration are relative to where the command was typed.
+                "directory": Path.cwd(),
+                "values": self.common,
+                "jobs": jobs,
+            },
+        )
+        return replace(self, written_ns=(self.folder / PLAN).stat().st_mtime_ns)
+
+    @classmethod
+    def read(cls, folder: Path, *, look: bool = True) -> Plan:
+        """The plan in a sweep's folder; ``look`` reads what earlier attempts ended with.
+
+        The process then works where the sweep was planned.
+
+        Raises
+        ------
+        InputError
+            If there is none, or it was written by another version or on another machine.
+        """
+        place = folder.resolve() / PLAN
+        if not place.is_file():
+            raise InputError(f"no sweep is planned in {folder}")
+        try:
+            data = read_mapping(place)
+            directory = str(data["directory"])
+            if not os.access(directory, os.X_OK):
+                raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
+            os.chdir(directory)
+            common = data["values"]
+            requests = [
+                Request(
+                    {k: v for k, v in common.items() if k not in job["without"]} | job["values"],
+                    job["config_hash"],
+                    place.parent / job["folder"],
+                    job["publish_as"],
+                    tuple(job["overrides"]),
+                )
+                for job in data["jobs"]
+            ]
+            return cls(
+                data["name"],
+                place.parent,
+                data["settings"],
+                tuple(requests),
+                earlier(requests) if look else {},
+                publish=data["publish"],
+                written_ns=place.stat().st_mtime_ns,
+            )
+        except OSError as error:
+            raise InputError(f"no sweep is planned in {folder}: {error}") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            why = one_line(error, 160)
+            raise InputError(f"{place} is no plan of this version: {why}") from error
+
+    def names(self) -> list[str]:
+        """What sets each job apart, in a few words: the factors in which jobs differ."""
+        factors = [[f"{k}={v}" for k, v in job.values["factors"].items()] for job in self.jobs]
+        shared = set(factors[0]).intersection(*factors) if len(factors) > 1 else set()
+        found = [", ".join(text for text in texts if text not in shared) for texts in factors]
+        return [name or str(job.values["row"]) for name, job in zip(found, self.jobs, strict=True)]
+
+    def summary(self) -> str:
+        """How much is done, how much is left and how long it will take, in one line."""
+        left, done = len(self.to_run), self.done
+        failed, size = len(self.before) - len(done), self.sweep.get("size")
+        present = git_state(Path(__file__).resolve().parent)["sha"]
+        stale = sum(record.provenance.git.sha != present for record in done.values())
+        takes = "nothing left"
+        if left and done:
+            mean = fmean(record.seconds_total for record in done.values())
+            total = duration(mean * left / min(self.workers, left))
+            takes = f"about {total}, {self.workers} at a time"
+        elif left:
+            takes = "time unknown: no job has finished yet"
+        remark = f" ({stale} of the done ones by another commit; force=true redoes)"
+        return (
+            f"{self.name}{f' ({size})' if size else ''}: {len(self.jobs)} jobs, {len(done)} done, "
+            f"{failed} failed before, {left} to run{remark if stale else ''}; {takes}"
+        )
+
+    def listing(self) -> str:
+        """Every job with its state, one line each."""
+        left, lines = {job.config_hash for job in self.to_run}, []
+        for job in self.jobs:
+            state = "run " if job.config_hash in left else "done"
+            last = self.before.get(job.config_hash)
+            failed = f"  [failed before: {last.reason}]" if last and not last.converged else ""
+            lines.append(f"  {state}  {job.short_hash}  {job.label}{failed}")
+        return "\n".join(lines)
+
+    def collect(self, ended: Mapping[str, Record]) -> Sweep:
+        """What all jobs gave, in their order, failed and missing ones included.
+
+        Parameters
+        ----------
+        ended : mapping
+            Hash of a configuration -> head of the record of a job that has just been run.
+        """
+        known = {**self.before, **ended}
+        records = [known[job.config_hash] for job in self.jobs if job.config_hash in known]
+        sources = [record.provenance for record in records]
+        first = self.common
+        return Sweep(
+            name=str(self.sweep.get("name", self.name)),
+            size=self.sweep.get("size"),
+            title=first["title"],
+            parameters=tuple(first["parameters"]),
+            paper=first["paper"],
+            provenance=here_and_now(
+                config_hash({"jobs": [job.config_hash for job in self.jobs]}),
+                next((one.mesh_hash for one in sources if one.mesh_hash != "none"), "none"),
+                first["seed"],
+            ),
+            commits=tuple(sorted({str(one.git.sha) for one in sources})),
+            settings={key: value for key, value in first.items() if key not in NOT_COMMON},
+            jobs=tuple(_swept(job, known.get(job.config_hash)) for job in self.jobs),
+        )
+
+
+def _swept(job: Request, record: Record | None) -> SweptJob:
+    values = job.values
+    if record is None:
+        result = Result(status="failed", reason=NOT_RUN)
+        record = stamp(values, job.config_hash, result, time.time())
+    return SweptJob(
+        hash=job.short_hash,
+        seed=values["seed"],
+        repeats=values["repeats"],
+        # One that was computed for another sweep has the factors of that.
+        record=record.model_copy(update={"factors": values["factors"]}),
+    )

@@ -1,1 +1,0 @@
-"""What a sweep will run: its jobs, composed, with those that are done and the time they take."""

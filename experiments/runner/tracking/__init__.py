@@ -1,1 +1,0 @@
-"""MLflow: its store, what is uploaded to it, and its pages."""
