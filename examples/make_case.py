@@ -1,10 +1,10 @@
 """The case in ``examples/case``, made anew: ``make_case.py FOLDER``.
 
-A simulated valve, open and closed under 120 mmHg on a finer mesh than an estimation uses. Its closed
-frame is seen with errors of 0.5 mm that are alike over 10 mm. The true moduli are the generic ones
-times 1.2 and 0.8. They are written beside the folder (``FOLDER_truth.txt``), where no estimation
-looks. Only the least is written into it: two surfaces, the papillary tips, the pressures and the
-size of the errors; whoever reads the case derives the rest.
+A simulated valve, open and closed under 120 mmHg on a finer mesh than an estimation uses. Its
+closed frame is seen with errors of 0.5 mm that are alike over 10 mm. The true moduli are the
+generic ones times 1.2 and 0.8. They are written beside the folder (``FOLDER_truth.txt``), where no
+estimation looks. Only the least is written into it: two surfaces, the papillary tips, the pressures
+and the size of the errors; whoever reads the case derives the rest.
 """
 
 import sys
