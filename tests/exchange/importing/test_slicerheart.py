@@ -277,12 +277,41 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
 
 
-def test_two_folders_of_valve_fem_export_are_the_open_and_the_closed_frame(tmp_path):
-    frames = [TRUTH.frame(Role.REFERENCE), TRUTH.frame(Role.CLOSED)]
-    folders = [fem_export(tmp_path / frame.name, frame) for frame in frames]
-    tips = frames[0].papillary_tips
-    tips = tuple(in_lps(tips[np.argsort(tips[:, 0])]).ravel())
-    options = SlicerheartOptions(closed=str(folders[1]), pressure_mmHg=100.0, tips=tips)
-    case = import_slicerheart(folders[0], options)
-    for frame in frames:
-        assert np.sqrt(np.mean(away(case.frame(frame.role), frame) ** 2)) < 0.05
+@pytest.fixture(scope="module")
+def fem(tmp_path_factory):
+    return fem_export(
+        tmp_path_factory.mktemp("fem") / "open", TRUTH.frame(Role.REFERENCE), TRUTH.chordae
+    )
+
+
+def test_a_folder_of_valve_fem_export_brings_its_chords(fem):
+    case, truth = import_slicerheart(fem, SlicerheartOptions()), TRUTH.chordae
+    reference, found = TRUTH.frame(Role.REFERENCE), case.chordae
+    assert np.sqrt(np.mean(away(case.frame(Role.REFERENCE), reference) ** 2)) < 0.05
+    # Files of text have six digits.
+    nearest = np.linalg.norm(in_lps(truth.insertion)[:, None] - found.insertion, axis=2)
+    assert nearest.min(axis=1).max() < 1e-2
+    same = nearest.argmin(axis=1)
+    assert sorted(same) == list(range(len(found)))
+    tips = case.frame(Role.REFERENCE).papillary_tips
+    begins = in_lps(reference.papillary_tips)
+    assert tips[found.tip[same]] == pytest.approx(begins[truth.tip], abs=1e-2)
+    assert tips[0, 0] > tips[1, 0]
+    lengths = np.linalg.norm(truth.insertion - reference.papillary_tips[truth.tip], axis=1)
+    assert found.rest_length[same] == pytest.approx(lengths, abs=1e-2)
+    named = [np.array(chordae.family_names)[chordae.family] for chordae in (found, truth)]
+    assert np.array_equal(named[0][same], named[1])
+    assert found.axial_stiffness.sum() == pytest.approx(truth.axial_stiffness.sum())
+    assert f"chordae: {len(truth)} of the export" in " | ".join(case.derived)
+
+
+def test_chords_that_begin_elsewhere_than_at_the_tips_are_refused(fem):
+    tips = import_slicerheart(fem, SlicerheartOptions()).frame(Role.REFERENCE).papillary_tips
+    moved = tuple((tips + 5.0 * np.eye(3)[2]).ravel())
+    refused(fem, "chords begin up to 5.0 mm from the papillary tips, expected 3 mm", tips=moved)
+
+
+def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(fem, tmp_path):
+    closed = fem_export(tmp_path / "closed", TRUTH.frame(Role.CLOSED))
+    case = import_slicerheart(fem, SlicerheartOptions(closed=str(closed), pressure_mmHg=100.0))
+    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), TRUTH.frame(Role.CLOSED)) ** 2)) < 0.05
