@@ -17,7 +17,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.exchange.febio.mesh import FIBRED, NAMES, QUADRILATERAL, FebLaw
+from mvest.exchange.febio.mesh import NAMES, QUADRILATERAL, FebLaw
 from mvest.files import write_atomically
 from mvest.reading.text import read_text
 from mvest.typing import FloatArray, IntArray
@@ -113,11 +113,7 @@ class FebDocument:
             for element in mesh.elements[own][:, order] + 1:
                 number += 1
                 _add(elements, "elem", element, id=number)
-            if law["type"] == FIBRED:
-                _add(material, "fiber", f"fibre_{region}", type="map")
-                self._data("Element", f"fibre_{region}", region, "vec3", mesh.fibre[own][:, order])
-            else:
-                self._axes(mesh, own, region)
+            self._axes(mesh, own, region)
         log = {"data": "x;y;z", "name": "positions", "delim": ","}
         self._log = Xml.Element("node_data", log)
         self._log.text = f"1:{len(self.nodes)}"
@@ -140,7 +136,10 @@ class FebDocument:
         """
         _add(self._at["Mesh"], "NodeSet", nodes + 1, name=name)
         for axis, values in zip(AXES, displacement.T, strict=True):
-            self._data("Node", f"{name}_{axis}", name, "scalar", values)
+            data = _add(self._at["MeshData"], "NodeData", name=f"{name}_{axis}")
+            data.attrib |= {"data_type": "scalar", "node_set": name}
+            for j, value in enumerate(values, start=1):
+                _add(data, "node", value, lid=j)
         if not displacement.any():
             fixed = _add(self._at["Boundary"], "bc", type="zero displacement", node_set=name)
             _fill(fixed, **{f"{axis}_dof": int(axis in axes) for axis in AXES})
@@ -249,13 +248,6 @@ class FebDocument:
         _fill(at, interpolate="LINEAR", extend="CONSTANT")
         _points(at, curve)
         return self._curves
-
-    def _data(self, of: str, name: str, on: str, kind: str, rows: FloatArray) -> None:
-        """Values for each node or element of a set."""
-        set_ = {"Node": "node_set", "Element": "elem_set"}[of]
-        data = _add(self._at["MeshData"], f"{of}Data", name=name, data_type=kind, **{set_: on})
-        for j, row in enumerate(rows, start=1):
-            _add(data, "node" if of == "Node" else "elem", row, lid=j)
 
     def _axes(self, mesh: SolidMesh, own: IntArray, region: str) -> None:
         """The direction of the fibre at the centre of each element."""
