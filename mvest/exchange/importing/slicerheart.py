@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.rims import two_loops
@@ -239,6 +241,8 @@ def _tips_of(
             "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial"
             ", with base, tip and insertion); give tips=[x,y,z,x,y,z] in LPS mm"
         )
+    if before and len(seen.tips) == len(before[0].tips):
+        return seen.tips[linear_sum_assignment(cdist(before[0].tips, seen.tips))[1]]
     return seen.tips
 
 
@@ -317,7 +321,7 @@ def _chordae(
     """
     if not len(seen.chords):
         return []
-    reach = np.linalg.norm(seen.chords[:, 0, None] - reference.tips, axis=2)
+    reach = cdist(seen.chords[:, 0], reference.tips)
     if (away := reach.min(axis=1).max()) > MAX_AWAY:
         raise InputError(
             f"chords begin up to {away:.1f} mm from the papillary tips, expected {MAX_AWAY:g} mm"

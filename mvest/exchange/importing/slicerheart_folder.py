@@ -107,7 +107,8 @@ class SeenPhase:
     landmarks
         ``(3,)`` mm by label, of `LANDMARKS`.
     tips
-        ``(2, 3)`` mm, antero-lateral and postero-medial, or None.
+        ``(2, 3)`` mm, antero-lateral and postero-medial; or ``(t, 3)`` where chords begin, from
+        left to right; or None.
     chords
         ``(c, 2, 3)`` mm, from where each begins to where it ends on a leaflet.
     chord_lengths
@@ -214,7 +215,7 @@ def _read_phase(
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
     chords, lengths = _chords([_model(f, notes) for f in beside if f.words & CHORDS])
     begins = np.unique(chords[:, 0], axis=0)
-    if len(tips) < 2 and len(begins) == 2:
+    if len(tips) < 2 <= len(begins):
         tips = dict(enumerate(begins[::-1]))  # the left one is the antero-lateral one
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:
@@ -224,7 +225,7 @@ def _read_phase(
         surfaces,
         next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
         {label: known[label] for label in LANDMARKS if label in known},
-        np.stack([tips[0], tips[1]]) if len(tips) == 2 else None,
+        np.stack([tips[k] for k in range(len(tips))]) if len(tips) > 1 else None,
         chords,
         lengths,
         tuple(dict.fromkeys(one_line(note) for note in notes)),
@@ -306,7 +307,8 @@ def _chords(models: Sequence[Surface]) -> tuple[FloatArray, FloatArray]:
     """Chords of models of lines, ``(c, 2, 3)`` mm, and their lengths ``(c,)`` mm along these.
 
     Lines run from the papillary muscles to the leaflets, and a branch begins where its trunk ends.
-    A chord leads from a point where no line ends to one where none begins, by the shortest way.
+    A chord begins where no line ends. Each line that ends where none begins is the end of one;
+    lines with the same ends count once.
     """
     parts = [model.vertices[model.segments] for model in models]
     points = np.concatenate([np.zeros((0, 2, 3)), *parts]).reshape(-1, 3)
@@ -315,14 +317,14 @@ def _chords(models: Sequence[Surface]) -> tuple[FloatArray, FloatArray]:
     pairs = np.unique(number.reshape(-1, 2), axis=0)
     begin, end = pairs[pairs[:, 0] != pairs[:, 1]].T
     length = np.linalg.norm(points[first[end]] - points[first[begin]], axis=1)
-    roots, leaves = np.setdiff1d(begin, end), np.setdiff1d(end, begin)
+    roots, last = np.setdiff1d(begin, end), ~np.isin(end, begin)
     if not len(roots):
         return np.zeros((0, 2, 3)), np.zeros(0)
     graph = csr_matrix((length, (begin, end)), shape=(len(first), len(first)))
-    way = dijkstra(graph, indices=roots)[:, leaves]
-    root, leaf = np.nonzero(np.isfinite(way))
-    chords = points[first[np.column_stack([roots[root], leaves[leaf]])]]
-    return chords, way[root, leaf]
+    way = dijkstra(graph, indices=roots)[:, begin[last]] + length[last]
+    root, line = np.nonzero(np.isfinite(way))
+    chords = points[first[np.column_stack([roots[root], end[last][line]])]]
+    return chords, way[root, line]
 
 
 def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:

@@ -22,6 +22,7 @@ from tests.exchange.importing.slicerheart_exports import (
     batch_export,
     fem_export,
     in_lps,
+    polyline,
     vtk,
     write_model,
 )
@@ -305,6 +306,29 @@ def test_a_folder_of_valve_fem_export_brings_its_chords(fem):
     assert f"chordae: {len(truth)} of the export" in " | ".join(case.derived)
 
 
+def test_chords_of_three_heads_whose_fans_meet(fem, tmp_path):
+    folder = shutil.copytree(fem, tmp_path / "fem")
+    frame = TRUTH.frame(Role.REFERENCE)
+    heads = np.vstack([frame.papillary_tips, frame.papillary_tips[1] + [0.0, 3.0, 2.0]])
+    end = TRUTH.chordae.insertion[TRUTH.chordae.tip == 1][0]
+    forks = [0.8 * end + 0.2 * heads[2] + move for move in ([1.0, 0, 0], [-1.0, 0, 0])]
+    lines = vtk.vtkAppendPolyData()
+    for fork in forks:
+        for line in ([heads[2], fork], [fork, end], [fork, end]):
+            lines.AddInputData(polyline(in_lps(np.array(line))))
+    lines.Update()
+    write_model(folder / "Chords_mesh_-_third.vtk", lines.GetOutput(), binary=False)
+    case = import_slicerheart(folder, SlicerheartOptions())
+    found, tips = case.chordae, case.frame(Role.REFERENCE).papillary_tips
+    assert len(tips) == 3
+    third = np.linalg.norm(tips - in_lps(heads[2]), axis=1).argmin()
+    own = found.tip == third
+    assert len(found) == len(TRUTH.chordae) + own.sum()
+    assert found.insertion[own] == pytest.approx(in_lps(np.array([end, end])), abs=1e-2)
+    lengths = [np.linalg.norm(f - heads[2]) + np.linalg.norm(end - f) for f in forks]
+    assert np.sort(found.rest_length[own]) == pytest.approx(np.sort(lengths), abs=1e-2)
+
+
 def test_chords_that_begin_elsewhere_than_at_the_tips_are_refused(fem):
     tips = import_slicerheart(fem, SlicerheartOptions()).frame(Role.REFERENCE).papillary_tips
     moved = tuple((tips + 5.0 * np.eye(3)[2]).ravel())
@@ -312,6 +336,11 @@ def test_chords_that_begin_elsewhere_than_at_the_tips_are_refused(fem):
 
 
 def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(fem, tmp_path):
-    closed = fem_export(tmp_path / "closed", TRUTH.frame(Role.CLOSED))
+    frame = TRUTH.frame(Role.CLOSED)
+    closed = fem_export(tmp_path / "closed", frame, TRUTH.chordae)
     case = import_slicerheart(fem, SlicerheartOptions(closed=str(closed), pressure_mmHg=100.0))
-    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), TRUTH.frame(Role.CLOSED)) ** 2)) < 0.05
+    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), frame) ** 2)) < 0.05
+    order = np.argsort(-in_lps(TRUTH.frame(Role.REFERENCE).papillary_tips)[:, 0])
+    for role in (Role.REFERENCE, Role.CLOSED):
+        expected = in_lps(TRUTH.frame(role).papillary_tips)[order]
+        assert case.frame(role).papillary_tips == pytest.approx(expected, abs=1e-2)
