@@ -13,7 +13,7 @@ from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
-from mvest.exchange.febio.document import Control, FebDocument
+from mvest.exchange.febio.document import FebDocument
 from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
@@ -81,10 +81,6 @@ class FebioOptions:
     density_factor : float
         On the density of a dynamic run: heavier leaflets take larger steps of time, and come to
         rest where lighter ones do.
-    quasi_newton : int
-        BFGS updates between two tangents; FEBio's tangent of ``neo-hookean`` is not exact.
-    tolerance : float
-        Of displacements, relative; that of the energy is its square.
     """
 
     case: str | None = None
@@ -103,8 +99,6 @@ class FebioOptions:
     contact_reach_mm: float = 1.65
     dynamic: bool = True
     density_factor: float = 1000.0
-    quasi_newton: int = 10
-    tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
         choices = {"mesh": ("structured", "tetwild"), "law": LAWS, "contact": CONTACTS}
@@ -118,9 +112,7 @@ class FebioOptions:
             )
         if self.contact == "potential" and self.contact_gap_mm == 0:
             raise InputError("contact_gap_mm = 0; expected a gap, which a potential keeps")
-        if self.quasi_newton < 0:
-            raise InputError(f"quasi_newton = {self.quasi_newton}, expected >= 0")
-        require_numbers(self, "FEBio", "tolerance", "density_factor")
+        require_numbers(self, "FEBio", "density_factor")
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
@@ -286,15 +278,12 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     document = FebDocument(
         mesh,
         [febio_law(moduli.material, options.law) for moduli in tissue],
-        Control(
-            protocol.end if options.dynamic else protocol.ramp,
-            protocol.ramp / STEPS,
-            options.tolerance,
-            options.dynamic,
-            options.quasi_newton,
-        ),
-        np.concatenate(further),
-        mechanics.density * options.density_factor,
+        protocol.end if options.dynamic else protocol.ramp,
+        protocol.ramp / STEPS,
+        tolerance=1e-3 if options.dynamic else 1e-4,
+        dynamic=options.dynamic,
+        further=np.concatenate(further),
+        density=mechanics.density * options.density_factor,
     )
     document.prescribe("tips", tip_nodes, closed.tips - opened.tips, phase)
     document.prescribe("annulus", hinge_nodes, closed.hinge - opened.hinge, phase)

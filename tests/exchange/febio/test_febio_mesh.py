@@ -8,7 +8,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 
-from mvest.exchange.febio.document import Control, FebDocument
+from mvest.exchange.febio.document import FebDocument
 from mvest.exchange.febio.mesh import NAMES, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.body import box, outer_faces
 from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
@@ -40,7 +40,7 @@ def corners_of(words):
 
 def written(given, folder):
     """Of the file of a body: FEBio's element, its nodes of each element, and of each face."""
-    document = FebDocument(febio_mesh(given), [febio_law(A)], Control(1.0, 1.0, 1e-9))
+    document = FebDocument(febio_mesh(given), [febio_law(A)], 1.0, 1.0, 1e-9)
     document.press(febio_mesh(given).pressure_faces, np.array([[0.0, 0.0], [1.0, 1.0]]))
     root = Xml.parse(document.write(folder / "a.feb")).getroot()
 
