@@ -215,7 +215,8 @@ def _read_phase(
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
     chords, lengths = _chords([_model(f, notes) for f in beside if f.words & CHORDS])
     begins = np.unique(chords[:, 0], axis=0)
-    if len(tips) < 2 <= len(begins):
+    # Fewer than there are chords, or these run the other way.
+    if len(tips) < 2 <= len(begins) < len(chords):
         tips = dict(enumerate(begins[::-1]))  # the left one is the antero-lateral one
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:

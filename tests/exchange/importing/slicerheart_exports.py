@@ -242,15 +242,21 @@ def fem_export(folder: Path, frame, chordae=None) -> Path:
     path = run(polyline(ring), tube, vtk.vtkTriangleFilter())
     write_model(folder / "AnnulusContourModel.vtk", path, binary=False)
     for tip, bundle in enumerate(("primary", "secondary") if chordae else ()):
-        lines, start = vtk.vtkAppendPolyData(), in_lps(frame.papillary_tips[tip])
+        lines, start = [], in_lps(frame.papillary_tips[tip])
         for k, end in enumerate(in_lps(chordae.insertion[chordae.tip == tip])):
             fork = end - 3.5 * (end - start) / np.linalg.norm(end - start)
-            for line in [(start, fork), (fork, end)] if k % 2 else [(start, fork, end)]:
-                lines.AddInputData(polyline(np.array(line)))
-        lines.Update()
-        file = folder / f"Chords_mesh_-_mitral_anterior_leaflet-{bundle}.vtk"
-        write_model(file, lines.GetOutput(), binary=False)
+            lines += [(start, fork), (fork, end)] if k % 2 else [(start, fork, end)]
+        write_lines(folder / f"Chords_mesh_-_mitral_anterior_leaflet-{bundle}.vtk", lines)
     return folder
+
+
+def write_lines(file: Path, lines) -> None:
+    """A model of lines, each with points of its own."""
+    whole = vtk.vtkAppendPolyData()
+    for line in lines:
+        whole.AddInputData(polyline(np.array(line)))
+    whole.Update()
+    write_model(file, whole.GetOutput(), binary=False)
 
 
 def polyline(points):

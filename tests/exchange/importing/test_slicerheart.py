@@ -22,8 +22,8 @@ from tests.exchange.importing.slicerheart_exports import (
     batch_export,
     fem_export,
     in_lps,
-    polyline,
     vtk,
+    write_lines,
     write_model,
 )
 
@@ -312,12 +312,8 @@ def test_chords_of_three_heads_whose_fans_meet(fem, tmp_path):
     heads = np.vstack([frame.papillary_tips, frame.papillary_tips[1] + [0.0, 3.0, 2.0]])
     end = TRUTH.chordae.insertion[TRUTH.chordae.tip == 1][0]
     forks = [0.8 * end + 0.2 * heads[2] + move for move in ([1.0, 0, 0], [-1.0, 0, 0])]
-    lines = vtk.vtkAppendPolyData()
-    for fork in forks:
-        for line in ([heads[2], fork], [fork, end], [fork, end]):
-            lines.AddInputData(polyline(in_lps(np.array(line))))
-    lines.Update()
-    write_model(folder / "Chords_mesh_-_third.vtk", lines.GetOutput(), binary=False)
+    lines = [line for f in forks for line in ([heads[2], f], [f, end], [f, end])]
+    write_lines(folder / "Chords_mesh_-_third.vtk", in_lps(np.array(lines)))
     case = import_slicerheart(folder, SlicerheartOptions())
     found, tips = case.chordae, case.frame(Role.REFERENCE).papillary_tips
     assert len(tips) == 3
@@ -333,6 +329,18 @@ def test_chords_that_begin_elsewhere_than_at_the_tips_are_refused(fem):
     tips = import_slicerheart(fem, SlicerheartOptions()).frame(Role.REFERENCE).papillary_tips
     moved = tuple((tips + 5.0 * np.eye(3)[2]).ravel())
     refused(fem, "chords begin up to 5.0 mm from the papillary tips, expected 3 mm", tips=moved)
+
+
+def test_chords_that_end_at_the_tips_are_refused(fem, tmp_path):
+    folder, chordae = shutil.copytree(fem, tmp_path / "fem"), TRUTH.chordae
+    for file in folder.glob("Chords*"):
+        file.unlink()
+    tips = in_lps(TRUTH.frame(Role.REFERENCE).papillary_tips)[chordae.tip]
+    lines = np.stack([in_lps(chordae.insertion), tips], axis=1)
+    write_lines(folder / "chords.vtk", lines)
+    refused(folder, "no papillary tips")
+    tips = tuple(np.unique(tips, axis=0).ravel())
+    refused(folder, r"chords begin up to \d\d\.\d mm from the papillary tips", tips=tips)
 
 
 def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(fem, tmp_path):
