@@ -60,7 +60,8 @@ class Surface:
     region
         ``(m,)`` index into the regions of a case; None where nothing labels them.
     segments
-        ``(k, 2)``, those of all lines, each in the direction of its line.
+        ``(k, 2)`` points of the lines of a file, in the direction of each; None where vertices were
+        merged or left out.
     others
         How many cells there are of each other type, by its name in VTK ("tetra", "wedge");
         vertices by themselves are left out.
@@ -243,6 +244,7 @@ def merged(surface: Surface) -> Surface:
         vertices=surface.vertices[keep],
         triangles=rank[inverse].reshape(-1, 3),
         point_data={name: values[keep] for name, values in surface.point_data.items()},
+        segments=None,
     )
 
 
