@@ -25,7 +25,6 @@ KEY_PACKAGES = (
     "pypardiso",
     "ipctk",
     "pytetwild",
-    "meshio",
     "vtk",
     "trimesh",
     "SimpleITK",

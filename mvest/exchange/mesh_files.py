@@ -23,9 +23,9 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-STRIPS, POLYGONS = (6,), (5, 7, 9)
-FLAT = (1, 2, 3, 4, *STRIPS, *POLYGONS)
-"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves, 3 and 4 lines."""
+LINES, STRIPS, POLYGONS = (3, 4), (6,), (5, 7, 9)
+FLAT = (1, 2, *LINES, *STRIPS, *POLYGONS)
+"""VTK's numbers of types of cells; 1 and 2 are vertices by themselves."""
 
 
 def read_cells(path: Path, suffix: str) -> dict[str, Any]:
@@ -52,6 +52,8 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
         for name, values in arrays.items():
             if len(values) != count:
                 raise InputError(f"data {name!r} has {len(values)} rows, expected {count} {what}")
+    owner = np.repeat(np.arange(len(types)), sizes)
+    onward = (owner[:-1] == owner[1:]) & np.isin(types[owner[:-1]], LINES)
     numbers, counts = np.unique(types[~np.isin(types, FLAT)], return_counts=True)
     name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
     names = [name_of(number).removeprefix("vtk").lower() for number in numbers.tolist()]
@@ -61,6 +63,7 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     return {
         "vertices": points,
         "triangles": triangles,
+        "segments": np.column_stack([corners[:-1], corners[1:]])[onward],
         "others": dict(zip(names, counts.tolist(), strict=True)),
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},

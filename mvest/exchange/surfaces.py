@@ -59,6 +59,9 @@ class Surface:
         Name of the group of each triangle, or of its object (OBJ, GLB); empty without any.
     region
         ``(m,)`` index into the regions of a case; None where nothing labels them.
+    segments
+        ``(k, 2)`` points of the lines of a file, in the direction of each; None where vertices were
+        merged or left out.
     others
         How many cells there are of each other type, by its name in VTK ("tetra", "wedge");
         vertices by themselves are left out.
@@ -73,12 +76,13 @@ class Surface:
     cell_data: Data = field(default_factory=dict)
     groups: Sequence[str] = ()
     region: IntArray | None = None
+    segments: IntArray | None = None
     others: Mapping[str, int] = field(default_factory=dict)
     space: str | None = None
 
 
 def read_mesh(path: Path | str) -> Surface:
-    """Read the points and triangles of a file, in the child.
+    """Read the points, triangles and lines of a file, in the child.
 
     Raises
     ------
@@ -240,6 +244,7 @@ def merged(surface: Surface) -> Surface:
         vertices=surface.vertices[keep],
         triangles=rank[inverse].reshape(-1, 3),
         point_data={name: values[keep] for name, values in surface.point_data.items()},
+        segments=None,
     )
 
 

@@ -13,16 +13,8 @@ from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
-from mvest.exchange.febio.document import Control, FebDocument
-from mvest.exchange.febio.mesh import (
-    FIBRED,
-    LAWS,
-    NAMES,
-    FebLaw,
-    febio_law,
-    febio_mesh,
-    opposite_faces,
-)
+from mvest.exchange.febio.document import FebDocument
+from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.system import System
@@ -89,10 +81,6 @@ class FebioOptions:
     density_factor : float
         On the density of a dynamic run: heavier leaflets take larger steps of time, and come to
         rest where lighter ones do.
-    quasi_newton : int
-        BFGS updates between two tangents; FEBio's tangent of ``neo-hookean`` is not exact.
-    tolerance : float
-        Of displacements, relative; that of the energy is its square.
     """
 
     case: str | None = None
@@ -111,8 +99,6 @@ class FebioOptions:
     contact_reach_mm: float = 1.65
     dynamic: bool = True
     density_factor: float = 1000.0
-    quasi_newton: int = 10
-    tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
         choices = {"mesh": ("structured", "tetwild"), "law": LAWS, "contact": CONTACTS}
@@ -126,9 +112,7 @@ class FebioOptions:
             )
         if self.contact == "potential" and self.contact_gap_mm == 0:
             raise InputError("contact_gap_mm = 0; expected a gap, which a potential keeps")
-        if self.quasi_newton < 0:
-            raise InputError(f"quasi_newton = {self.quasi_newton}, expected >= 0")
-        require_numbers(self, "FEBio", "tolerance", "density_factor")
+        require_numbers(self, "FEBio", "density_factor")
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
@@ -264,21 +248,12 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     Raises
     ------
     InputError
-        If the mesh or the law has no counterpart, or the boundary goes another way than straight.
+        If the mesh has no counterpart.
     MaterialError
         If a modulus is inadmissible.
     """
     values = {**model.fixed, **dict(zip(model.names, map(float, m), strict=True))}
     mechanics, protocol = model.settings, model.settings.protocol
-    if len(model.valve.motion.phase) != 2:
-        raise InputError(
-            f"the boundary has {len(model.valve.motion.phase)} key frames; expected two, between "
-            "which it goes straight"
-        )
-    if mechanics.fields or mechanics.patches:
-        raise InputError("the modulus varies within a leaflet; expected one of each leaflet")
-    if model.ties is not None:
-        raise InputError("leaflets are tied together, as by a clip; expected a valve without")
     mesh = febio_mesh(model.mesh)
     unhindered = replace(mechanics, contact=replace(mechanics.contact, active=False))
     system = build_system(model.valve, model.contact_valve, mesh, unhindered, values)
@@ -294,18 +269,21 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     further = [opened.tips, ends, opened.hinge]
     at = np.cumsum([len(mesh.nodes), *map(len, further)])
     tip_nodes, end_nodes, hinge_nodes = (np.arange(a, b) for a, b in itertools.pairwise(at))
+    tissue = [
+        mechanics.tissue[name].moduli(
+            values[f"E_f.{name}"], values.get(f"ratio.{name}"), values.get(f"G.{name}")
+        )
+        for name in mesh.region_names
+    ]
     document = FebDocument(
         mesh,
-        [_law(mechanics, values, name, options) for name in mesh.region_names],
-        Control(
-            protocol.end if options.dynamic else protocol.ramp,
-            protocol.ramp / STEPS,
-            options.tolerance,
-            options.dynamic,
-            options.quasi_newton,
-        ),
-        np.concatenate(further),
-        mechanics.density * options.density_factor,
+        [febio_law(moduli.material, options.law) for moduli in tissue],
+        protocol.end if options.dynamic else protocol.ramp,
+        protocol.ramp / STEPS,
+        tolerance=1e-3 if options.dynamic else 1e-4,
+        dynamic=options.dynamic,
+        further=np.concatenate(further),
+        density=mechanics.density * options.density_factor,
     )
     document.prescribe("tips", tip_nodes, closed.tips - opened.tips, phase)
     document.prescribe("annulus", hinge_nodes, closed.hinge - opened.hinge, phase)
@@ -319,23 +297,6 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     document.pull(pairs, _chord_forces(system, document.nodes[pairs]))
     document.support(hinge_nodes, hinge.points, hinge.stiffness)
     return document
-
-
-def _law(
-    mechanics: MechanicsSettings, values: dict[str, float], region: str, options: FebioOptions
-) -> FebLaw:
-    tissue = mechanics.tissue[region]
-    own = {
-        kind: values[f"{kind}.{region}"] for kind in tissue.kinds if f"{kind}.{region}" in values
-    }
-    if tissue.law == "stiffening" or own.pop("prestretch", tissue.prestretch) != 1.0:
-        raise InputError(
-            f"{region}: its tissue is between two laws or prestretched; the file has no such law"
-        )
-    if tissue.law == "exponential":
-        return febio_law(tissue.coefficients(own), options.law)
-    moduli = tissue.moduli(own["E_f"], own.get("ratio"), own.get("G"))
-    return febio_law(moduli.material, options.law)
 
 
 def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
@@ -393,8 +354,6 @@ def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
     mesh, mechanics = model.mesh, model.settings
     contact, damping = mechanics.contact, mechanics.damping
     law = f"linear in the Biot strain; in this file {LAWS[options.law]} with the same moduli"
-    if {mechanics.tissue[name].law for name in mesh.region_names} == {"exponential"}:
-        law = f"exponential; in this file {FIBRED}, fibres by their isochoric stretch"
     gap, reach = options.contact_gap_mm, options.contact_reach_mm
     theirs = {
         "potential": f"a contact potential, atrial faces {gap:g} mm apart under this pressure and "
@@ -410,8 +369,7 @@ def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
         f"element: here {mesh.element_type}; in this file "
         f"{NAMES[febio_mesh(mesh).element_type][0]} without enhanced or assumed strains.",
         f"law: here {law}.",
-        "direction of the fibre: here at every node; in this file at the centre of each element, "
-        "or at its nodes for the exponential law.",
+        "direction of the fibre: here at every node; in this file at the centre of each element.",
         f"contact: here a potential, midsurfaces {contact.reference_distance:g} thicknesses apart "
         f"under {1e3 * contact.reference_pressure:g} kPa; in this file {theirs}.",
         f"time: here implicit Euler with damping {damping.alpha:g} 1/s of mass and "

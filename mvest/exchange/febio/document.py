@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -17,7 +16,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.exchange.febio.mesh import FIBRED, NAMES, QUADRILATERAL, FebLaw
+from mvest.exchange.febio.mesh import NAMES, QUADRILATERAL, FebLaw
 from mvest.files import write_atomically
 from mvest.reading.text import read_text
 from mvest.typing import FloatArray, IntArray
@@ -27,31 +26,10 @@ AXES = ("x", "y", "z")
 SECTIONS = ("Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "Loads",
             "Contact", "Constraints", "Discrete", "LoadData", "Output")  # fmt: skip
 """In the order in which FEBio can resolve names."""
+UPDATES = 10
+"""By BFGS; FEBio's tangent of its neo-Hookean law is not exact."""
 MAX_LOG = 1 << 28
 """Bytes of a log that are read."""
-
-
-@dataclass(frozen=True, slots=True)
-class Control:
-    """How FEBio solves.
-
-    Attributes
-    ----------
-    end, step : float
-        s, and the first and largest time step.
-    tolerance : float
-        Of displacements, relative; that of the energy is its square.
-    dynamic : bool
-        With inertia (the generalised alpha rule at its most dissipative) or static.
-    quasi_newton : int
-        BFGS updates between two new tangents; 0 for Newton's method.
-    """
-
-    end: float
-    step: float
-    tolerance: float
-    dynamic: bool = False
-    quasi_newton: int = 0
 
 
 class FebDocument:
@@ -63,7 +41,13 @@ class FebDocument:
         In elements that FEBio has (`mvest.exchange.febio.mesh.febio_mesh`).
     laws : sequence of FebLaw
         One per region.
-    control : Control
+    end, step : float
+        s, and the first and largest time step.
+    tolerance : float
+        Of displacements, relative; that of the energy is its square.
+    dynamic : bool
+        With inertia (the generalised alpha rule at its most dissipative) and `UPDATES` between two
+        tangents; or static, by Newton's method.
     further : (k, 3) mm
         Nodes that belong to no element; they are numbered after those of the mesh.
     density : float
@@ -74,7 +58,11 @@ class FebDocument:
         self,
         mesh: SolidMesh,
         laws: Sequence[FebLaw],
-        control: Control,
+        end: float,
+        step: float,
+        tolerance: float,
+        *,
+        dynamic: bool = False,
         further: FloatArray = np.zeros((0, 3)),  # noqa: B008
         density: float = 1.04e-9,
     ) -> None:
@@ -85,19 +73,19 @@ class FebDocument:
         self._face = mesh.reference.face
         _fill(
             self._at["Control"],
-            analysis="DYNAMIC" if control.dynamic else "STATIC",
-            time_steps=max(1, round(control.end / control.step)),
-            step_size=control.step,
+            analysis="DYNAMIC" if dynamic else "STATIC",
+            time_steps=max(1, round(end / step)),
+            step_size=step,
             plot_level="PLOT_MAJOR_ITRS",
         )
         stepper = {"max_retries": 10, "opt_iter": 15, "aggressiveness": 1, "cutback": 0.5,
-                   "dtmin": 1e-4 * control.step, "dtmax": control.step}  # fmt: skip
+                   "dtmin": 1e-4 * step, "dtmax": step}  # fmt: skip
         _fill(_add(self._at["Control"], "time_stepper", type="default"), **stepper)
         solver = _add(self._at["Control"], "solver", type="solid")
         _fill(solver, symmetric_stiffness=0, equation_scheme="staggered", optimize_bw=0, lstol=0.9)
-        _fill(solver, max_refs=25, diverge_reform=1, min_residual=1e-16, dtol=control.tolerance)
-        _fill(solver, etol=control.tolerance**2, rtol=0, rhoi=0)
-        _fill(_add(solver, "qn_method", type="BFGS"), max_ups=control.quasi_newton)
+        _fill(solver, max_refs=25, diverge_reform=1, min_residual=1e-16, dtol=tolerance)
+        _fill(solver, etol=tolerance**2, rtol=0, rhoi=0)
+        _fill(_add(solver, "qn_method", type="BFGS"), max_ups=UPDATES if dynamic else 0)
         nodes = _add(self._at["Mesh"], "Nodes", name="all")
         for k, x in enumerate(self.nodes, start=1):
             _add(nodes, "node", x, id=k)
@@ -113,11 +101,7 @@ class FebDocument:
             for element in mesh.elements[own][:, order] + 1:
                 number += 1
                 _add(elements, "elem", element, id=number)
-            if law["type"] == FIBRED:
-                _add(material, "fiber", f"fibre_{region}", type="map")
-                self._data("Element", f"fibre_{region}", region, "vec3", mesh.fibre[own][:, order])
-            else:
-                self._axes(mesh, own, region)
+            self._axes(mesh, own, region)
         log = {"data": "x;y;z", "name": "positions", "delim": ","}
         self._log = Xml.Element("node_data", log)
         self._log.text = f"1:{len(self.nodes)}"
@@ -140,7 +124,10 @@ class FebDocument:
         """
         _add(self._at["Mesh"], "NodeSet", nodes + 1, name=name)
         for axis, values in zip(AXES, displacement.T, strict=True):
-            self._data("Node", f"{name}_{axis}", name, "scalar", values)
+            data = _add(self._at["MeshData"], "NodeData", name=f"{name}_{axis}")
+            data.attrib |= {"data_type": "scalar", "node_set": name}
+            for j, value in enumerate(values, start=1):
+                _add(data, "node", value, lid=j)
         if not displacement.any():
             fixed = _add(self._at["Boundary"], "bc", type="zero displacement", node_set=name)
             _fill(fixed, **{f"{axis}_dof": int(axis in axes) for axis in AXES})
@@ -249,13 +236,6 @@ class FebDocument:
         _fill(at, interpolate="LINEAR", extend="CONSTANT")
         _points(at, curve)
         return self._curves
-
-    def _data(self, of: str, name: str, on: str, kind: str, rows: FloatArray) -> None:
-        """Values for each node or element of a set."""
-        set_ = {"Node": "node_set", "Element": "elem_set"}[of]
-        data = _add(self._at["MeshData"], f"{of}Data", name=name, data_type=kind, **{set_: on})
-        for j, row in enumerate(rows, start=1):
-            _add(data, "node" if of == "Node" else "elem", row, lid=j)
 
     def _axes(self, mesh: SolidMesh, own: IntArray, region: str) -> None:
         """The direction of the fibre at the centre of each element."""

@@ -9,9 +9,6 @@ Both have the same stiffness at rest.
 ``neo-hookean``
     ``neo-Hookean transiso``: the same moduli in a neo-Hookean form.
 
-The exponential law (:mod:`mvest.mechanics.law.exponential`) becomes ``uncoupled trans-iso
-hyperelastic`` with the same exponential; the stretch of its fibres is then the isochoric one.
-
 Node orders are those of FEBio's shape functions (``FESolidElementShape.cpp``): corners of the lower
 face counterclockwise, of the upper face, middles of the lower, of the upper, of the upright edges,
 and of a brick the middles of its sides, of the lower and the upper face, and its centre.
@@ -27,7 +24,6 @@ from scipy.spatial import cKDTree
 from mvest.errors import InputError
 from mvest.mechanics.body import outer_faces
 from mvest.mechanics.law.moduli import TransverselyIsotropic
-from mvest.mechanics.settings import ExponentialTissue
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -35,8 +31,6 @@ FebLaw = dict[str, float | str]
 """A material of FEBio: its ``type`` and its parameters."""
 LAWS = {"orthotropic": "orthotropic elastic", "neo-hookean": "neo-Hookean transiso"}
 """FEBio's materials for the linear law."""
-FIBRED = "uncoupled trans-iso hyperelastic"
-"""FEBio's material for the exponential law; its fibre is a field, that of the others an axis."""
 
 BRICK = np.array([0, 2, 8, 6, 18, 20, 26, 24, 1, 5, 7, 3, 19, 23, 25, 21, 9, 11, 17, 15, 10, 14, 16,
                   12, 4, 22, 13])  # fmt: skip
@@ -55,23 +49,8 @@ UPRIGHT = {"hex18": "hex27", "hex18_thin": "hex27", "wedge12": "wedge18"}
 """Elements that get nodes halfway through the thickness."""
 
 
-def febio_law(
-    tissue: TransverselyIsotropic | ExponentialTissue, kind: str = "orthotropic"
-) -> FebLaw:
-    """The material of FEBio for the tissue of one region.
-
-    Parameters
-    ----------
-    tissue : TransverselyIsotropic or ExponentialTissue
-    kind : str
-        One of `LAWS`, for the linear law.
-    """
-    if isinstance(tissue, ExponentialTissue):
-        fibre = f"{tissue.c2!r}*H(sqrt(I4)-1)*(sqrt(I4)-1)^4"
-        exponent = f"{tissue.c1!r}*(I1-3)^2+{fibre}"
-        energy = f"{tissue.c0!r}*(exp({exponent})-1)+{tissue.mu / 2!r}*(I1-3)"
-        # Pressure model 3 is kappa / 4 (J^2 - 1 - 2 ln J), as here.
-        return {"type": FIBRED, "k": tissue.kappa, "pressure_model": 3, "W": energy}
+def febio_law(tissue: TransverselyIsotropic, kind: str = "orthotropic") -> FebLaw:
+    """The material of FEBio, one of `LAWS`, for the tissue of one region."""
     if kind == "neo-hookean":
         return {"type": LAWS[kind], "Ep": tissue.E_p, "Ez": tissue.E_f, "vz": tissue.nu_fp,
                 "vp": tissue.nu_pp, "gz": tissue.G}  # fmt: skip

@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.rims import two_loops
+from mvest.cases.tissue import FAMILIES, GENERIC_THICKNESS
 from mvest.errors import InputError
 from mvest.exchange.importing.joining import (
     REGIONS,
@@ -26,6 +29,7 @@ from mvest.exchange.markups import TO_LPS
 from mvest.exchange.surfaces import Surface
 from mvest.reading.text import named
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.dimensions import ChordLayout
 
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
 """Phases in the order in which they are preferred."""
@@ -37,6 +41,10 @@ CORRELATED_MM = 10.0
 """Along the leaflets over which errors of a segmentation are alike."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
+MARGINAL_MM = 4.0
+"""From the free edge, within which a chord inserts as marginal ones do."""
+MAX_AWAY = 3.0
+"""mm from where a chord begins to its papillary tip."""
 
 _Seen: TypeAlias = tuple[SeenPhase, Role]
 
@@ -128,7 +136,9 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
         raise InputError(f"{source}: no such folder; expected one that SlicerHeart wrote")
     derived: list[str] = []
     with named(source):
-        frames = _frames(_chosen(source, options, derived), options, derived)
+        chosen = _chosen(source, options, derived)
+        frames = _frames(chosen, options, derived)
+        chordae = _chordae(chosen[0][0], frames[0], derived)
         std, known = options.std_mm, {"correlation_length_mm": CORRELATED_MM}
         document = {
             "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
@@ -138,7 +148,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
             **({} if std is None else {"observation": {"std_mm": std, **known}}),
             "derived": derived,
         }
-        return case_of_frames(frames, document)
+        return case_of_frames(frames, document, chordae)
 
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
@@ -231,6 +241,8 @@ def _tips_of(
             "no papillary tips (lists of points PapillaryMarkup-antero-lateral and -postero-medial"
             ", with base, tip and insertion); give tips=[x,y,z,x,y,z] in LPS mm"
         )
+    if before and len(seen.tips) == len(before[0].tips):
+        return seen.tips[linear_sum_assignment(cdist(before[0].tips, seen.tips))[1]]
     return seen.tips
 
 
@@ -295,3 +307,38 @@ def _check_axes(seen: SeenPhase, edges: FloatArray, down: FloatArray, mirrored: 
 
 def _rms(points: FloatArray, edges: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(cKDTree(edges).query(points)[0]))))
+
+
+def _chordae(
+    seen: SeenPhase, reference: FoundFrame, derived: list[str]
+) -> list[tuple[object, ...]]:
+    """Rows of the table of chordae; none if the export has none.
+
+    Raises
+    ------
+    InputError
+        Chords begin elsewhere than at the tips.
+    """
+    if not len(seen.chords):
+        return []
+    reach = cdist(seen.chords[:, 0], reference.tips)
+    if (away := reach.min(axis=1).max()) > MAX_AWAY:
+        raise InputError(
+            f"chords begin up to {away:.1f} mm from the papillary tips, expected {MAX_AWAY:g} mm"
+        )
+    vertices, insertion = reference.surface.vertices, seen.chords[:, 1]
+    loops = [vertices[loop] for loop in two_loops(vertices, reference.surface.triangles)]
+    edge = min(loops, key=lambda curve: _rms(curve, reference.tips))
+    basal = np.where(cKDTree(edge).query(insertion)[0] > MARGINAL_MM, 1, 0)
+    # As stiff together as the template's, of which there may be fewer.
+    template, count = ChordLayout(), np.bincount(basal, minlength=2)
+    marginal = len(template.marginal_phi) * template.marginal_stiffness
+    both = np.array([marginal, len(template.basal) * template.basal_stiffness])
+    stiffness = 2 * both / np.maximum(count, 1)
+    derived.append(
+        f"chordae: {len(basal)} of the export, as long as there; the {count[0]} within "
+        f"{MARGINAL_MM:g} mm of the free edge are marginal; as stiff together as the template's"
+    )
+    names = np.array(FAMILIES)[basal]
+    columns = (reach.argmin(axis=1), *insertion.T, names, seen.chord_lengths, stiffness[basal])
+    return list(zip(*(column.tolist() for column in columns), strict=True))

@@ -17,6 +17,8 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.markups import TO_LPS, PointList, read_markups
@@ -50,8 +52,8 @@ MUSCLES = (
 )
 """Words of the two papillary muscles, in the order of a case's tips."""
 PAPILLARY = {"papillary", "muscle", "muscles", "tip", "tips"}
-ANNULUS, MARKS = {"annulus"}, {"landmarks", "labels"}
-NO_LEAFLET = PAPILLARY | ANNULUS | {"chords", "chordae", "ventricular"}
+CHORDS, ANNULUS, MARKS = {"chords", "chordae"}, {"annulus"}, {"landmarks", "labels"}
+NO_LEAFLET = PAPILLARY | CHORDS | ANNULUS | {"ventricular"}
 LANDMARKS = ("A", "P", "AL", "PM", "ALC", "PMC")
 _COMMON = ("Filename", "Phase", "FrameNumber", "Valve")
 _TABLES = {
@@ -105,7 +107,12 @@ class SeenPhase:
     landmarks
         ``(3,)`` mm by label, of `LANDMARKS`.
     tips
-        ``(2, 3)`` mm, antero-lateral and postero-medial, or None.
+        ``(2, 3)`` mm, antero-lateral and postero-medial; or ``(t, 3)`` where chords begin, from
+        left to right; or None.
+    chords
+        ``(c, 2, 3)`` mm, from where each begins to where it ends on a leaflet.
+    chord_lengths
+        ``(c,)`` mm along the lines.
     notes
         What was assumed in reading, and what was not used.
     """
@@ -115,6 +122,8 @@ class SeenPhase:
     contour: FloatArray | None
     landmarks: dict[str, FloatArray]
     tips: FloatArray | None
+    chords: FloatArray
+    chord_lengths: FloatArray
     notes: tuple[str, ...]
 
 
@@ -204,6 +213,11 @@ def _read_phase(
                 notes.append(f"{item.kind} of {len(item.labels)} points ({listed}) not used")
             if item.unplaced:
                 notes.append(f"points {', '.join(item.unplaced)} not placed, so not used")
+    chords, lengths = _chords([_model(f, notes) for f in beside if f.words & CHORDS])
+    begins = np.unique(chords[:, 0], axis=0)
+    # Fewer than there are chords, or these run the other way.
+    if len(tips) < 2 <= len(begins) < len(chords):
+        tips = dict(enumerate(begins[::-1]))  # the left one is the antero-lateral one
     known = {label.strip().upper(): point for label, point in landmarks.items()}
     if unused := known.keys() - {"", *LANDMARKS}:
         notes.append(f"landmarks {', '.join(sorted(unused))} not used")
@@ -212,7 +226,9 @@ def _read_phase(
         surfaces,
         next((curve for curve in curves if len(curve) >= MIN_CONTOUR), None),
         {label: known[label] for label in LANDMARKS if label in known},
-        np.stack([tips[0], tips[1]]) if len(tips) == 2 else None,
+        np.stack([tips[k] for k in range(len(tips))]) if len(tips) > 1 else None,
+        chords,
+        lengths,
         tuple(dict.fromkeys(one_line(note) for note in notes)),
     )
 
@@ -286,6 +302,30 @@ def _tips_in(file: Path, words: set[str], item: PointList) -> dict[int, FloatArr
             "insertion"
         )
     return {muscle: item.points[tip[0] if tip else 1]}
+
+
+def _chords(models: Sequence[Surface]) -> tuple[FloatArray, FloatArray]:
+    """Chords of models of lines, ``(c, 2, 3)`` mm, and their lengths ``(c,)`` mm along these.
+
+    Lines run from the papillary muscles to the leaflets, and a branch begins where its trunk ends.
+    A chord begins where no line ends. Each line that ends where none begins is the end of one;
+    lines with the same ends count once.
+    """
+    parts = [model.vertices[model.segments] for model in models]
+    points = np.concatenate([np.zeros((0, 2, 3)), *parts]).reshape(-1, 3)
+    rounded = np.round(points, 3)  # of text have six digits
+    _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    pairs = np.unique(number.reshape(-1, 2), axis=0)
+    begin, end = pairs[pairs[:, 0] != pairs[:, 1]].T
+    length = np.linalg.norm(points[first[end]] - points[first[begin]], axis=1)
+    roots, last = np.setdiff1d(begin, end), ~np.isin(end, begin)
+    if not len(roots):
+        return np.zeros((0, 2, 3)), np.zeros(0)
+    graph = csr_matrix((length, (begin, end)), shape=(len(first), len(first)))
+    way = dijkstra(graph, indices=roots)[:, begin[last]] + length[last]
+    root, line = np.nonzero(np.isfinite(way))
+    chords = points[first[np.column_stack([roots[root], end[last][line]])]]
+    return chords, way[root, line]
 
 
 def _middle_of_tube(file: _File, notes: list[str]) -> FloatArray:

@@ -14,8 +14,10 @@ import yaml
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
+from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES
 from mvest.errors import MvestError
 from mvest.exchange.surfaces import Surface, write_surface
+from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
 
@@ -36,6 +38,7 @@ class FoundFrame:
 def case_of_frames(
     frames: Sequence[FoundFrame],
     document: Mapping[str, Any],
+    chordae: Sequence[Sequence[object]] = (),
 ) -> ValveCase:
     """The case of frames without common vertices, with the checks and rules of every case.
 
@@ -45,6 +48,8 @@ def case_of_frames(
         The reference and others.
     document
         Further fields of ``case.yaml``.
+    chordae
+        Rows of a table with `CHORD_COLUMNS`; without any, chordae are laid out.
 
     Raises
     ------
@@ -63,6 +68,10 @@ def case_of_frames(
             entry |= {"surface": f"{number}.vtp", "papillary_tips": one.tips.tolist()}
             apart = {} if one.role is Role.REFERENCE else {"corresponds": False}
             entries.append(entry | {"pressure": float(one.pressure)} | apart)
+        if chordae:
+            write_columns(folder / "chordae.csv", CHORD_COLUMNS, chordae)
+            table = {"file": "chordae.csv", "families": list(FAMILIES)}
+            document = {**document, "chordae": table}
         units = {"length": "mm", "pressure": "mmHg", "time": "s"}
         whole = {"version": 1, "units": units, **document, "frames": entries}
         text = yaml.safe_dump(whole, sort_keys=False, allow_unicode=True)

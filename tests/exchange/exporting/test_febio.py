@@ -176,6 +176,15 @@ def test_sliding_contact_and_inertia(folder, tmp_path):
     assert float(root.find("Loads/body_load/C").text) == pytest.approx(0.1)
 
 
+def write_run(place, case, unknowns):
+    """What the run of a case leaves of its estimates."""
+    tissue = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
+    mechanics = {"tissue": {"anterior": tissue, "posterior": tissue}}
+    record = {"findings": {"case": {"unknowns": unknowns, "settings": {"mechanics": mechanics}}}}
+    (place / "result.json").write_text(json.dumps(record))
+    (place / "config.json").write_text(json.dumps({"case": str(case)}))
+
+
 def test_a_run_is_exported_with_its_estimates(folder, tmp_path):
     unknown = {"prior_mean": 1.0, "estimate": None}
     unknowns = [
@@ -184,11 +193,7 @@ def test_a_run_is_exported_with_its_estimates(folder, tmp_path):
         unknown | {"name": "pressure_scale", "estimate": 0.5},
         unknown | {"name": "shift.x", "estimate": 3.0},
     ]
-    tissue = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
-    mechanics = {"tissue": {"anterior": tissue, "posterior": tissue}}
-    record = {"findings": {"case": {"unknowns": unknowns, "settings": {"mechanics": mechanics}}}}
-    (tmp_path / "result.json").write_text(json.dumps(record))
-    (tmp_path / "config.json").write_text(json.dumps({"case": str(folder)}))
+    write_run(tmp_path, folder, unknowns)
     options = FebioOptions(columns=12, rows=2, contact="none", law="orthotropic")
     root = Xml.parse(export_febio(tmp_path, tmp_path / "a.feb", options)).getroot()
     anterior, posterior = root.findall("Material/material")
@@ -207,11 +212,7 @@ def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, u
         {"name": name, "prior_mean": 1.0, "estimate": 2.0}
         for name in ("E_f.anterior", "E_f.posterior", unlike)
     ]
-    own = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
-    settings = {"mechanics": {"tissue": {"anterior": own, "posterior": own}}}
-    record = {"findings": {"case": {"unknowns": unknowns, "settings": settings}}}
-    (tmp_path / "result.json").write_text(json.dumps(record))
-    (tmp_path / "config.json").write_text(json.dumps({"case": str(folder)}))
+    write_run(tmp_path, folder, unknowns)
     with pytest.raises(InputError, match=f"{unlike}: the file has no law for such tissue"):
         export_febio(tmp_path, tmp_path / "a.feb", FebioOptions(columns=12, rows=2))
 

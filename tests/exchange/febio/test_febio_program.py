@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import ConfigurationError, InputError
-from mvest.exchange.febio.document import Control, FebDocument, read_positions
+from mvest.exchange.febio.document import FebDocument, read_positions
 from mvest.exchange.febio.mesh import febio_law, febio_mesh
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law import Law
@@ -57,7 +57,7 @@ def theirs(mesh, fibre, rim, kind, folder):
     own = febio_mesh(directed)
     nodes = np.flatnonzero(np.isin(own.nodes[:, 0], (0.0, 8.0)))
     curve = np.array([[0.0, 0.0], [1.0, 1.0]])
-    document = FebDocument(own, [febio_law(MATERIAL, kind)], Control(1.0, 0.2, 1e-9))
+    document = FebDocument(own, [febio_law(MATERIAL, kind)], 1.0, 0.2, 1e-9)
     document.prescribe("rim", nodes, np.zeros((len(nodes), 3)), curve)
     document.press(own.pressure_faces, curve * [1.0, PRESSURE])
     return run_febio(document, directed, folder / "sheet.feb")

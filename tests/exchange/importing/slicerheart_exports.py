@@ -223,8 +223,12 @@ def batch_export(folder: Path, case, scene="P001", *, voxel_mm=None, **how) -> P
     return folder
 
 
-def fem_export(folder: Path, frame) -> Path:
-    """What ValveFemExport writes of one frame: shells and the tube of the annulus."""
+def fem_export(folder: Path, frame, chordae=None) -> Path:
+    """What ValveFemExport writes of one frame: shells, the tube of the annulus, bundles of chords.
+
+    A bundle is a model of lines; every second chord parts 3.5 mm before it ends, where a second
+    line begins.
+    """
     folder.mkdir(parents=True)
     for label, (name, thickness) in enumerate(THICKNESS.items()):
         model = atrial_leaflet(frame, label, thickness)
@@ -237,7 +241,22 @@ def fem_export(folder: Path, frame) -> Path:
     tube.CappingOff()
     path = run(polyline(ring), tube, vtk.vtkTriangleFilter())
     write_model(folder / "AnnulusContourModel.vtk", path, binary=False)
+    for tip, bundle in enumerate(("primary", "secondary") if chordae else ()):
+        lines, start = [], in_lps(frame.papillary_tips[tip])
+        for k, end in enumerate(in_lps(chordae.insertion[chordae.tip == tip])):
+            fork = end - 3.5 * (end - start) / np.linalg.norm(end - start)
+            lines += [(start, fork), (fork, end)] if k % 2 else [(start, fork, end)]
+        write_lines(folder / f"Chords_mesh_-_mitral_anterior_leaflet-{bundle}.vtk", lines)
     return folder
+
+
+def write_lines(file: Path, lines) -> None:
+    """A model of lines, each with points of its own."""
+    whole = vtk.vtkAppendPolyData()
+    for line in lines:
+        whole.AddInputData(polyline(np.array(line)))
+    whole.Update()
+    write_model(file, whole.GetOutput(), binary=False)
 
 
 def polyline(points):

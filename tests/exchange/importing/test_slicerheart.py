@@ -23,6 +23,7 @@ from tests.exchange.importing.slicerheart_exports import (
     fem_export,
     in_lps,
     vtk,
+    write_lines,
     write_model,
 )
 
@@ -277,12 +278,77 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
 
 
-def test_two_folders_of_valve_fem_export_are_the_open_and_the_closed_frame(tmp_path):
-    frames = [TRUTH.frame(Role.REFERENCE), TRUTH.frame(Role.CLOSED)]
-    folders = [fem_export(tmp_path / frame.name, frame) for frame in frames]
-    tips = frames[0].papillary_tips
-    tips = tuple(in_lps(tips[np.argsort(tips[:, 0])]).ravel())
-    options = SlicerheartOptions(closed=str(folders[1]), pressure_mmHg=100.0, tips=tips)
-    case = import_slicerheart(folders[0], options)
-    for frame in frames:
-        assert np.sqrt(np.mean(away(case.frame(frame.role), frame) ** 2)) < 0.05
+@pytest.fixture(scope="module")
+def fem(tmp_path_factory):
+    return fem_export(
+        tmp_path_factory.mktemp("fem") / "open", TRUTH.frame(Role.REFERENCE), TRUTH.chordae
+    )
+
+
+def test_a_folder_of_valve_fem_export_brings_its_chords(fem):
+    case, truth = import_slicerheart(fem, SlicerheartOptions()), TRUTH.chordae
+    reference, found = TRUTH.frame(Role.REFERENCE), case.chordae
+    assert np.sqrt(np.mean(away(case.frame(Role.REFERENCE), reference) ** 2)) < 0.05
+    # Files of text have six digits.
+    nearest = np.linalg.norm(in_lps(truth.insertion)[:, None] - found.insertion, axis=2)
+    assert nearest.min(axis=1).max() < 1e-2
+    same = nearest.argmin(axis=1)
+    assert sorted(same) == list(range(len(found)))
+    tips = case.frame(Role.REFERENCE).papillary_tips
+    begins = in_lps(reference.papillary_tips)
+    assert tips[found.tip[same]] == pytest.approx(begins[truth.tip], abs=1e-2)
+    assert tips[0, 0] > tips[1, 0]
+    lengths = np.linalg.norm(truth.insertion - reference.papillary_tips[truth.tip], axis=1)
+    assert found.rest_length[same] == pytest.approx(lengths, abs=1e-2)
+    named = [np.array(chordae.family_names)[chordae.family] for chordae in (found, truth)]
+    assert np.array_equal(named[0][same], named[1])
+    assert found.axial_stiffness.sum() == pytest.approx(truth.axial_stiffness.sum())
+    assert f"chordae: {len(truth)} of the export" in " | ".join(case.derived)
+
+
+def test_chords_of_three_heads_whose_fans_meet(fem, tmp_path):
+    folder = shutil.copytree(fem, tmp_path / "fem")
+    frame = TRUTH.frame(Role.REFERENCE)
+    heads = np.vstack([frame.papillary_tips, frame.papillary_tips[1] + [0.0, 3.0, 2.0]])
+    end = TRUTH.chordae.insertion[TRUTH.chordae.tip == 1][0]
+    forks = [0.8 * end + 0.2 * heads[2] + move for move in ([1.0, 0, 0], [-1.0, 0, 0])]
+    lines = [line for f in forks for line in ([heads[2], f], [f, end], [f, end])]
+    write_lines(folder / "Chords_mesh_-_third.vtk", in_lps(np.array(lines)))
+    case = import_slicerheart(folder, SlicerheartOptions())
+    found, tips = case.chordae, case.frame(Role.REFERENCE).papillary_tips
+    assert len(tips) == 3
+    third = np.linalg.norm(tips - in_lps(heads[2]), axis=1).argmin()
+    own = found.tip == third
+    assert len(found) == len(TRUTH.chordae) + own.sum()
+    assert found.insertion[own] == pytest.approx(in_lps(np.array([end, end])), abs=1e-2)
+    lengths = [np.linalg.norm(f - heads[2]) + np.linalg.norm(end - f) for f in forks]
+    assert np.sort(found.rest_length[own]) == pytest.approx(np.sort(lengths), abs=1e-2)
+
+
+def test_chords_that_begin_elsewhere_than_at_the_tips_are_refused(fem):
+    tips = import_slicerheart(fem, SlicerheartOptions()).frame(Role.REFERENCE).papillary_tips
+    moved = tuple((tips + 5.0 * np.eye(3)[2]).ravel())
+    refused(fem, "chords begin up to 5.0 mm from the papillary tips, expected 3 mm", tips=moved)
+
+
+def test_chords_that_end_at_the_tips_are_refused(fem, tmp_path):
+    folder, chordae = shutil.copytree(fem, tmp_path / "fem"), TRUTH.chordae
+    for file in folder.glob("Chords*"):
+        file.unlink()
+    tips = in_lps(TRUTH.frame(Role.REFERENCE).papillary_tips)[chordae.tip]
+    lines = np.stack([in_lps(chordae.insertion), tips], axis=1)
+    write_lines(folder / "chords.vtk", lines)
+    refused(folder, "no papillary tips")
+    tips = tuple(np.unique(tips, axis=0).ravel())
+    refused(folder, r"chords begin up to \d\d\.\d mm from the papillary tips", tips=tips)
+
+
+def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(fem, tmp_path):
+    frame = TRUTH.frame(Role.CLOSED)
+    closed = fem_export(tmp_path / "closed", frame, TRUTH.chordae)
+    case = import_slicerheart(fem, SlicerheartOptions(closed=str(closed), pressure_mmHg=100.0))
+    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), frame) ** 2)) < 0.05
+    order = np.argsort(-in_lps(TRUTH.frame(Role.REFERENCE).papillary_tips)[:, 0])
+    for role in (Role.REFERENCE, Role.CLOSED):
+        expected = in_lps(TRUTH.frame(role).papillary_tips)[order]
+        assert case.frame(role).papillary_tips == pytest.approx(expected, abs=1e-2)
