@@ -27,7 +27,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
-from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.template import Template, smoothstep
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 
@@ -59,7 +59,7 @@ def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface
     shape = seen.vertices, seen.triangles, reference.region, names
     bare = LeafletSurface(*shape, np.tile([1.0, 0.0, 0.0], (n, 1)), np.ones(n))
     with folder.at("thickness"):
-        thickness = _thickness(folder, seen, names, bare.vertex_region)
+        thickness = _thickness(folder, reference, names, bare.vertex_region)
         check_thickness(thickness)
     with folder.at("fibre"):
         fibre = _fibre(folder, reference)
@@ -67,24 +67,34 @@ def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface
 
 
 def _thickness(
-    folder: CaseFolder, seen: SeenFrame, names: tuple[str, ...], vertex_region: IntArray
+    folder: CaseFolder, reference: CheckedFrame, names: tuple[str, ...], vertex_region: IntArray
 ) -> FloatArray:
-    given = folder.document.thickness
+    given, seen = folder.document.thickness, reference.seen
     if isinstance(given, PointData):
         return MM_PER[folder.document.units.length] * point_data(seen, given.point_data, 1)[:, 0]
     if isinstance(given, float):
         return np.full(len(seen.vertices), given)
     by_name: Mapping[str, float] = GENERIC_THICKNESS if given is None else given
+    thinning = TemplateParameters().leaflets.edge_thinning
     missing = [name for name in names if name not in by_name]
     if missing:
         raise InputError(f"none for the region {', '.join(missing)}; give one in mm")
     unknown = [name for name in by_name if name not in names]
     if given is None:
         listed = ", ".join(f"{by_name[name]:g} mm ({name})" for name in names)
-        folder.derived.append(f"thickness: {listed} assumed")
+        folder.derived += [
+            f"thickness: {listed} assumed",
+            f"thickness: falls towards the free edge as in the template, to {thinning:.0%}",
+        ]
     elif unknown:
         raise InputError(f"unknown region {unknown[0]!r}; known are {', '.join(names)}")
-    return np.array([by_name[name] for name in names])[vertex_region]
+    thickness = np.array([by_name[name] for name in names])[vertex_region]
+    if given is not None:
+        return thickness
+    # As that of the template: leaflets as thick at the free edge do not close tightly.
+    loops = reference.annulus, reference.free_edge
+    s = surface_coordinates(seen.vertices, seen.triangles, *loops).s
+    return thickness * (1.0 - (1.0 - thinning) * smoothstep((s - 0.5) / 0.5))
 
 
 def _fibre(folder: CaseFolder, reference: CheckedFrame) -> FloatArray:

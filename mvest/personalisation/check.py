@@ -8,8 +8,6 @@ them (`mvest.personalisation.known`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from mvest.cases.case import ValveCase
@@ -20,48 +18,13 @@ from mvest.personalisation.estimation import CaseProblem, linearised, sampled
 from mvest.personalisation.known import (
     REACH,
     LinearModel,
-    Narrower,
-    VarianceShare,
     narrower,
     variance_shares,
 )
 from mvest.personalisation.model import build_coarse
+from mvest.personalisation.result import Expected, ExpectedUnknown
 from mvest.personalisation.settings import PersonaliseSettings
 from mvest.problem.registration import unit_of
-
-
-@dataclass(frozen=True, slots=True)
-class ExpectedUnknown:
-    """The interval of 95 % of one unknown beforehand and, about its prior mean, after an estimate.
-
-    Attributes
-    ----------
-    name, unit : str
-    generic : float
-        Where it is assumed to be.
-    low_before, high_before, low, high : float
-    width : float
-        Of the interval after over before, of the logarithm of what is positive.
-    """
-
-    name: str
-    unit: str
-    generic: float
-    low_before: float
-    high_before: float
-    low: float
-    high: float
-    width: float
-
-
-@dataclass(frozen=True, slots=True)
-class Expected:
-    """What can be expected of an estimate; without unknowns the reason why that is not known."""
-
-    unknowns: tuple[ExpectedUnknown, ...] = ()
-    shares: tuple[VarianceShare, ...] = ()
-    narrower: tuple[Narrower, ...] = ()
-    reason: str = ""
 
 
 def expect_case(

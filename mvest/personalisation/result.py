@@ -134,6 +134,40 @@ class Known:
     law_share: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ExpectedUnknown:
+    """The interval of 95 % of one unknown beforehand and, about its prior mean, after an estimate.
+
+    Attributes
+    ----------
+    name, unit : str
+    generic : float
+        Where it is assumed to be.
+    low_before, high_before, low, high : float
+    width : float
+        Of the interval after over before, of the logarithm of what is positive.
+    """
+
+    name: str
+    unit: str
+    generic: float
+    low_before: float
+    high_before: float
+    low: float
+    high: float
+    width: float
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What can be expected of an estimate; without unknowns the reason why that is not known."""
+
+    unknowns: tuple[ExpectedUnknown, ...] = ()
+    shares: tuple[VarianceShare, ...] = ()
+    narrower: tuple[Narrower, ...] = ()
+    reason: str = ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDistance:
     """How far a frame as seen is from the closed valve of the model.

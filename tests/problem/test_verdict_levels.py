@@ -1,9 +1,9 @@
 """What the levels of the verdict are worth, on published estimates of simulated valves.
 
-`results/calibration_estimates.csv` holds 598 estimated moduli of valves for which the model is wrong
-in one of fifteen ways, with what spoke against each. They were judged by other rules; here the rules
-of `mvest.problem.verdict` judge them anew. Which checks count, and how many are too many, was chosen
-on even seeds alone.
+`results/calibration_estimates.csv` holds 598 estimated moduli of valves for which the model is
+wrong in one of fifteen ways, with what spoke against each. They were judged by other rules; here
+the rules of `mvest.problem.verdict` judge them anew. Which checks count, and how many are too many,
+was chosen on even seeds alone.
 """
 
 import re

@@ -20,9 +20,8 @@ from pandas import json_normalize
 from mvest.cases.from_images.detected import DetectedValve
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
-from mvest.personalisation.check import Expected
 from mvest.personalisation.record import arrays_of_case, record_of_case
-from mvest.personalisation.result import Personalised
+from mvest.personalisation.result import Expected, Personalised
 from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord, Spread
 from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure

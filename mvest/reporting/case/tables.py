@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from mvest.personalisation.check import Expected
 from mvest.personalisation.record import label_of
+from mvest.personalisation.result import Expected
 from mvest.problem.record import EstimateRecord, FrameFit, Row, Unknown
 from mvest.problem.verdict import NONE
 from mvest.reporting.markup import ended

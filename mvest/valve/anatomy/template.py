@@ -26,7 +26,7 @@ ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")
 
 
-def _smoothstep(x: FloatArray) -> FloatArray:
+def smoothstep(x: FloatArray) -> FloatArray:
     """C2 step from 0 to 1 on [0, 1] (quintic)."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x * x)
@@ -98,9 +98,9 @@ class Template:
         """Thickness ``(k,)``; blends between the leaflets over 20 degrees at each commissure."""
         p = self.parameters.leaflets
         thick, other = p.anterior.thickness, p.posterior.thickness
-        blend = _smoothstep(0.5 + np.sin(np.deg2rad(phi)) / (2 * np.sin(np.deg2rad(20.0))))
+        blend = smoothstep(0.5 + np.sin(np.deg2rad(phi)) / (2 * np.sin(np.deg2rad(20.0))))
         base = other + (thick - other) * blend
-        return base * (1 - (1 - p.edge_thinning) * _smoothstep((s - 0.5) / 0.5))
+        return base * (1 - (1 - p.edge_thinning) * smoothstep((s - 0.5) / 0.5))
 
     @cached_property
     def _edge_table(self) -> tuple[FloatArray, FloatArray]:
@@ -206,7 +206,7 @@ class Template:
         """Angle ``(k,)`` in rad of the fibres to the direction around the valve."""
         turn = self.parameters.leaflets.fibre_turn * 180.0
         from_commissure = np.minimum(np.mod(phi, 360.0), np.abs(180.0 - np.mod(phi, 360.0)))
-        angle = 0.5 * np.pi * (1 - _smoothstep(from_commissure / turn))
+        angle = 0.5 * np.pi * (1 - smoothstep(from_commissure / turn))
         return np.where(region == ANTERIOR, angle, 0.0)
 
     # -- what hangs on it -------------------------------------------------------------------------
