@@ -1,4 +1,4 @@
-"""Pages of the API, written from the packages as they are: the front door, and one page a package."""
+"""Pages of the API, written from the packages as they are: the front door, and one a package."""
 
 from __future__ import annotations
 
