@@ -32,7 +32,7 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "api_pages",
-    "rooms",
+    "import_graph",
     "study_pages",
     "computed_tables",
 ]

@@ -1,4 +1,4 @@
-"""Pages of the API, written from the packages as they are: the front door, and one page a room."""
+"""Pages of the API, written from the packages as they are: the front door, and one a package."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def front_door() -> str:
 
 {listing}
 
-The rooms hold these and all the rest:
+The packages hold these and all the rest:
 
 .. toctree::
    :maxdepth: 1
    :glob:
 
-   rooms/*
+   packages/*
 """
 
 
-def room(package: Path) -> str:
-    """A room with all its public modules."""
+def package_page(package: Path) -> str:
+    """A package with all its public modules."""
     name = f"mvest.{package.name}"
     modules = modules_of(package)
     parts = [titled(name, "="), f".. automodule:: {name}\n   :no-members:\n"]
@@ -86,10 +86,10 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Write the pages before Sphinx looks for its sources."""
     folder, library = Path(app.srcdir) / "api", Path(mvest.__file__).parent
     write(folder / "index.rst", front_door())
-    rooms = {path.name: path for path in library.iterdir() if (path / "__init__.py").is_file()}
-    for stale in folder.glob("rooms/*.rst"):
-        if stale.stem not in rooms:
+    packages = {path.name: path for path in library.iterdir() if (path / "__init__.py").is_file()}
+    for stale in folder.glob("packages/*.rst"):
+        if stale.stem not in packages:
             stale.unlink()
-    for name, path in rooms.items():
-        write(folder / "rooms" / f"{name}.rst", room(path))
+    for name, path in packages.items():
+        write(folder / "packages" / f"{name}.rst", package_page(path))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -32,9 +32,9 @@ same_scale(panels, [frame.vertices for frame in case.frames], ATRIUM)
 
 # %%
 # The closed surface is uneven because it is "seen" with errors of 0.5 mm (simulated).
-# ``mvest.personalise(case)`` takes its settings from `mvest.default_settings`, which count on all
-# that is not known of a case and take some minutes. For seconds, here is a coarse mesh, and what is
-# not known of the geometry and the law is left out, so the intervals are too narrow.
+# ``mvest.personalise(case)`` takes its settings from `mvest.default_settings`, which include the
+# errors of geometry and law and take some minutes. Here a coarse mesh without these errors takes
+# seconds, so the intervals are too narrow.
 
 settings = replace(
     mvest.default_settings(case),
@@ -49,8 +49,8 @@ found = mvest.personalise(case, settings)
 print(found)
 
 # %%
-# The report opens with whether the estimate may be believed. Its numbers are a record, which
-# tables and plots of one's own can read.
+# The report begins with the verdict on the estimate. Its numbers are a record, which your own
+# tables and plots can read.
 
 record = mvest.record_of_case(found)
 print(record.verdict)
