@@ -82,10 +82,10 @@ def _thickness(
     unknown = [name for name in by_name if name not in names]
     if given is None:
         listed = ", ".join(f"{by_name[name]:g} mm ({name})" for name in names)
-        folder.derived += [
-            f"thickness: {listed} assumed",
-            f"thickness: falls towards the free edge as in the template, to {thinning:.0%}",
-        ]
+        folder.derived.append(f"thickness: {listed} assumed")
+        folder.derived.append(
+            f"thickness: falls towards the free edge as in the template, to {thinning:.0%}"
+        )
     elif unknown:
         raise InputError(f"unknown region {unknown[0]!r}; known are {', '.join(names)}")
     thickness = np.array([by_name[name] for name in names])[vertex_region]
