@@ -169,7 +169,7 @@ def seam(gap):
     def change(folder, document):
         for entry in document["frames"]:
             old = read_surface(folder / entry["surface"])
-            files = {n: f"{entry['name']}_{n}.stl" for n in document["regions"]}
+            files = {n: f"{entry['name']}_{n}.vtp" for n in document["regions"]}
             for number, file in enumerate(files.values()):
                 moved = old.vertices + np.array([0.0, 0.0, gap * number])
                 save_surface(folder / file, moved, old.triangles[region_of(old) == number], None)

@@ -21,7 +21,7 @@ from mvest.problem.verdict import ONE_STATE
 from tests.experiments.configured import composed, plain
 from tests.made_up_closure import made_up_case, use
 
-OWN = ("experiment=own_valve", "personal.mesh.source=structured", "figures=false")
+OWN = ("experiment=own_valve", "figures=false")
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_settings_are_those_of_the_configuration(config):
     assert (about["E_f.anterior"].mean, about["E_f.anterior"].std) == (6.23, 3.1)
     assert {u.treatment for u in settings.unknowns} == {Treatment.ESTIMATED}
     assert (settings.moduli_only, settings.confirm, settings.paper) == (True, True, None)
-    assert settings.mesh.source == "structured"
+    assert settings.mesh.source == "automatic"
     assert settings.correspondence
     given = plain(
         composed(

@@ -152,7 +152,7 @@ def test_a_check_tells_of_a_twin_and_estimates_nothing(tmp_path, monkeypatch, ca
     assert not list(Path(tmp_path).rglob("result.json"))
 
 
-def test_jobs_of_a_sweep_that_begin_alike_share_a_closure(tmp_path, monkeypatch, capsys):
+def test_each_job_of_a_sweep_says_what_it_will_tell(tmp_path, monkeypatch, capsys):
     calls = []
     original = ClosureModel.__call__
 
@@ -166,7 +166,7 @@ def test_jobs_of_a_sweep_that_begin_alike_share_a_closure(tmp_path, monkeypatch,
         "filter.R=0.01,0.04", "hydra.sweep.dir=sweep",
     )  # fmt: skip
     assert status == 0, said.err
-    assert len(calls) == 1
+    assert len(calls) == 2
     # Twice the noise, twice the deviation from the data alone.
     stds = [
         [float(line.split()[4]) for line in part.splitlines() if "E_f." in line and "MPa" in line]
