@@ -41,7 +41,7 @@ from mvest.personalisation.design import (
 from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
-from mvest.problem.record import EstimateRecord, confounded, finite, record_of
+from mvest.problem.record import EstimateRecord, finite, record_of
 from mvest.quantities import (
     BeatTime,
     Count,
@@ -250,7 +250,7 @@ def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) ->
     """Changes of parameters that hardly show together, where nothing is known of nuisances."""
     for about, design in designs:
         bound = design.at(settings.typical_mm, dict.fromkeys(settings.known, 0.0))
-        for group in confounded(bound):
+        for group in bound.confounded():
             moved = zip(group.parameters, group.relative, strict=True)
             yield {
                 "frames": about["frames"],

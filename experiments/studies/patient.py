@@ -464,12 +464,12 @@ def figure(results: Results) -> dict[str, Figure]:
         return {"moduli": moduli_figure(_drawn(patients))}
     if results.first.table == CALIBRATION:
         return {"ranks": ranks_figure(_by_scenario(patients))}
-    from mvest.problem.fields import read_case_fields
+    from mvest.problem.fields import case_fields
 
     names = {id(record): name for name, record in results.records.items()}
     places = {estimate.case: names[id(record)] for record, estimate in patients}
     fields = {
-        case: read_case_fields(results.arrays[name])
+        case: case_fields(results.arrays[name])
         for case, name in places.items()
         if name in results.arrays
     }

@@ -18,7 +18,6 @@ from .information.design import Design as Design
 from .information.design import together as together
 from .information.identifiability import Identifiability as Identifiability
 from .information.identifiability import TradeOff as TradeOff
-from .information.identifiability import cramer_rao_bound as cramer_rao_bound
 from .information.identifiability import identifiability as identifiability
 from .information.identifiability import shift_by_model_error as shift_by_model_error
 from .information.identifiability import with_shift as with_shift

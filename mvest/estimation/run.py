@@ -167,6 +167,7 @@ class FilterRun:
             more["check"] = self.check(prediction, prior=prior)
         if learned := more.get("learned"):
             self._covariances[-1] = self._covariances[-1] + learned.covariance
+        more["standardised"] = update.standardised_innovation
         return self._estimate(reason, detail, prediction=prediction, innovation=summary, **more)
 
     def check(

@@ -43,7 +43,6 @@ from mvest.observation.errors import (
 )
 from mvest.observation.vertices import require_frames
 from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
 from mvest.problem.stored import Extrapolated, Store, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
@@ -340,9 +339,8 @@ def expect_twin(config: Values, _folder: Path | None = None) -> str:
         return unknown_text(title, first.reason)
     std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
     noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
-    return expectation_text(
-        title, expect(replace(twin.problem, model=model), data.observation), noise
-    )
+    problem = replace(twin.problem, model=model)
+    return expectation_text(title, problem, data.observation, noise)
 
 
 def noise_words(known: str, std_mm: Sequence[float], length_mm: float) -> str:

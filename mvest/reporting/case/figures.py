@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
-from mvest.problem.fields import CaseFields, case_fields, read_case_fields, turn_of
+from mvest.problem.fields import CaseFields, case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     UNSEEN,
@@ -146,7 +146,7 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     Parameters
     ----------
     fields : CaseFields or Path
-        A path is read by `mvest.problem.fields.read_case_fields`.
+        A path is read by `mvest.problem.fields.case_fields`.
     names : sequence of str
         Of the leaflets, written beside them.
 
@@ -156,7 +156,7 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
         If a shape or its distances are missing.
     """
     if isinstance(fields, Path):
-        fields = read_case_fields(fields)
+        fields = case_fields(fields)
     k = fields.closed
     if fields.generic is None or fields.fitted is None:
         raise InputError("Figure 3 needs the generic and the personalised closed valve")
@@ -193,15 +193,14 @@ def fitted_figure(fields: Path) -> Figure:
     Parameters
     ----------
     fields : Path
-        As `mvest.problem.fields.read_case_fields` reads it, with the fitted shape and its
-        distances.
+        As `mvest.problem.fields.case_fields` reads it, with the fitted shape and its distances.
 
     Raises
     ------
     InputError
         If it cannot be read or has none.
     """
-    valve = read_case_fields(fields)
+    valve = case_fields(fields)
     if valve.fitted is None or valve.distance_fitted is None:
         raise InputError(f"{fields}: no fields of a fitted valve")
     k = valve.closed

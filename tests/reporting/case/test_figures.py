@@ -7,7 +7,7 @@ import pytest
 from matplotlib.collections import PolyCollection, QuadMesh
 
 from mvest.errors import InputError
-from mvest.problem.fields import read_case_fields
+from mvest.problem.fields import case_fields
 from mvest.reporting.case.drawing import BLOOD, LINE_PIECES, TISSUE, leak_of, quartered
 from mvest.reporting.case.figures import (
     case_figure,
@@ -32,7 +32,7 @@ def case(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fields(case):
-    return read_case_fields(case[1])
+    return case_fields(case[1])
 
 
 LINES = 2 * COLUMNS * LINE_PIECES
@@ -67,7 +67,7 @@ def test_a_valve_is_turned_the_same_way_however_it_lies(case, fields, tmp_path) 
     for name in ("rest", "observed", "generic", "registered", "fitted", "truth", "tips"):
         arrays[name] = arrays[name] @ turn.T + [50.0, -20.0, 300.0]
     np.savez(tmp_path / "turned.npz", **arrays)
-    turned = read_case_fields(tmp_path / "turned.npz")
+    turned = case_fields(tmp_path / "turned.npz")
     np.testing.assert_allclose(turned.rest, fields.rest, atol=1e-9)
     np.testing.assert_allclose(turned.observed, fields.observed, atol=1e-9)
     np.testing.assert_allclose(turned.tips, fields.tips, atol=1e-9)
@@ -104,7 +104,7 @@ def test_arrays_that_do_not_fit_are_named(case, tmp_path, name, value, message) 
         arrays = dict(stored) | {name: value}
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(InputError, match=message):
-        read_case_fields(tmp_path / "bad.npz")
+        case_fields(tmp_path / "bad.npz")
 
 
 # --- Figure 3 -----------------------------------------------------------------------------------
