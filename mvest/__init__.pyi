@@ -10,8 +10,8 @@ from .closure.model import ClosureModel as ClosureModel
 from .closure.robustness import run_gate as run_gate
 from .errors import MvestError as MvestError
 from .estimation.filters.ensemble import EnsembleFilter as EnsembleFilter
-from .estimation.filters.extended import ExtendedFilter as ExtendedFilter
 from .estimation.filters.importance import ImportanceFilter as ImportanceFilter
+from .estimation.filters.iterated import ExtendedFilter as ExtendedFilter
 from .estimation.filters.iterated import IteratedFilter as IteratedFilter
 from .estimation.filters.paper import PaperFilter as PaperFilter
 from .estimation.filters.unscented import UnscentedFilter as UnscentedFilter

@@ -32,14 +32,16 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
-from mvest.problem.skill import GENERIC, prior_alone, score
 from mvest.problem.verdict import TRUSTWORTHY
 from mvest.reading.npz import read_npz
 from mvest.reporting.skill import (
+    GENERIC,
     VERDICTS,
     interval,
     interval_columns,
     moduli_figure,
+    prior_alone,
+    score,
     skill_table,
     stated,
     trust_of,

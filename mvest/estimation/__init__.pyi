@@ -3,8 +3,8 @@ from .estimate import Estimate as Estimate
 from .estimate import InnovationSummary as InnovationSummary
 from .estimate import Reason as Reason
 from .filters.ensemble import EnsembleFilter as EnsembleFilter
-from .filters.extended import ExtendedFilter as ExtendedFilter
 from .filters.importance import ImportanceFilter as ImportanceFilter
+from .filters.iterated import ExtendedFilter as ExtendedFilter
 from .filters.iterated import IteratedFilter as IteratedFilter
 from .filters.paper import PaperFilter as PaperFilter
 from .filters.unscented import UnscentedFilter as UnscentedFilter

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import ndtri
 
 from mvest.estimation.information.identifiability import TradeOff, identifiability
 from mvest.estimation.noise import observation_noise
@@ -17,7 +18,6 @@ from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import unit_of
-from mvest.problem.skill import HALF
 from mvest.reporting.markup import listed
 from mvest.reporting.tables import Column, table
 
@@ -52,7 +52,9 @@ def expectation_text(title: str, problem: Problem, observation: Observed, noise:
     ]
     for when, std in (("_before", before.std), ("", after.std)):
         for end, sign in (("low", -1.0), ("high", 1.0)):
-            for row, value in zip(rows, transform.inverse(z + sign * HALF * std), strict=True):
+            for row, value in zip(
+                rows, transform.inverse(z + sign * ndtri(0.975) * std), strict=True
+            ):
                 row[end + when] = value
     expected = table(
         rows,

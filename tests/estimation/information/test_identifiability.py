@@ -65,3 +65,8 @@ def test_what_is_not_determined_is_told_as_such_and_not_as_a_correlation():
     found = identifiability(H, 1.0, np.ones(3), names=("a", "b", "c"))
     assert found.confounded() == ()
     assert any("a" in words and "not determined at all" in words for words in found.flat())
+
+
+def test_what_is_known_to_no_better_than_its_size_has_no_percentage():
+    found = identifiability(np.diag([1.0, 0.04]), 0.01, np.ones(2), names=("a", "b"))
+    assert found.flat() == ("1.00 b: known to no better than its own size",)
