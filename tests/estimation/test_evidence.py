@@ -377,15 +377,6 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
         lambda: NoiseFamily(FAMILY.blocks, {}, FAMILY.bands), "rough; quantities are given for none"
     ),
     "no bands": (lambda: NoiseFamily(FAMILY.blocks, {"rough": ROUGH}), "expected its bands"),
-    "too few bands": (
-        lambda: NoiseFamily(FAMILY.blocks, {"rough": ROUGH}, Gaussian(np.zeros(3), np.eye(3))),
-        "3 bands of a smooth part, expected 14",
-    ),
-    "scale": (lambda: NoiseBlock("rough", np.array([1.0, 0.0])), "scale of noise is 0"),
-    "basis of others": (lambda: NoiseBlock("rough", np.ones(3), 1, BASIS), "of 392 points"),
-    "columns": (
-        lambda: FAMILY.plus(ErrorColumns("tips", np.zeros((4, 2)))), r"shape \(4, 2\)"
-    ),
     "a name twice": (
         lambda: FAMILY.plus(ErrorColumns("rough", np.zeros((FAMILY.size, 1)))), "different names"
     ),
@@ -396,10 +387,6 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "all averaged away": (
         lambda: replace(FAMILY, resolution=0.0).at(FAMILY.prior.mean, np.inf), "no noise without"
-    ),
-    "resolution": (
-        lambda: NoiseFamily(FAMILY.blocks, {"rough": ROUGH}, FAMILY.bands, -1.0),
-        "resolution of -1.0",
     ),
 }  # fmt: skip
 
