@@ -34,8 +34,8 @@ from .personalisation.record import record_of_case as record_of_case
 from .personalisation.settings import PersonaliseSettings as PersonaliseSettings
 from .personalisation.settings import Prior as Prior
 from .personalisation.settings import default_settings as default_settings
+from .problem.estimate import Problem as Problem
 from .problem.estimate import estimate as estimate
-from .problem.problem import Problem as Problem
 from .problem.synthetic import simulate_observation as simulate_observation
 from .reporting.case.report import report as report
 from .valve.anatomy.dimensions import TemplateParameters as TemplateParameters

@@ -28,8 +28,7 @@ from mvest.estimation.information.consistency import nees
 from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.prediction import Remembered, predict
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, StudyResult, estimate
 from mvest.problem.record import finite, record_of
 from mvest.problem.synthetic import Truth
 from mvest.quantities import AxisCount, Count, Length, Logarithm, Share, TimeStep, Tolerance

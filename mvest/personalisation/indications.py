@@ -16,7 +16,7 @@ from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.personalisation.errors import WeighedObservation
 from mvest.personalisation.result import Personalised
-from mvest.problem.problem import Observed
+from mvest.problem.estimate import Observed
 from mvest.problem.verdict import APPROXIMATION, Held, Indications
 from mvest.typing import FloatArray
 

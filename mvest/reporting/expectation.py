@@ -16,7 +16,7 @@ from mvest.estimation.noise import observation_noise
 from mvest.estimation.prediction import predict
 from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
-from mvest.problem.problem import Observed, Problem
+from mvest.problem.estimate import Observed, Problem
 from mvest.problem.registration import unit_of
 from mvest.reporting.markup import listed
 from mvest.reporting.tables import Column, table

@@ -17,7 +17,7 @@ from mvest.estimation import (
 )
 from mvest.estimation.prediction import Remembered, SharedStart, as_prediction, of_some, predict
 from mvest.observation.vertices import Observation
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem
 from mvest.reporting.expectation import expectation_text
 
 H = np.random.default_rng(5).standard_normal((6, 2))

@@ -24,8 +24,7 @@ from mvest.observation.surfaces import (
     mean_surface_distance,
     surface_distance,
 )
-from mvest.problem.estimate import estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, estimate
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points

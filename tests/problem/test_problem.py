@@ -12,8 +12,7 @@ from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, StudyResult, estimate
 from mvest.problem.record import record_of
 from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth, TwinData, simulate_observation

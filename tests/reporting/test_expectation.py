@@ -6,8 +6,7 @@ import pytest
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction, identifiability
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, estimate
 from mvest.reporting.expectation import alike_words, expectation_text
 
 NAMES = ("E_f.anterior", "E_f.posterior", "pressure_scale")

@@ -42,8 +42,7 @@ from mvest.observation.errors import (
     WhiteNoise,
 )
 from mvest.observation.vertices import require_frames
-from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, StudyResult, estimate
 from mvest.problem.stored import Extrapolated, Store, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.reporting.expectation import expectation_text, unknown_text
