@@ -136,6 +136,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.estimation",
         "mvest.problem",
         "mvest.cases",
+        "mvest.personalisation.check",
         "mvest.personalisation.record",
         "mvest.personalisation.result",
     ),

@@ -208,7 +208,7 @@ def _patient(
     data = twin.observe(twin.source, truth, rng)
     step()
     if data.observation is None:
-        return StudyResult.failed(twin.problem, data.reason, 0.0), {}
+        return StudyResult.failed(twin.problem, data.reason), {}
     # From the open valve, so that no patient depends on the one before.
     twin.model.restart(None)
     steps = len(twin.model.settings.protocol.steps())

@@ -145,9 +145,9 @@ class StudyResult:
         return "\n".join(lines)
 
     @classmethod
-    def failed(cls, problem: Problem, reason: str, seconds: float) -> StudyResult:
+    def failed(cls, problem: Problem, reason: str) -> StudyResult:
         """The result of a study that had nothing to estimate from."""
-        return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, seconds)
+        return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, 0.0)
 
     def against(self, truth: Truth | None) -> StudyResult:
         """The same result, compared with the truth."""
@@ -167,13 +167,6 @@ class StudyResult:
         if self.estimate is None or self.filtered is None:
             return None
         return self.filtered.std
-
-    @property
-    def relative_error(self) -> FloatArray | None:
-        """(estimate - truth) / truth, ``(p,)``."""
-        if self.truth is None or self.estimate is None:
-            return None
-        return (self.estimate - self.truth.values) / self.truth.values
 
     @property
     def distance(self) -> FloatArray | None:

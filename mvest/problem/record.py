@@ -18,8 +18,9 @@ from pydantic import BaseModel, ConfigDict
 from mvest.errors import InputError
 from mvest.estimation.estimate import InnovationSummary
 from mvest.estimation.information.identifiability import TradeOff
+from mvest.mechanics.parameters import is_positive
 from mvest.problem.estimate import StudyResult
-from mvest.problem.registration import unit_of
+from mvest.problem.registration import REGISTRATION, unit_of
 from mvest.problem.verdict import NONE, Verdict
 from mvest.typing import FloatArray
 
@@ -110,6 +111,11 @@ class Unknown(Frozen):
     def is_modulus(self) -> bool:
         """Whether it is an estimated modulus of a leaflet."""
         return self.kind == "modulus"
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether its interval is that of its logarithm."""
+        return self.name not in REGISTRATION and is_positive(self.name)
 
     @property
     def relative_error(self) -> float | None:

@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import beta, norm
 
-from mvest.mechanics.parameters import is_positive
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.registration import REGISTRATION
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.tables import Column, Table, table
 
@@ -39,7 +37,7 @@ def prior_alone(unknown: Unknown) -> Unknown:
     mean, std = unknown.prior_mean, unknown.prior_std
     if mean is None or std is None:
         return _with(unknown, mean, std)
-    if _is_log(unknown):
+    if unknown.is_positive:
         factor = float(np.exp(HALF * std / mean))
         return _with(unknown, mean, std, mean / factor, mean * factor)
     return _with(unknown, mean, std, mean - HALF * std, mean + HALF * std)
@@ -122,7 +120,7 @@ def score(unknown: Unknown) -> float | None:
     if any(value is None for value in values):
         return None
     known = np.array(values, dtype=np.float64)
-    truth, estimate, low, high = np.log(known) if _is_log(unknown) else known
+    truth, estimate, low, high = np.log(known) if unknown.is_positive else known
     return float(2 * HALF * (truth - estimate) / (high - low))
 
 
@@ -151,10 +149,6 @@ def _errors(unknowns: Iterable[Unknown], unit: str) -> list[float]:
 def _scale(unknown: Unknown, unit: str) -> float:
     """By which errors of an unknown are multiplied: to a share of the truth in %, or 1."""
     return 1.0 if unit or not unknown.truth else 100.0 / unknown.truth
-
-
-def _is_log(unknown: Unknown) -> bool:
-    return unknown.name not in REGISTRATION and is_positive(unknown.name)
 
 
 VERDICTS = (TRUSTWORTHY, DOUBTFUL, NONE)

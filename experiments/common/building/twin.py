@@ -295,7 +295,7 @@ def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[Stud
         for seed in seeds:
             data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
             if data.observation is None:
-                return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
+                return [StudyResult.failed(twin.problem, data.reason) for _ in seeds]
             result = estimate(problem, data.observation, on_iterate=bar.iterate)
             results.append(result.against(data.truth))
     return results

@@ -18,7 +18,7 @@ import scipy
 from mvest.errors import InputError
 from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance, observation_noise
-from mvest.estimation.prediction import require_finite, require_positive
+from mvest.estimation.prediction import require_positive
 from mvest.typing import FloatArray
 
 NOISE_RANGE = (1e-6, 1e6)
@@ -51,15 +51,8 @@ class Design:
         Raises
         ------
         InputError
-            If shapes disagree or a value is not admissible.
+            If a value is not positive.
         """
-        H, values = np.asarray(H, dtype=np.float64), np.asarray(values, dtype=np.float64)
-        if H.ndim != 2 or H.shape[1] != len(names) or values.shape != (len(names),):
-            raise InputError(
-                f"a design of {len(names)} parameters has a Jacobian of shape {H.shape} and values "
-                f"of shape {values.shape}"
-            )
-        require_finite(H, "the Jacobian")
         require_positive(values, "a value of a design")
         return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))
 

@@ -259,21 +259,8 @@ def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray
     Returns
     -------
     (p,) in the filter's coordinates
-
-    Raises
-    ------
-    InputError
-        If there is no prediction, or the offset does not belong to it or is not finite.
     """
-    offset = np.asarray(offset, dtype=np.float64)
-    if found.prediction is None:
-        raise InputError("an estimate without a prediction has no derivatives")
-    if offset.shape != found.prediction.y.shape:
-        raise InputError(
-            f"offset of shape {offset.shape}, expected that of the prediction: "
-            f"{found.prediction.y.shape}"
-        )
-    require_finite(offset, "the error of the model")
+    assert found.prediction is not None
     noise, prior = observation_noise(R, len(offset)), to_filter(found.transform, found.prior)
     H = found.prediction.jacobian * found.transform.derivative(found.transformed.mean)
     return kalman_update(prior, offset, H, noise).posterior.mean - prior.mean
