@@ -182,6 +182,11 @@ class Estimate:
         return self.reason.converged
 
     @property
+    def trusted(self) -> bool:
+        """Whether the filter converged, and no check of its posterior fails."""
+        return self.converged and (self.check is None or self.check.holds)
+
+    @property
     def why(self) -> str:
         """Why the filter stopped, and what is wrong with its posterior if anything is."""
         if self.check is None or self.check.holds:

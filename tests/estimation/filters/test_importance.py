@@ -13,8 +13,7 @@ def test_a_banana_is_drawn_as_one(y, R) -> None:
     prior = Gaussian(np.array([0.3, 0.0]), np.eye(2))
     mean, std, kurtosis = gridded(banana, prior, np.array([y]), R)
     found = ImportanceFilter(effective=100.0)(banana, prior, np.array([y]), R)
-    assert found.converged, found.why
-    assert found.check.holds, found.why
+    assert found.trusted, found.why
     # Four standard errors of a mean of 100 effective draws, and of a standard deviation of theirs.
     assert np.all(np.abs(found.mean - mean) < 4.0 * std / 10.0)
     # The latter has the relative variance (kurtosis - 1)/(4 n).
@@ -27,8 +26,7 @@ def test_both_wings_are_seen(seed) -> None:
     prior = Gaussian(np.array([0.05]), np.eye(1))
     mean, std, _ = gridded(wings, prior, np.array([1.3]), 0.05)
     found = ImportanceFilter(seed=seed)(wings, prior, np.array([1.3]), 0.05)
-    assert found.converged, found.why
-    assert found.check.holds, found.why
+    assert found.trusted, found.why
     assert abs(found.mean[0] - mean[0]) < 4.0 * std[0] / np.sqrt(60.0)
     assert found.std[0] == pytest.approx(std[0], rel=0.2)
     low, high = found.interval()
@@ -62,7 +60,7 @@ def test_too_few_runs_are_said_to_be_too_few() -> None:
         problem.differentiated, problem.prior, problem.y, problem.R
     )
     assert found.reason is Reason.NOT_SAMPLED
-    assert not (found.converged and found.check.holds)
+    assert not found.trusted
     assert "effective" in found.why + found.detail
 
 
