@@ -10,8 +10,8 @@ from .closure.model import ClosureModel as ClosureModel
 from .closure.robustness import run_gate as run_gate
 from .errors import MvestError as MvestError
 from .estimation.filters.ensemble import EnsembleFilter as EnsembleFilter
-from .estimation.filters.extended import ExtendedFilter as ExtendedFilter
 from .estimation.filters.importance import ImportanceFilter as ImportanceFilter
+from .estimation.filters.iterated import ExtendedFilter as ExtendedFilter
 from .estimation.filters.iterated import IteratedFilter as IteratedFilter
 from .estimation.filters.paper import PaperFilter as PaperFilter
 from .estimation.filters.unscented import UnscentedFilter as UnscentedFilter
@@ -34,8 +34,8 @@ from .personalisation.record import record_of_case as record_of_case
 from .personalisation.settings import PersonaliseSettings as PersonaliseSettings
 from .personalisation.settings import Prior as Prior
 from .personalisation.settings import default_settings as default_settings
+from .problem.estimate import Problem as Problem
 from .problem.estimate import estimate as estimate
-from .problem.problem import Problem as Problem
 from .problem.synthetic import simulate_observation as simulate_observation
 from .reporting.case.report import report as report
 from .valve.anatomy.dimensions import TemplateParameters as TemplateParameters

@@ -27,7 +27,7 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError
-from mvest.estimation.information.design import Design, together
+from mvest.estimation.information.design import Design, needed, together
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
@@ -41,7 +41,7 @@ from mvest.personalisation.design import (
 from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
-from mvest.problem.record import EstimateRecord, confounded, finite, record_of
+from mvest.problem.record import EstimateRecord, finite, record_of
 from mvest.quantities import (
     BeatTime,
     Count,
@@ -120,6 +120,10 @@ def run(job: Job[Settings]) -> Result:
         return _valve_designs(job.values, job.settings.designs)
     except GeometryError as error:
         return Result(status="failed", reason=str(error))
+
+
+KNOWN = (1e-5, 1e2)
+"""Relative standard deviations between which a needed knowledge is looked for."""
 
 
 # -- one configured valve -------------------------------------------------------------------------
@@ -218,16 +222,17 @@ def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
     """Each modulus with each knowledge of the nuisances."""
     target, typical = f"{100 * settings.target:g} %", f"{settings.typical_mm:g} mm"
     for (knowledge, stds), name in product(settings.knowledge.items(), _moduli(design)):
+        noise = design.needed_noise(name, settings.target, stds)
         yield {
             "knowledge of the nuisances": knowledge,
             "parameter": name,
             **{
-                f"std at {noise:g} mm": finite(100 * design.std(name, noise, stds))
-                for noise in settings.noise_mm
+                f"std at {mm:g} mm": finite(100 * design.std(name, mm, stds))
+                for mm in settings.noise_mm
             },
-            f"noise for {target}": finite(design.needed_noise(name, settings.target, stds)),
+            f"noise for {target}": finite(noise),
             f"observations of {typical} for {target}": finite(
-                design.needed_repeats(name, settings.target, settings.typical_mm, stds)
+                (settings.typical_mm / noise) ** 2 if noise else np.inf
             ),
         }
 
@@ -239,18 +244,25 @@ def _pressures(settings: DesignsSettings, about: Row, design: Design) -> Iterato
     """
     if "pressure_scale" in design.names:
         half = settings.knowledge.get(settings.believed, {})
-        asked = settings.target, settings.typical_mm, "pressure_scale", half
         for name in _moduli(design):
-            needed = finite(100 * design.needed_knowledge(name, *asked))
-            frames, errors = about["frames"], about["errors"]
-            yield {"frames": frames, "errors": errors, "parameter": name, "known to": needed}
+
+            def relative(std: float, name: str = name) -> float:
+                known = {**half, "pressure_scale": std}
+                return design.std(name, settings.typical_mm, known) / settings.target
+
+            yield {
+                "frames": about["frames"],
+                "errors": about["errors"],
+                "parameter": name,
+                "known to": finite(100 * needed(relative, KNOWN)),
+            }
 
 
 def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) -> Iterator[Row]:
     """Changes of parameters that hardly show together, where nothing is known of nuisances."""
     for about, design in designs:
         bound = design.at(settings.typical_mm, dict.fromkeys(settings.known, 0.0))
-        for group in confounded(bound):
+        for group in bound.confounded():
             moved = zip(group.parameters, group.relative, strict=True)
             yield {
                 "frames": about["frames"],

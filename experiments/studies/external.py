@@ -30,8 +30,7 @@ from mvest.exchange.external.contract import (
 )
 from mvest.exchange.external.model import Differences, ProcessModel
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, estimate
 from mvest.problem.record import EstimateRecord, record_of
 from mvest.reporting.tables import Column, table
 from mvest.typing import FloatArray

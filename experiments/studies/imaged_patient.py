@@ -34,11 +34,12 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.skill import GENERIC, generic_guess
 from mvest.problem.stored import Store
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import (
+    GENERIC,
+    generic_guess,
     interval,
     interval_columns,
     moduli_figure,

@@ -59,9 +59,8 @@ from mvest.exchange.surfaces import part_of, read_surface
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import estimate
+from mvest.problem.estimate import Problem, estimate
 from mvest.problem.fields import valve_fields
-from mvest.problem.problem import Problem
 from mvest.problem.record import EstimateRecord, record_of
 from mvest.quantities import Length, Share, Thickness
 from mvest.reporting.skill import estimates_table

@@ -32,14 +32,16 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
-from mvest.problem.skill import GENERIC, prior_alone, score
 from mvest.problem.verdict import TRUSTWORTHY
 from mvest.reading.npz import read_npz
 from mvest.reporting.skill import (
+    GENERIC,
     VERDICTS,
     interval,
     interval_columns,
     moduli_figure,
+    prior_alone,
+    score,
     skill_table,
     stated,
     trust_of,
@@ -464,12 +466,12 @@ def figure(results: Results) -> dict[str, Figure]:
         return {"moduli": moduli_figure(_drawn(patients))}
     if results.first.table == CALIBRATION:
         return {"ranks": ranks_figure(_by_scenario(patients))}
-    from mvest.problem.fields import read_case_fields
+    from mvest.problem.fields import case_fields
 
     names = {id(record): name for name, record in results.records.items()}
     places = {estimate.case: names[id(record)] for record, estimate in patients}
     fields = {
-        case: read_case_fields(results.arrays[name])
+        case: case_fields(results.arrays[name])
         for case, name in places.items()
         if name in results.arrays
     }

@@ -208,7 +208,7 @@ def _patient(
     data = twin.observe(twin.source, truth, rng)
     step()
     if data.observation is None:
-        return StudyResult.failed(twin.problem, data.reason, 0.0), {}
+        return StudyResult.failed(twin.problem, data.reason), {}
     # From the open valve, so that no patient depends on the one before.
     twin.model.restart(None)
     steps = len(twin.model.settings.protocol.steps())
@@ -342,7 +342,7 @@ def figure(results: Results) -> Figure | None:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    from mvest.problem.fields import read_case_fields
+    from mvest.problem.fields import case_fields
     from mvest.reporting.case import drawing
     from mvest.reporting.figures import ATRIUM, SMALL, TEXT
 
@@ -350,7 +350,7 @@ def figure(results: Results) -> Figure | None:
     if name not in results.arrays:
         return None
     reach = float(record.numbers["contact_reach_mm"])  # type: ignore[arg-type]
-    valve = replace(read_case_fields(results.arrays[name], turned=False), reach_mm=reach)
+    valve = replace(case_fields(results.arrays[name], turned=False), reach_mm=reach)
     assert valve.fitted is not None
     rows, failed = record.table_of().frame, record.table_of("not_closed").frame
     drawn = Figure(figsize=(max(2.7 * len(valve.frames), 8.0), 8.6), layout="constrained")

@@ -24,12 +24,12 @@ from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case, write_case
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.registration import REGISTRATION
-from mvest.problem.skill import prior_alone
 from mvest.reporting.skill import (
     VERDICTS,
     interval,
     interval_columns,
     moduli_figure,
+    prior_alone,
     skill_table,
     stated,
     trust_of,

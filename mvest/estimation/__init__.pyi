@@ -3,8 +3,8 @@ from .estimate import Estimate as Estimate
 from .estimate import InnovationSummary as InnovationSummary
 from .estimate import Reason as Reason
 from .filters.ensemble import EnsembleFilter as EnsembleFilter
-from .filters.extended import ExtendedFilter as ExtendedFilter
 from .filters.importance import ImportanceFilter as ImportanceFilter
+from .filters.iterated import ExtendedFilter as ExtendedFilter
 from .filters.iterated import IteratedFilter as IteratedFilter
 from .filters.paper import PaperFilter as PaperFilter
 from .filters.unscented import UnscentedFilter as UnscentedFilter
@@ -18,7 +18,6 @@ from .information.design import Design as Design
 from .information.design import together as together
 from .information.identifiability import Identifiability as Identifiability
 from .information.identifiability import TradeOff as TradeOff
-from .information.identifiability import cramer_rao_bound as cramer_rao_bound
 from .information.identifiability import identifiability as identifiability
 from .information.identifiability import shift_by_model_error as shift_by_model_error
 from .information.identifiability import with_shift as with_shift

@@ -41,7 +41,7 @@ class Reason(Enum):
         return self in (Reason.CONVERGED, Reason.COMPLETED)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class InnovationSummary:
     """The innovation of the prior and how well its covariance S explains it.
 
@@ -58,23 +58,20 @@ class InnovationSummary:
         Number n of observations.
     rms, max_abs : float, in units of the observation
         Root mean square and largest absolute value of e.
-    residual_rms : float, in units of the observation
-        Root mean square of the residual y − h(z), of the estimate itself.
     nis : float
         eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right.
-    log_likelihood : float
-        log N(e; 0, S).
-    standardised : (n,)
-        S^(-1/2) e, to be tested for whiteness.
+    nis_band : (float, float)
+        Band that holds such a number with 95 % probability.
+    residual_rms : float, in units of the observation
+        Root mean square of the residual y − h(z), of the estimate itself.
     """
 
     size: int
     rms: float
     max_abs: float
-    residual_rms: float
     nis: float
-    log_likelihood: float
-    standardised: FloatArray
+    nis_band: tuple[float, float]
+    residual_rms: float | None = None
 
     @classmethod
     def of(
@@ -85,21 +82,10 @@ class InnovationSummary:
             size=innovation.size,
             rms=float(np.sqrt(np.mean(innovation**2))),
             max_abs=float(np.max(np.abs(innovation))),
-            residual_rms=float(np.sqrt(np.mean(residual**2))),
             nis=update.nis,
-            log_likelihood=update.log_likelihood,
-            standardised=update.standardised_innovation,
+            nis_band=chi_square_band(innovation.size),
+            residual_rms=float(np.sqrt(np.mean(residual**2))),
         )
-
-    @property
-    def nis_band(self) -> tuple[float, float]:
-        """Band that holds such a number as `nis` with 95 % probability."""
-        return chi_square_band(self.size)
-
-    @property
-    def consistent(self) -> bool:
-        """Whether `nis` lies in its band."""
-        return self.nis_band[0] <= self.nis <= self.nis_band[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,6 +118,8 @@ class Estimate:
         the slope that the filter found with its points.
     innovation : InnovationSummary or None
         Innovation at the last iterate; None if the model failed there.
+    standardised : (n,) or None
+        S^(-1/2) e of the same, to be tested for whiteness.
     reason : Reason
     detail : str
         Numbers to the reason, or the failed model's own words.
@@ -160,6 +148,7 @@ class Estimate:
     reason: Reason
     detail: str
     forward_solves: int
+    standardised: FloatArray | None = None
     transformed_samples: FloatArray | None = None
     learned: LearnedNoise | None = None
     check: ApproximationCheck | None = None

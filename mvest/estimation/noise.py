@@ -24,7 +24,7 @@ import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import SYMMETRY_TOLERANCE, Gaussian
-from mvest.estimation.prediction import read_only, require_finite, require_positive
+from mvest.estimation.prediction import require_finite, require_positive
 from mvest.estimation.spectrum import BANDS, Basis, LogNormal, bands_of
 from mvest.typing import FloatArray, IntArray
 
@@ -223,15 +223,6 @@ class NoiseBlock:
     basis: Basis | None = None
     frame: str | None = None
 
-    def __post_init__(self) -> None:
-        scale = np.array(self.scale, dtype=np.float64)
-        if scale.ndim != 1 or not scale.size or self.coordinates < 1:
-            raise InputError(f"noise of scale {scale.shape}, expected one for each of its points")
-        require_positive(scale, "scale of noise")
-        if self.basis is not None and len(self.basis.U) != len(scale):
-            raise InputError(f"smooth noise of {len(self.basis.U)} points, expected {len(scale)}")
-        object.__setattr__(self, "scale", read_only(scale))
-
     @property
     def size(self) -> int:
         """Number of observations."""
@@ -272,14 +263,6 @@ class ErrorColumns:
     columns: FloatArray
     factor: float = 1.0
 
-    def __post_init__(self) -> None:
-        columns = np.array(self.columns, dtype=np.float64)
-        if columns.ndim != 2:
-            raise InputError(f"added noise {self.name} has shape {columns.shape}, expected (n, q)")
-        require_finite(columns, f"added noise {self.name}")
-        LogNormal(1.0, self.factor)
-        object.__setattr__(self, "columns", read_only(columns))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFamily:
@@ -317,19 +300,8 @@ class NoiseFamily:
             )
         if self.bands is None and any(block.basis is not None for block in self.blocks):
             raise InputError("a smooth part, of which nothing is believed; expected its bands")
-        if self.bands is not None and self.bands.size != BANDS:
-            raise InputError(f"{self.bands.size} bands of a smooth part, expected {BANDS}")
-        if not (np.isfinite(self.resolution) and self.resolution >= 0.0):
-            raise InputError(f"resolution of {self.resolution}, expected >= 0")
-        names = self.names
-        if len(set(names)) != len(names):
-            raise InputError(f"noise of {', '.join(names)}: expected different names")
-        for columns in self.columns:
-            if len(columns.columns) != self.size:
-                raise InputError(
-                    f"added noise {columns.name} has shape {columns.columns.shape}, expected "
-                    f"({self.size}, q)"
-                )
+        if len(set(self.names)) != len(self.names):
+            raise InputError(f"noise of {', '.join(self.names)}: expected different names")
 
     @property
     def size(self) -> int:

@@ -79,10 +79,7 @@ class FilterRun:
         self._on_iterate = on_iterate
         self._last: tuple[FloatArray, Prediction] | None = None
         self._runs: list[Run] = []
-        self._iterates: list[FloatArray] = []
-        self._covariances: list[FloatArray] = []
-        self._objectives: list[float] = []
-        self._log_likelihoods: list[float] = []
+        self._history: list[tuple[FloatArray, FloatArray, float, float]] = []
 
     def z(self, x: FloatArray) -> FloatArray:
         """Filter coordinates m + L x (p,)."""
@@ -133,12 +130,9 @@ class FilterRun:
 
     def record(self, z: FloatArray, P: FloatArray, objective: float, log_likelihood: float) -> None:
         """Append an iterate (filter coordinates) to the history."""
-        self._iterates.append(np.array(z))
-        self._covariances.append(np.array(P))
-        self._objectives.append(objective)
-        self._log_likelihoods.append(log_likelihood)
+        self._history.append((np.array(z), np.array(P), objective, log_likelihood))
         if self._on_iterate is not None:
-            number = len(self._iterates) - 1
+            number = len(self._history) - 1
             self._on_iterate(number, self.transform.inverse(z).copy(), objective)
 
     def finish(
@@ -166,7 +160,9 @@ class FilterRun:
             # Of the posterior with the noise as it is; what widens it has no part in its form.
             more["check"] = self.check(prediction, prior=prior)
         if learned := more.get("learned"):
-            self._covariances[-1] = self._covariances[-1] + learned.covariance
+            z, P, *values = self._history[-1]
+            self._history[-1] = (z, P + learned.covariance, *values)
+        more["standardised"] = update.standardised_innovation
         return self._estimate(reason, detail, prediction=prediction, innovation=summary, **more)
 
     def check(
@@ -180,7 +176,7 @@ class FilterRun:
 
         All runs of the model are compared with. ``others`` are what the filter itself has compared.
         """
-        z, P = self._iterates[-1], self._covariances[-1]
+        z, P, *_ = self._history[-1]
         if not np.all(np.isfinite(P)) or not np.any(P):
             return worst(others)
         checks = check_against_runs(
@@ -246,14 +242,17 @@ class FilterRun:
         return self._estimate(Reason.MODEL_FAILED, detail, prediction=None, innovation=None)
 
     def _estimate(self, reason: Reason, detail: str, **more: Any) -> Estimate:
+        iterates, covariances, objective, log_likelihood = (
+            read_only(np.array(column)) for column in zip(*self._history, strict=True)
+        )
         return Estimate(
             names=self.names,
             prior=self.physical_prior,
             transform=self.transform,
-            transformed_iterates=read_only(np.array(self._iterates)),
-            transformed_iterate_covariances=read_only(np.array(self._covariances)),
-            objective=read_only(np.array(self._objectives)),
-            log_likelihood=read_only(np.array(self._log_likelihoods)),
+            transformed_iterates=iterates,
+            transformed_iterate_covariances=covariances,
+            objective=objective,
+            log_likelihood=log_likelihood,
             reason=reason,
             detail=detail,
             forward_solves=self.forward_solves,

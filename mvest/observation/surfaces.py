@@ -50,7 +50,13 @@ from mvest.estimation.noise import (
     scaled_noise,
     stacked_noise,
 )
-from mvest.estimation.prediction import ObservationModel, Prediction, predict
+from mvest.estimation.prediction import (
+    ObservationModel,
+    Prediction,
+    predict,
+    read_only,
+    require_finite,
+)
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import FRAMES, scales
 from mvest.typing import BoolArray, FloatArray, IntArray
@@ -112,11 +118,10 @@ class ObservedSurface:
             j = len(self.free_edge)
         if self.scale is not None:
             checked["scale"] = scales(f"scale of the points {where}", self.scale, q)
-        numbers = {"region": _numbers(f"regions {where}", self.region, UNKNOWN, shape=(q,))}
+        numbers = {"region": _regions(f"regions {where}", self.region, q)}
         if self.free_edge_region is not None:
             what = f"regions of the free edge {where}"
-            own = _numbers(what, self.free_edge_region, UNKNOWN, shape=(j,))
-            numbers["free_edge_region"] = own
+            numbers["free_edge_region"] = _regions(what, self.free_edge_region, j)
         for name, values in {**checked, **numbers}.items():
             object.__setattr__(self, name, values)
 
@@ -169,11 +174,6 @@ class PredictedSurface:
         The surface's vertices, of those that are predicted; None: they are the same.
     width : float
         mm, over which the surface is smoothed where it has weights.
-
-    Raises
-    ------
-    InputError
-        On wrong shapes and numbers out of range.
     """
 
     n_vertices: int
@@ -182,26 +182,6 @@ class PredictedSurface:
     free_edge: IntArray | None = None
     weights: csr_array | None = None
     width: float = 0.0
-
-    def __post_init__(self) -> None:
-        last = self.n_vertices - 1
-        if self.weights is not None:
-            if self.weights.shape[1] != self.n_vertices:
-                raise InputError(
-                    f"weights: shape {self.weights.shape}, expected (r, {self.n_vertices})"
-                )
-            last = self.weights.shape[0] - 1
-        triangles = _numbers("triangles", self.triangles, 0, last)
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
-            raise InputError(f"triangles: shape {triangles.shape}, expected (m, 3)")
-        region = _numbers("region", self.region, 0, shape=(len(triangles),))
-        object.__setattr__(self, "triangles", triangles)
-        object.__setattr__(self, "region", region)
-        if self.free_edge is not None:
-            loop = _numbers("free_edge", self.free_edge, 0, last)
-            if loop.ndim != 1 or len(loop) < 3 or len(np.unique(loop)) != len(loop):
-                raise InputError("free_edge: expected a loop of three or more different vertices")
-            object.__setattr__(self, "free_edge", loop)
 
     @classmethod
     def of_valve(cls, valve: Valve) -> PredictedSurface:
@@ -483,11 +463,8 @@ def _points(what: str, values: FloatArray) -> FloatArray:
     points = np.array(values, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{what}: shape {points.shape}, expected (q, 3) mm")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if bad.size:
-        raise InputError(f"{what}: point {bad[0]} is {points[bad[0]]}, expected finite numbers")
-    points.setflags(write=False)
-    return points
+    require_finite(points, what)
+    return read_only(points)
 
 
 def _curve(what: str, values: FloatArray) -> FloatArray:
@@ -503,23 +480,12 @@ def _curve(what: str, values: FloatArray) -> FloatArray:
     return curve
 
 
-def _numbers(
-    what: str,
-    values: IntArray,
-    least: int,
-    most: int | None = None,
-    shape: tuple[int, ...] | None = None,
-) -> IntArray:
+def _regions(what: str, values: IntArray, size: int) -> IntArray:
     given = np.asarray(values)
-    if given.size and not np.issubdtype(given.dtype, np.integer):
-        raise InputError(f"{what}: {given.dtype}, expected integers")
-    if shape is not None and given.shape != shape:
-        raise InputError(f"{what}: shape {given.shape}, expected {shape}")
-    numbers = np.array(given, dtype=np.int64)
-    if numbers.size and (numbers.min() < least or (most is not None and numbers.max() > most)):
-        raise InputError(
-            f"{what}: numbers from {numbers.min()} to {numbers.max()}, expected {least} to "
-            f"{'any' if most is None else most}"
-        )
-    numbers.setflags(write=False)
-    return numbers
+    if given.shape != (size,):
+        raise InputError(f"{what}: shape {given.shape}, expected ({size},)")
+    if size and (not np.issubdtype(given.dtype, np.integer) or given.min() < UNKNOWN):
+        raise InputError(f"{what}: {given.min()}, expected integers from {UNKNOWN} on")
+    regions = np.array(given, dtype=np.int64)
+    regions.setflags(write=False)
+    return regions

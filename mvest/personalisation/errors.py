@@ -42,7 +42,7 @@ from mvest.personalisation.sources import (
     law_and_mesh_sources,
     of_low_rank,
 )
-from mvest.problem.problem import Observed
+from mvest.problem.estimate import Observed
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 

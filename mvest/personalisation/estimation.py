@@ -41,8 +41,7 @@ from mvest.personalisation.model import (
     with_pressures,
 )
 from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Prior, Treatment
-from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.problem import Observed, Problem
+from mvest.problem.estimate import Observed, Problem, StudyResult, estimate
 from mvest.problem.registration import REGISTRATION
 from mvest.typing import FloatArray
 

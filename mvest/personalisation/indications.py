@@ -16,7 +16,7 @@ from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.personalisation.errors import WeighedObservation
 from mvest.personalisation.result import Personalised
-from mvest.problem.problem import Observed
+from mvest.problem.estimate import Observed
 from mvest.problem.verdict import APPROXIMATION, Held, Indications
 from mvest.typing import FloatArray
 
@@ -74,8 +74,8 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         stretch=moved,
         data_alone={one.parameter: one.prior_stds for one in fit.known.data_alone},
         alike=None
-        if innovation is None or result.observation is None
-        else _alike(result.observation, innovation.standardised),
+        if filtered.standardised is None or result.observation is None
+        else _alike(result.observation, filtered.standardised),
         held_out=tuple(
             Held(
                 one.frame,

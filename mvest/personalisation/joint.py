@@ -16,7 +16,7 @@ from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
 from mvest.personalisation.errors import FrameErrors
-from mvest.problem.problem import Observed
+from mvest.problem.estimate import Observed
 from mvest.typing import FloatArray
 
 T = TypeVar("T")

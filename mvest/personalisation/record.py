@@ -246,9 +246,9 @@ def _errors(result: StudyResult) -> Iterator[Row]:
 def _whiteness(fit: Personalised) -> Iterator[Row]:
     """Tests of the standardised innovation of the closed frame."""
     filtered, surface = fit.result.filtered, fit.case.surface
-    if filtered is None or filtered.innovation is None:
+    if filtered is None or filtered.standardised is None:
         return
-    standardised = filtered.innovation.standardised
+    standardised = filtered.standardised
     tests = {"mean zero": zero_mean(standardised)}
     if standardised.size == surface.vertices.size * (1 + len(fit.case.fitted)):
         adjacency = _adjacency(len(surface.vertices), surface.triangles)

@@ -25,7 +25,7 @@ from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.personalisation.geometry import rest_lengths_by_ends
 from mvest.personalisation.sources import TOLERANCE
-from mvest.problem.problem import Observed
+from mvest.problem.estimate import Observed
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
 from mvest.valve.geometry.proximity import closest_points

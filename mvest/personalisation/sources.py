@@ -24,7 +24,7 @@ from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import Simulation
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalisation.geometry import GeometryModes
-from mvest.problem.problem import Observed
+from mvest.problem.estimate import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
 

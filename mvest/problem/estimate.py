@@ -9,17 +9,90 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, OnIterate
+from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability, identifiability
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel
+from mvest.estimation.run import Filter
+from mvest.estimation.transform import Transform
 from mvest.mechanics.settings import TissueSettings
-from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth
 from mvest.typing import FloatArray
+
+
+class Observed(Protocol):
+    """What an estimation needs of an observation, whatever its kind."""
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the observed frames, the closed one last."""
+        ...
+
+    @property
+    def y(self) -> FloatArray:
+        """The observation ``(k,)``."""
+        ...
+
+    @property
+    def R(self) -> NoiseCovariance:
+        """Covariance of ``y``."""
+        ...
+
+    def of(self, model: ObservationModel, /) -> ObservationModel:
+        """What a model that predicts all frames, stacked, predicts of this observation.
+
+        Its predictions have for ``aux`` the observed frames ``(f, n, 3)`` mm with all vertices.
+        """
+        ...
+
+    def distance(self, fitted: FloatArray) -> FloatArray:
+        """Distances (mm) of what was seen in the last frame to fitted ``(f, n, 3)``."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Everything an estimation needs besides the observation.
+
+    Attributes
+    ----------
+    parameters : tuple of str, (p,)
+        Names of the unknowns, for example ``E_f.anterior``.
+    model : ObservationModel
+        Predicts all frames, stacked.
+    prior : Gaussian
+        Of the parameters themselves.
+    filter : Filter
+    transform : Transform
+    tissue : mapping
+        Region -> the fixed ratios from which its other moduli follow.
+    """
+
+    parameters: tuple[str, ...]
+    model: ObservationModel
+    prior: Gaussian
+    filter: Filter
+    transform: Transform
+    tissue: Mapping[str, TissueSettings]
+
+    def __post_init__(self) -> None:
+        if self.prior.size != len(self.parameters):
+            raise InputError(
+                f"the prior has {self.prior.size} parameters, the problem names "
+                f"{len(self.parameters)}: {', '.join(self.parameters)}"
+            )
+
+    @property
+    def start(self) -> FloatArray:
+        """Parameters ``(p,)`` at which filters start: the prior's mean but for its last bit."""
+        return self.transform.inverse(self.transform.forward(self.prior.mean))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,9 +145,9 @@ class StudyResult:
         return "\n".join(lines)
 
     @classmethod
-    def failed(cls, problem: Problem, reason: str, seconds: float) -> StudyResult:
+    def failed(cls, problem: Problem, reason: str) -> StudyResult:
         """The result of a study that had nothing to estimate from."""
-        return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, seconds)
+        return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, 0.0)
 
     def against(self, truth: Truth | None) -> StudyResult:
         """The same result, compared with the truth."""
@@ -94,13 +167,6 @@ class StudyResult:
         if self.estimate is None or self.filtered is None:
             return None
         return self.filtered.std
-
-    @property
-    def relative_error(self) -> FloatArray | None:
-        """(estimate - truth) / truth, ``(p,)``."""
-        if self.truth is None or self.estimate is None:
-            return None
-        return (self.estimate - self.truth.values) / self.truth.values
 
     @property
     def distance(self) -> FloatArray | None:

@@ -7,7 +7,8 @@ report can say so instead of drawing something else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,12 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve
 
 POINTS = "observed_points_"
-SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
-"""Arrays of positions, which turn with the valve."""
+NEEDED = ("triangles", "region", "rest", "annulus", "frames", "seen")
+"""Arrays that every case has."""
+INDICES = ("triangles", "region", "annulus", "free_edge", "chord_tip", "chord_insertion")
+SEEN = ("observed", "generic", "registered", "fitted", "truth")
+"""Shapes in all frames."""
+NO_INDEX: IntArray = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,13 +66,13 @@ class CaseFields:
     region: IntArray
     rest: FloatArray
     annulus: IntArray
-    free_edge: IntArray
     frames: tuple[str, ...]
     seen: BoolArray
     tips: FloatArray
-    chord_tip: IntArray
-    chord_insertion: IntArray
     observed_points: Mapping[str, FloatArray]
+    free_edge: IntArray = field(default_factory=lambda: NO_INDEX)
+    chord_tip: IntArray = field(default_factory=lambda: NO_INDEX)
+    chord_insertion: IntArray = field(default_factory=lambda: NO_INDEX)
     observed: FloatArray | None = None
     generic: FloatArray | None = None
     registered: FloatArray | None = None
@@ -83,7 +88,7 @@ class CaseFields:
             raise InputError(f"{f} frames and seen {self.seen.shape}, expected ({f},) and f > 0")
         if self.region.shape != (len(self.triangles),):
             raise InputError(f"region {self.region.shape}, expected ({len(self.triangles)},)")
-        for name in ("observed", "generic", "registered", "fitted", "truth"):
+        for name in SEEN:
             _check(name, getattr(self, name), (f, n, 3))
         for name in ("distance_generic", "distance_fitted"):
             _check(name, getattr(self, name), (f, n))
@@ -129,24 +134,7 @@ def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]
     }
 
 
-def read_case_fields(path: Path, *, turned: bool = True) -> CaseFields:
-    """Read ``fields.npz``; see `case_fields`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or as `case_fields` does.
-    """
-    try:
-        arrays = read_npz(path, where=path.name)
-    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise InputError(f"{path}: no fields of a case ({one_line(error, 200)})") from error
-    return case_fields(arrays, turned=turned, where=str(path))
-
-
-def case_fields(
-    arrays: Mapping[str, Any] | Path, *, turned: bool = True, where: str = "arrays"
-) -> CaseFields:
+def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> CaseFields:
     """The fields of a case, turned: z to the atrium, the first leaflet towards positive y.
 
     Parameters
@@ -156,54 +144,42 @@ def case_fields(
         others as in `CaseFields`, and ``observed_points_<frame>``; or the ``.npz`` file of them.
     turned : bool
         Otherwise it is left in the axes of the case.
-    where : str
-        Names the arrays in an error.
 
     Raises
     ------
     InputError
-        If one of those is missing, or arrays do not fit each other.
+        If they cannot be read, one of those is missing, or arrays do not fit each other.
     """
-    if isinstance(arrays, Path):
-        return read_case_fields(arrays, turned=turned)
+    where = "arrays"
     try:
-        points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
-        fields = _fields(arrays, points)
+        if isinstance(arrays, Path):
+            where = str(arrays)
+            arrays = read_npz(arrays, where=arrays.name)
+        values = {
+            one.name: _value(one.name, arrays[one.name])
+            for one in dataclass_fields(CaseFields)
+            if one.name in arrays or one.name in NEEDED
+        }
+        values["observed_points"] = {
+            name.removeprefix(POINTS): np.asarray(points, dtype=np.float64)
+            for name, points in arrays.items()
+            if name.startswith(POINTS)
+        }
+        values.setdefault("tips", np.empty((len(values["frames"]) + 1, 0, 3)))
+        fields = CaseFields(**values)
         return _turned(fields) if turned else fields
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise InputError(f"{where}: no fields of a case ({one_line(error, 200)})") from error
 
 
-def _fields(arrays: Mapping[str, Any], points: Mapping[str, FloatArray]) -> CaseFields:
-    def indices(name: str) -> IntArray:
-        return np.asarray(arrays.get(name, []), dtype=np.int64)
-
-    def reals(name: str) -> FloatArray | None:
-        return None if name not in arrays else np.asarray(arrays[name], dtype=np.float64)
-
-    frames = tuple(str(name) for name in arrays["frames"])
-    tips = reals("tips")
-    return CaseFields(
-        triangles=np.asarray(arrays["triangles"], dtype=np.int64),
-        region=np.asarray(arrays["region"], dtype=np.int64),
-        rest=np.asarray(arrays["rest"], dtype=np.float64),
-        annulus=np.asarray(arrays["annulus"], dtype=np.int64),
-        free_edge=indices("free_edge"),
-        frames=frames,
-        seen=np.asarray(arrays["seen"], dtype=bool),
-        tips=np.empty((len(frames) + 1, 0, 3)) if tips is None else tips,
-        chord_tip=indices("chord_tip"),
-        chord_insertion=indices("chord_insertion"),
-        observed_points={k: np.asarray(v, dtype=np.float64) for k, v in points.items()},
-        observed=reals("observed"),
-        generic=reals("generic"),
-        registered=reals("registered"),
-        fitted=reals("fitted"),
-        truth=reals("truth"),
-        distance_generic=reals("distance_generic"),
-        distance_fitted=reals("distance_fitted"),
-        reach_mm=float(arrays["reach_mm"]) if "reach_mm" in arrays else None,
-    )
+def _value(name: str, array: Any) -> Any:
+    """An array in the type of its field."""
+    if name == "frames":
+        return tuple(map(str, array))
+    if name == "reach_mm":
+        return float(array)
+    kind = bool if name == "seen" else np.int64 if name in INDICES else np.float64
+    return np.asarray(array, dtype=kind)
 
 
 def _check(name: str, array: FloatArray | None, shape: tuple[int | None, ...]) -> None:
@@ -243,7 +219,7 @@ def _turned(fields: CaseFields) -> CaseFields:
     )
     shapes: dict[str, Any] = {
         name: (array - middle) @ axes
-        for name in SHAPES
+        for name in ("rest", "tips", *SEEN)
         if (array := getattr(fields, name)) is not None
     }
     points = {name: (array - middle) @ axes for name, array in fields.observed_points.items()}

@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict
 
 from mvest.errors import InputError
-from mvest.estimation.estimate import Estimate
-from mvest.estimation.information.identifiability import Identifiability
+from mvest.estimation.estimate import InnovationSummary
+from mvest.estimation.information.identifiability import TradeOff
+from mvest.mechanics.parameters import is_positive
 from mvest.problem.estimate import StudyResult
-from mvest.problem.registration import unit_of
+from mvest.problem.registration import REGISTRATION, unit_of
 from mvest.problem.verdict import NONE, Verdict
 from mvest.typing import FloatArray
 
@@ -28,9 +29,6 @@ Row = Mapping[str, Any]
 
 LEVEL = 0.95
 """Probability that an interval holds."""
-
-STEP = 0.1
-"""Change that shows how parameters make up for each other, in parts of a scale."""
 
 
 class Frozen(BaseModel):
@@ -115,6 +113,11 @@ class Unknown(Frozen):
         return self.kind == "modulus"
 
     @property
+    def is_positive(self) -> bool:
+        """Whether its interval is that of its logarithm."""
+        return self.name not in REGISTRATION and is_positive(self.name)
+
+    @property
     def relative_error(self) -> float | None:
         """(estimate - truth) / truth."""
         if self.estimate is None or not self.truth:
@@ -152,33 +155,6 @@ class FrameFit(Frozen):
     personalised_to_truth: Spread | None = None
 
 
-class Innovation(Frozen):
-    """What the prior leaves unexplained of ``size`` observed numbers, in their unit.
-
-    See `mvest.estimation.estimate.InnovationSummary`.
-    """
-
-    size: int
-    rms: float
-    max_abs: float
-    nis: float
-    nis_band: tuple[float, float]
-    residual_rms: float | None = None
-
-
-class Confounded(Frozen):
-    """Parameters ``(g,)`` that the data hardly tell apart.
-
-    ``changes`` ``(g,)`` are changes in their units that hardly show together; ``relative`` is the
-    same relative to their scales.
-    """
-
-    parameters: tuple[str, ...]
-    changes: tuple[float, ...]
-    relative: tuple[float, ...]
-    correlation: float
-
-
 class EstimateRecord(Frozen):
     """One estimate, or the reason why there is none.
 
@@ -201,12 +177,13 @@ class EstimateRecord(Frozen):
     distance_mm, distance_to_truth_mm : Spread or None
         Of the fitted vertices of the last observed frame from the observed and the true ones.
     frames : tuple of FrameFit
-    innovation : Innovation or None
+    innovation : InnovationSummary or None
     condition_number : float or None
         Of the information of the data alone.
     flat : tuple of str
         Combinations of unknowns that the data hardly determine.
-    confounded : tuple of Confounded
+    confounded : tuple of TradeOff
+        Parameters that the data hardly tell apart.
     iterations, forward_solves : int or None
     iterates, iterate_std : (i, p)
     objective : (i,)
@@ -231,10 +208,10 @@ class EstimateRecord(Frozen):
     distance_mm: Spread | None = None
     distance_to_truth_mm: Spread | None = None
     frames: tuple[FrameFit, ...] = ()
-    innovation: Innovation | None = None
+    innovation: InnovationSummary | None = None
     condition_number: float | None = None
     flat: tuple[str, ...] = ()
-    confounded: tuple[Confounded, ...] = ()
+    confounded: tuple[TradeOff, ...] = ()
     iterations: int | None = None
     forward_solves: int | None = None
     iterates: tuple[Numbers, ...] = ()
@@ -376,10 +353,10 @@ def record_of(
         unknowns=_unknowns(result),
         distance_mm=spread(result.distance),
         distance_to_truth_mm=spread(result.distance_to_truth),
-        innovation=_innovation(filtered),
+        innovation=None if filtered is None else filtered.innovation,
         condition_number=None if known is None else finite(known.condition_number),
         flat=() if known is None else tuple(known.flat()),
-        confounded=() if known is None else confounded(known),
+        confounded=() if known is None else known.confounded(),
         iterations=None if filtered is None else filtered.iterations,
         forward_solves=None if filtered is None else filtered.forward_solves,
         iterates=() if filtered is None else _rows(filtered.iterates),
@@ -404,50 +381,27 @@ def _rows(values: ArrayLike) -> tuple[Numbers, ...]:
 
 def _unknowns(result: StudyResult) -> tuple[Unknown, ...]:
     """The parameters of a result, and the moduli that follow through fixed ratios."""
-    filtered, names = result.filtered, result.parameters
-    nothing: Sequence[float | None] = (None,) * len(names)
-
-    def column(values: FloatArray | None) -> Sequence[float | None]:
-        return nothing if values is None else _numbers(values)
-
-    bound = None if result.identifiability is None else result.identifiability.std
-    ends: tuple[FloatArray | None, FloatArray | None] = (None, None)
-    if result.estimate is not None and filtered is not None:
-        ends = filtered.interval(LEVEL)
-    truth = None if result.truth is None else result.truth.values
-    prior = None if filtered is None else filtered.prior
-    columns = zip(
-        names,
-        column(None if prior is None else prior.mean),
-        column(None if prior is None else prior.std),
-        column(result.estimate),
-        column(result.std),
-        column(ends[0]),
-        column(ends[1]),
-        column(bound),
-        column(truth),
-        strict=True,
-    )
+    filtered = result.filtered
+    columns: dict[str, FloatArray | None] = {"estimate": result.estimate, "std": result.std}
+    if filtered is not None:
+        columns |= {"prior_mean": filtered.prior.mean, "prior_std": filtered.prior.std}
+        if result.estimate is not None:
+            columns |= zip(("low", "high"), filtered.interval(LEVEL), strict=True)
+    columns["bound"] = None if result.identifiability is None else result.identifiability.std
+    columns["truth"] = None if result.truth is None else result.truth.values
+    known = {key: values for key, values in columns.items() if values is not None}
     own = [
         Unknown(
             name=name,
             unit=unit_of(name),
             kind="modulus" if name.startswith("E_f.") else "nuisance",
-            prior_mean=mean,
-            prior_std=std,
-            estimate=estimate,
-            std=after,
-            low=low,
-            high=high,
-            bound=best,
-            truth=true,
-        )
-        for name, mean, std, estimate, after, low, high, best, true in columns
+        ).model_copy(update={key: finite(values[k]) for key, values in known.items()})
+        for k, name in enumerate(result.parameters)
     ]
-    return (*own, *derived_moduli(result, own))
+    return (*own, *_derived_moduli(result, own))
 
 
-def derived_moduli(result: StudyResult, unknowns: Sequence[Unknown]) -> list[Unknown]:
+def _derived_moduli(result: StudyResult, unknowns: Sequence[Unknown]) -> list[Unknown]:
     """The moduli that follow from the estimated ones through the fixed ratios of the tissue."""
     rows = []
     for own in unknowns:
@@ -461,36 +415,3 @@ def derived_moduli(result: StudyResult, unknowns: Sequence[Unknown]) -> list[Unk
             nothing = dict.fromkeys(("prior_mean", "prior_std", "bound"))
             rows.append(own.model_copy(update=about | scaled | nothing))
     return rows
-
-
-def _innovation(filtered: Estimate | None) -> Innovation | None:
-    summary = None if filtered is None else filtered.innovation
-    if summary is None:
-        return None
-    return Innovation(
-        size=summary.size,
-        rms=summary.rms,
-        max_abs=summary.max_abs,
-        nis=summary.nis,
-        nis_band=summary.nis_band,
-        residual_rms=summary.residual_rms,
-    )
-
-
-def confounded(data: Identifiability) -> tuple[Confounded, ...]:
-    """Parameters that the data hardly tell apart, each with a change that hardly shows.
-
-    The first parameter of a group changes by a tenth of its scale.
-    """
-    return tuple(
-        Confounded(
-            parameters=group.names,
-            changes=tuple(
-                STEP * exchange * float(data.scale[data.names.index(name)])
-                for name, exchange in zip(group.names, group.exchange, strict=True)
-            ),
-            relative=tuple(STEP * exchange for exchange in group.exchange),
-            correlation=group.correlation,
-        )
-        for group in data.confounded()
-    )

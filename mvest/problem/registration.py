@@ -24,6 +24,8 @@ from mvest.typing import FloatArray
 
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
 """Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
+UNITS = {"shift": "mm", "turn": "degrees"}
+LARGEST = {"mm": 1000, "degrees": 360}
 
 
 def registration_of(names: tuple[str, ...], m: FloatArray) -> FloatArray:
@@ -35,7 +37,7 @@ def registration_of(names: tuple[str, ...], m: FloatArray) -> FloatArray:
 def unit_of(name: str) -> str:
     """Unit of a parameter of a closure or of a displacement; empty for what has none."""
     if name in REGISTRATION:
-        return "mm" if name.startswith("shift") else "degrees"
+        return UNITS[name.partition(".")[0]]
     if is_frame_pressure(name):
         return "mmHg"
     kind = KINDS.get(name.partition(".")[0])
@@ -45,11 +47,8 @@ def unit_of(name: str) -> str:
 def range_of(name: str) -> FieldInfo | None:
     """The admissible range of a parameter of a closure or of a displacement; None for others."""
     if name in REGISTRATION:
-        return (
-            within(-1000, 1000, "mm", "")
-            if name.startswith("shift")
-            else within(-360, 360, "degrees", "")
-        )
+        unit = unit_of(name)
+        return within(-LARGEST[unit], LARGEST[unit], unit, "")
     kind = KINDS.get(name.partition(".")[0])
     return None if kind is None else within(kind.low, kind.high, kind.unit, kind.description)
 

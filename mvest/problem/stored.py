@@ -7,7 +7,7 @@ it (:mod:`mvest.cache`), is made once, and appears whole or not at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -86,36 +86,32 @@ class Store:
         model: ObservationModel,
         described: Mapping[str, Any],
         made_by: tuple[Any, ...],
-        *,
-        jacobian: bool = False,
     ) -> StoredModel:
         """A model whose predictions are entries: see `entry` and :class:`StoredModel`."""
-        key = key_of(described, made_by)
-        return StoredModel(model, self.folder / kind, key, jacobian=jacobian)
+        return StoredModel(model, self.folder / kind, key_of(described, made_by))
 
 
+@dataclass(frozen=True, slots=True)
 class StoredModel:
-    """A model whose converged predictions are kept on disk.
+    """A model whose converged predictions are kept on disk, without their derivatives.
 
-    Parameters
+    Attributes
     ----------
     model : ObservationModel
     folder : Path
     key : str
         See :func:`key_of`; the parameters are added to it.
-    jacobian : bool
-        Whether the Jacobian is kept as well; that of a stored prediction is zero otherwise.
+    counts : Counts
+        Of what was in the store.
     """
 
-    def __init__(
-        self, model: ObservationModel, folder: Path, key: str, *, jacobian: bool = False
-    ) -> None:
-        self._model, self._folder, self._jacobian = model, folder, jacobian
-        self.key = key
-        self.counts = Counts()
+    model: ObservationModel
+    folder: Path
+    key: str
+    counts: Counts = field(default_factory=Counts)
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Prediction at ``m (p,)``, read from disk if it is there.
+        """Prediction at ``m (p,)``, read from disk if it is there; its Jacobian is then zero.
 
         Raises
         ------
@@ -124,20 +120,15 @@ class StoredModel:
         """
 
         def read(path: Path) -> Prediction:
-            y, *rest = read_npz(path, ["y", "jacobian"] if self._jacobian else ["y"]).values()
-            return Prediction(y, rest[0] if rest else np.zeros((len(y), len(m))))
+            y = read_npz(path, ["y"])["y"]
+            return Prediction(y, np.zeros((len(y), len(m))))
 
-        def write(path: Path, prediction: Prediction) -> None:
-            arrays: dict[str, Any] = {"y": prediction.y}
-            if self._jacobian:
-                arrays["jacobian"] = prediction.jacobian
-            np.savez(path, **arrays)
-
-        about = {"key": self.key, "m": [float(v).hex() for v in m], "jacobian": self._jacobian}
-        path = self._folder / f"{config_hash(about)[:DIGITS]}.npz"
-        entry = Entry(path, read, counts=self.counts)
-        return entry.get_or_make(
-            lambda: predict(self._model, m), write, lambda made: made.converged
+        about = {"key": self.key, "m": [float(v).hex() for v in m]}
+        path = self.folder / f"{config_hash(about)[:DIGITS]}.npz"
+        return Entry(path, read, counts=self.counts).get_or_make(
+            lambda: predict(self.model, m),
+            lambda file, prediction: np.savez(file, y=prediction.y),
+            lambda made: made.converged,
         )
 
 

@@ -17,7 +17,8 @@ data narrow the prior (28, none).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -190,248 +191,227 @@ ONE_STATE = "one closed state"
 """The check of the gate. It is not asked of a valve that is met for the first time, since it costs
 minutes; that it was not is no ground against an estimate, and is said."""
 
+Words = Mapping[str, object]
+Found = Iterable[tuple[float, Words]]
+STATED: tuple[float, float] = (0.0, math.inf)
+"""Limits of what is doubtful wherever it is found."""
+GRAVE: tuple[float, float] = (0.0, 0.0)
+"""Limits of what leaves no estimate wherever it is found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One row of `CHECKS`.
+
+    Attributes
+    ----------
+    name : str
+        Of the check; rows of one name are one check.
+    look : function
+        Values that indications hold for it, each with words for the text; None if there is nothing
+        to look at.
+    limits : (float, float)
+        Beyond the first a value is doubtful, beyond the second it leaves no estimate.
+    text, advice : str
+        Of a `Ground`. ``{value}`` and ``{limit}`` (the first) stand in it beside the words.
+    """
+
+    name: str
+    look: Callable[[Indications], Found | None]
+    limits: tuple[float, float]
+    text: str
+    advice: str
+
+    def grounds(self, found: Found) -> list[Ground]:
+        """Those of the values that are beyond the limits."""
+        doubtful, grave = self.limits
+        return [
+            Ground(
+                self.name,
+                NONE if value > grave else DOUBTFUL,
+                self.text.format(value=value, limit=doubtful, **words),
+                self.advice.format(**words),
+            )
+            for value, words in found
+            if value > doubtful
+        ]
+
 
 def judge(seen: Indications) -> Verdict:
     """The verdict that indications lead to: one doubtful check is doubtful, two are none."""
     grounds: list[Ground] = []
-    passed: list[str] = []
     missing: list[str] = []
-    for check, look in CHECKS.items():
-        found = list(look(seen))
-        if found and found[0] is None:
-            missing.append(check)
-            if check in NEEDED and seen.estimated:
-                grounds.append(Ground(check, DOUBTFUL, f"nothing is known of {check}", "record it"))
+    for check in CHECKS:
+        found = check.look(seen)
+        if found is not None:
+            grounds += check.grounds(found)
             continue
-        against = [ground for ground in found if ground is not None]
-        grounds += against
-        if not against:
-            passed.append(check)
+        missing.append(check.name)
+        if check.name in NEEDED and seen.estimated:
+            unknown = f"nothing is known of {check.name}"
+            grounds.append(Ground(check.name, DOUBTFUL, unknown, "record it"))
     grounds.sort(key=lambda ground: -RANK[ground.trust])
-    weight = sum({ground.check: RANK[ground.trust] for ground in reversed(grounds)}.values())
-    trust = (TRUSTWORTHY, DOUBTFUL, NONE)[min(weight, 2)]
-    return Verdict(trust, tuple(grounds), tuple(passed), tuple(missing))
+    against = {ground.check: RANK[ground.trust] for ground in reversed(grounds)}
+    trust = (TRUSTWORTHY, DOUBTFUL, NONE)[min(sum(against.values()), 2)]
+    names = dict.fromkeys(check.name for check in CHECKS)
+    passed = tuple(name for name in names if name not in against and name not in missing)
+    return Verdict(trust, tuple(grounds), passed, tuple(missing))
 
 
-Seen = Iterator[Ground | None]
-"""Grounds against an estimate; None first where there was nothing to look at."""
+def _one(value: float | None) -> Found | None:
+    """A value, if it is known."""
+    return None if value is None else [(value, {"size": value})]
 
 
-def _ended(e: Indications) -> Seen:
-    if not e.estimated:
-        yield Ground(
-            "iterations",
-            NONE,
-            f"there is no estimate: {e.ended or 'the run gives no reason'}",
-            "close the valve with the generic moduli first (check=true); if that fails, look at "
-            "chordae and annulus; if only a trial fails, narrow the priors",
-        )
-    elif not e.converged:
-        yield Ground(
-            "iterations",
-            NONE,
-            f"the iterations did not come to their end: {e.ended}",
-            "let it iterate longer (personal.max_iterations), or start nearer",
-        )
+def _each(values: Mapping[str, float]) -> Found | None:
+    """The size of each value with its name, if there are any."""
+    return [(abs(value), {"what": what}) for what, value in values.items()] or None
 
 
-def _approximated(e: Indications) -> Seen:
-    if e.approximation is None:
-        yield None
-    elif e.approximation:
-        yield Ground(
-            "approximation",
-            DOUBTFUL,
-            f"the interval is not that of the posterior: {e.approximation}",
-            "sample the posterior",
-        )
+def _stated(texts: Iterable[str]) -> Found:
+    """Texts, each of which is a ground."""
+    return [(math.inf, {"what": text}) for text in texts if text]
 
 
-def _linear(e: Indications) -> Seen:
-    if e.moved is None:
-        yield None
-    elif e.moved > MOVED:
-        yield Ground(
-            "geometry",
-            DOUBTFUL,
-            f"a modulus is {e.moved:.2f} of its standard deviations from where the geometry was "
-            f"linearised last, expected at most {MOVED:g}",
-            "allow more such steps (personal.considered_geometry.renewals), or see the open "
-            "shape, annulus and tips better",
-        )
+def _innovation(e: Indications) -> Found | None:
+    """How many times beyond its band the innovation is.
 
-
-def _stiffens(e: Indications) -> Seen:
-    doubtful, grave = LAW
-    if e.law is None:
-        yield None
-    elif e.law > doubtful:
-        yield Ground(
-            "law",
-            NONE if e.law > grave else DOUBTFUL,
-            f"what was seen puts the tissue at {e.law:.2f} of the way from the linear law to an "
-            f"exponential one, expected at most {doubtful:g}: it probably stiffens",
-            "estimate how far each leaflet stiffens (personal=stiffening); moduli of the linear "
-            "law are those of its stretch alone",
-        )
-
-
-def _plausible(e: Indications) -> Seen:
-    for text in e.mistakes:
-        yield Ground("case", NONE, text, "mend the case and run it again")
-    if e.unlike:
-        yield Ground("case", NONE, e.unlike, "record another volume, or segment it by other means")
-    for text in e.doubts:
-        yield Ground("case", DOUBTFUL, text, "look at this part of the case")
-
-
-def _accounted(e: Indications) -> Seen:
-    for reason in e.unaccounted:
-        yield Ground(
-            "errors left out",
-            DOUBTFUL,
-            f"what is not known of geometry or law is not in the intervals: {reason}",
-            "close the valve with a finer mesh, or state these errors smaller",
-        )
-
-
-def _innovation(e: Indications) -> Seen:
+    Errors smaller than assumed leave intervals wider than they need to be, and are no ground.
+    """
     if e.nis is None or e.nis_band is None:
-        yield None
-        return
-    low, high = e.nis_band
-    # Errors smaller than assumed leave intervals wider than they need to be.
-    if e.nis <= high:
-        return
-    yield Ground(
-        "size of what is left over",
-        NONE if e.nis > NIS_FACTOR * high else DOUBTFUL,
-        f"what the fit leaves over is {np.sqrt(e.nis):.2f} times what its errors explain, "
-        f"expected {np.sqrt(low):.2f} to {np.sqrt(high):.2f}",
-        "state larger errors, or look where the model cannot follow (map of the innovation)",
-    )
+        return None
+    root, low, high = np.sqrt([e.nis, *e.nis_band])
+    return [(e.nis / e.nis_band[1], {"root": root, "low": low, "high": high})]
 
 
-def _structure(e: Indications) -> Seen:
-    if e.alike is None:
-        yield None
-    elif abs(e.alike) > ALIKE:
-        yield Ground(
-            "pattern of what is left over",
-            DOUBTFUL,
-            f"what the fit leaves over is alike at neighbouring points (correlation "
-            f"{e.alike:.2f}, expected below {ALIKE:g})",
-            "errors are smoother than believed, or the model has another shape: see their map",
-        )
-
-
-def _stretched(e: Indications) -> Seen:
-    if not e.stretch:
-        yield None
-    doubtful, contradicted = STRETCH
-    for what, moved in e.stretch.items():
-        if abs(moved) > doubtful:
-            yield Ground(
-                "what was known beforehand",
-                NONE if abs(moved) > contradicted else DOUBTFUL,
-                f"{what} was moved by {abs(moved):.1f} of its standard deviations, expected at "
-                f"most {doubtful:g}",
-                f"check what the case says of it; if it is right, {what} makes up for something "
-                "else that is wrong",
-            )
-
-
-def _contradicts(e: Indications) -> Seen:
-    if not e.data_alone:
-        yield None
-    for modulus, prior_stds in e.data_alone.items():
-        if abs(prior_stds) > FAR:
-            yield Ground(
-                "data against prior",
-                DOUBTFUL,
-                f"the data alone have {modulus} {abs(prior_stds):.1f} of its prior's standard "
-                f"deviations from the prior's mean, expected at most {FAR:g}: the estimate lies "
-                "between the two",
-                "see the estimate by the data alone; widen the prior if such a modulus may be",
-            )
-
-
-def _predicts(e: Indications) -> Seen:
-    if not e.held_out:
-        yield None
-    for one in e.held_out:
-        if one.fitted > WORSE * one.generic:
-            yield Ground(
-                "frames held out",
-                DOUBTFUL,
-                f"frame {one.frame}, which was not fitted, is {one.fitted:.2f} mm from the fitted "
-                f"valve and {one.generic:.2f} mm from the generic one",
-                "the moduli do not predict; check that frame's pressure and annulus",
-            )
-
-
-def _closes(e: Indications) -> Seen:
+def _closure(e: Indications) -> Found | None:
     if e.orifice_mm2 is None or e.observed_orifice_mm2 is None:
-        yield None
-        return
-    more = e.orifice_mm2 - e.observed_orifice_mm2
-    small, large = LEAK
-    if more > small:
-        yield Ground(
-            "closure",
-            NONE if more > large else DOUBTFUL,
-            f"the fitted valve leaves {e.orifice_mm2:.0f} mm² free, the observed one "
-            f"{e.observed_orifice_mm2:.0f} mm²",
-            "chordae too short, leaflets too small, or tips too far: check them",
-        )
+        return None
+    fitted, observed = e.orifice_mm2, e.observed_orifice_mm2
+    return [(fitted - observed, {"fitted": fitted, "observed": observed})]
 
 
-def _repeated(e: Indications) -> Seen:
-    if e.again is None:
-        yield None
-    elif not e.again:
-        yield Ground(
-            "closed anew",
-            DOUBTFUL,
-            "the fitted valve, closed anew from the open one, ends in another closed state",
-            "ask the gate of this valve (check=true gate=true)",
-        )
-
-
-def _unique(e: Indications) -> Seen:
-    if e.gate is None:
-        yield None
-    elif not e.gate:
-        yield Ground(
-            ONE_STATE,
-            DOUBTFUL,
-            "the valve did not pass the gate: its closed state is not the only one, or jumps while "
-            "moduli change",
-            "the gate says by what (experiment=gate, check=true gate=true); a finer mesh or denser "
-            "contact samples may mend it",
-        )
-
-
-CHECKS = {
-    "iterations": _ended,
-    "approximation": _approximated,
-    "geometry": _linear,
-    "law": _stiffens,
-    "case": _plausible,
-    "errors left out": _accounted,
-    "size of what is left over": _innovation,
-    "pattern of what is left over": _structure,
-    "what was known beforehand": _stretched,
-    "data against prior": _contradicts,
-    "frames held out": _predicts,
-    "closure": _closes,
-    "closed anew": _repeated,
-    ONE_STATE: _unique,
-}
-"""Check -> what it looks at."""
-
-NEEDED = (
-    "size of what is left over",
-    "what was known beforehand",
+CHECKS = (
+    Check(
+        "iterations",
+        lambda e: [] if e.estimated else _stated([e.ended or "the run gives no reason"]),
+        GRAVE,
+        "there is no estimate: {what}",
+        "close the valve with the generic moduli first (check=true); if that fails, look at "
+        "chordae and annulus; if only a trial fails, narrow the priors",
+    ),
+    Check(
+        "iterations",
+        lambda e: [(math.inf, {"what": e.ended})] if e.estimated and not e.converged else [],
+        GRAVE,
+        "the iterations did not come to their end: {what}",
+        "let it iterate longer (personal.max_iterations), or start nearer",
+    ),
+    Check(
+        "approximation",
+        lambda e: None if e.approximation is None else _stated([e.approximation]),
+        STATED,
+        "the interval is not that of the posterior: {what}",
+        "sample the posterior",
+    ),
+    Check(
+        "geometry",
+        lambda e: _one(e.moved),
+        (MOVED, math.inf),
+        "a modulus is {value:.2f} of its standard deviations from where the geometry was "
+        "linearised last, expected at most {limit:g}",
+        "allow more such steps (personal.considered_geometry.renewals), or see the open shape, "
+        "annulus and tips better",
+    ),
+    Check(
+        "law",
+        lambda e: _one(e.law),
+        LAW,
+        "what was seen puts the tissue at {value:.2f} of the way from the linear law to an "
+        "exponential one, expected at most {limit:g}: it probably stiffens",
+        "estimate how far each leaflet stiffens (personal=stiffening); moduli of the linear law "
+        "are those of its stretch alone",
+    ),
+    Check("case", lambda e: _stated(e.mistakes), GRAVE, "{what}", "mend the case and run it again"),
+    Check(
+        "case",
+        lambda e: _stated([e.unlike]),
+        GRAVE,
+        "{what}",
+        "record another volume, or segment it by other means",
+    ),
+    Check("case", lambda e: _stated(e.doubts), STATED, "{what}", "look at this part of the case"),
+    Check(
+        "errors left out",
+        lambda e: _stated(e.unaccounted),
+        STATED,
+        "what is not known of geometry or law is not in the intervals: {what}",
+        "close the valve with a finer mesh, or state these errors smaller",
+    ),
+    Check(
+        "size of what is left over",
+        _innovation,
+        (1.0, NIS_FACTOR),
+        "what the fit leaves over is {root:.2f} times what its errors explain, expected {low:.2f} "
+        "to {high:.2f}",
+        "state larger errors, or look where the model cannot follow (map of the innovation)",
+    ),
+    Check(
+        "pattern of what is left over",
+        lambda e: None if e.alike is None else [(abs(e.alike), {"alike": e.alike})],
+        (ALIKE, math.inf),
+        "what the fit leaves over is alike at neighbouring points (correlation {alike:.2f}, "
+        "expected below {limit:g})",
+        "errors are smoother than believed, or the model has another shape: see their map",
+    ),
+    Check(
+        "what was known beforehand",
+        lambda e: _each(e.stretch),
+        STRETCH,
+        "{what} was moved by {value:.1f} of its standard deviations, expected at most {limit:g}",
+        "check what the case says of it; if it is right, {what} makes up for something else that "
+        "is wrong",
+    ),
+    Check(
+        "data against prior",
+        lambda e: _each(e.data_alone),
+        (FAR, math.inf),
+        "the data alone have {what} {value:.1f} of its prior's standard deviations from the "
+        "prior's mean, expected at most {limit:g}: the estimate lies between the two",
+        "see the estimate by the data alone; widen the prior if such a modulus may be",
+    ),
+    Check(
+        "frames held out",
+        lambda e: [(x.fitted - WORSE * x.generic, {"one": x}) for x in e.held_out] or None,
+        STATED,
+        "frame {one.frame}, which was not fitted, is {one.fitted:.2f} mm from the fitted valve and "
+        "{one.generic:.2f} mm from the generic one",
+        "the moduli do not predict; check that frame's pressure and annulus",
+    ),
+    Check(
+        "closure",
+        _closure,
+        LEAK,
+        "the fitted valve leaves {fitted:.0f} mm² free, the observed one {observed:.0f} mm²",
+        "chordae too short, leaflets too small, or tips too far: check them",
+    ),
+    Check(
+        "closed anew",
+        lambda e: None if e.again is None else _one(float(not e.again)),
+        STATED,
+        "the fitted valve, closed anew from the open one, ends in another closed state",
+        "ask the gate of this valve (check=true gate=true)",
+    ),
+    Check(
+        ONE_STATE,
+        lambda e: None if e.gate is None else _one(float(not e.gate)),
+        STATED,
+        "the valve did not pass the gate: its closed state is not the only one, or jumps while "
+        "moduli change",
+        "the gate says by what (experiment=gate, check=true gate=true); a finer mesh or denser "
+        "contact samples may mend it",
+    ),
 )
+
+NEEDED = ("size of what is left over", "what was known beforehand")
 """Checks without which no estimate is trustworthy."""

@@ -1,64 +1,75 @@
-"""What data will tell, in words: expected intervals, and what parameters make up for each other."""
+"""What data will tell of parameters, found out before any are taken.
+
+The Fisher information needs a model, where it is believed to be, and what is to be observed how
+well; it needs no observed value. So one run of the model says which intervals to expect.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import ndtri
 
-from mvest.problem.expectation import Expectation
-from mvest.problem.record import Confounded, confounded
+from mvest.estimation.information.identifiability import TradeOff, identifiability
+from mvest.estimation.noise import observation_noise
+from mvest.estimation.prediction import predict
+from mvest.estimation.transform import to_filter
+from mvest.estimation.update import kalman_update
+from mvest.problem.estimate import Observed, Problem
 from mvest.problem.registration import unit_of
-from mvest.reporting.markup import MISSING, listed, number
+from mvest.reporting.markup import listed
+from mvest.reporting.tables import Column, table
 
-ALL_APART, UNTOLD = "The data tell all parameters apart.", "not determined"
 
-
-def expectation_text(title: str, expected: Expectation, noise: str) -> str:
-    """The answer of the Fisher information as text for a terminal.
+def expectation_text(title: str, problem: Problem, observation: Observed, noise: str) -> str:
+    """The intervals to expect of an estimation that is not run, as text for a terminal.
 
     Parameters
     ----------
     title : str
-    expected : Expectation
+    problem : Problem
+        The model is run once, at the mean of the prior.
+    observation : Observed
+        Which points are seen, and how well; the values that were seen play no part where points
+        correspond.
     noise : str
         How well coordinates are seen.
     """
-    import pandas as pd
-
-    data, informed = expected.data, expected.informed
-    if data is None:
-        return unknown_text(title, expected.reason)
-    assumed, prior = expected.assumed, expected.problem.prior
-    low, high = (None, None) if informed is None else expected.interval()
-    sized = (assumed != 0.0) & np.isfinite(data.std)
-    shares = np.divide(data.std, abs(assumed), out=np.full(len(sized), np.nan), where=sized)
+    prior, assumed, R = problem.prior, problem.start, observation.R
+    seen = predict(observation.of(problem.model), assumed, derivatives=True)
+    if not seen.converged:
+        return unknown_text(title, seen.reason)
+    scale = np.where(assumed != 0.0, np.abs(assumed), prior.std)
+    data = identifiability(seen.jacobian, R, scale, names=problem.parameters)
+    transform, n = problem.transform, len(seen.y)
+    z, before = transform.forward(assumed), to_filter(transform, prior)
+    H = seen.jacobian * transform.derivative(z)
+    after = kalman_update(before, np.zeros(n), H, observation_noise(R, n)).posterior
     rows = [
-        {
-            "parameter": name,
-            "unit": unit_of(name) or MISSING,
-            "assumed": number(float(assumed[k])),
-            "± beforehand": number(float(prior.std[k]), 2),
-            "± from the data alone": _width(float(data.std[k])),
-            "[%]": number(100.0 * float(shares[k]), 2),
-            "± with both": MISSING if informed is None else _width(float(informed.std[k])),
-            "95 % interval to expect": MISSING
-            if low is None or high is None
-            else f"{number(float(low[k]))} to {number(float(high[k]))}",
-        }
-        for k, name in enumerate(data.names)
+        {"parameter": name, "unit": unit_of(name), "generic": value, "alone": alone}
+        for name, value, alone in zip(problem.parameters, assumed, data.std, strict=True)
     ]
-    condition = data.condition_number
+    for when, std in (("_before", before.std), ("", after.std)):
+        for end, sign in (("low", -1.0), ("high", 1.0)):
+            for row, value in zip(
+                rows, transform.inverse(z + sign * ndtri(0.975) * std), strict=True
+            ):
+                row[end + when] = value
+    expected = table(
+        rows,
+        parameter="",
+        unit="",
+        generic=Column(low="low_before", high="high_before", label="generic (beforehand)"),
+        low="::from",
+        high="::to",
+        alone=":.2g:± by the data alone",
+    )
     lines = [
-        f"{title}: what the data will tell (Cramér-Rao bound at the assumed values)",
-        f"Observed: {expected.observations} numbers of {', '.join(expected.frames)}; {noise}",
-        "",
-        pd.DataFrame(rows).to_string(index=False),
-        "",
-        "Condition number of the information: "
-        + (number(condition) if np.isfinite(condition) else "infinite")
-        + " (1: all parameters, in parts of their size, are told equally well)",
-        *([alike_words(group) for group in confounded(data)] or [ALL_APART]),
+        f"{title}: what the data will tell, intervals of 95 % to first order",
+        f"Observed: {n} numbers of {', '.join(observation.frames)}; {noise}",
+        expected.text(),
+        *map(alike_words, data.confounded()),
         *(f"Known badly from the data alone: {words}" for words in data.flat()),
         "No estimation was run.",
     ]
@@ -73,34 +84,25 @@ def unknown_text(title: str, reason: str) -> str:
     )
 
 
-def alike_words(group: Confounded, labels: Mapping[str, str] | None = None) -> str:
+def alike_words(group: TradeOff, labels: Mapping[str, str] | None = None) -> str:
     """``The data hardly tell apart A and B: +10 % of A with −5 % of B looks almost the same``.
 
     Parameters
     ----------
-    group : Confounded
+    group : TradeOff
     labels : mapping, optional
         What parameters are called.
     """
     labelled = [(labels or {}).get(name, name) for name in group.parameters]
-    moved = [
-        f"{_change(name, change, relative)} of {label}"
-        for name, label, change, relative in zip(
-            group.parameters, labelled, group.changes, group.relative, strict=True
-        )
-    ]
+    moved = []
+    for name, label, change, relative in zip(
+        group.parameters, labelled, group.changes, group.relative, strict=True
+    ):
+        unit = unit_of(name)
+        own = f"{change:+.2g} {unit}" if unit in ("mm", "degrees") else f"{100 * relative:+.2g} %"
+        moved.append(f"{own.replace('-', '−')} of {label}")
     return (
         f"The data hardly tell apart {listed(labelled)} (correlations of at least "
         f"{np.floor(1000 * group.correlation) / 1000:.3g}): {moved[0]} with "
         f"{listed(moved[1:])} looks almost the same."
     )
-
-
-def _change(name: str, change: float, relative: float) -> str:
-    if unit_of(name) in ("mm", "degrees"):
-        return f"{change:+.2g} {unit_of(name)}".replace("-", "−")
-    return f"{100 * relative:+.2g} %".replace("-", "−")
-
-
-def _width(std: float) -> str:
-    return number(std, 2) if np.isfinite(std) else UNTOLD

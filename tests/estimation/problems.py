@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mvest.estimation import Gaussian, Prediction, chi_square_band
+from mvest.estimation import Gaussian, Prediction, chi_square_band, identifiability
 
 
 def consistent(values, freedom):
@@ -70,3 +70,8 @@ def gridded(model, prior, y, R, reach=5.0, points=201):
     mean = weights @ at
     variance = weights @ (at - mean) ** 2
     return mean, np.sqrt(variance), weights @ (at - mean) ** 4 / variance**2
+
+
+def bound(H, R, prior=None):
+    """The Cramér-Rao bound of all parameters, of no scale in particular."""
+    return identifiability(H, R, np.ones(np.shape(H)[-1]), prior=prior).covariance

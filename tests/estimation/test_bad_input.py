@@ -12,13 +12,13 @@ from mvest.estimation import (
     PaperFilter,
     Prediction,
     chi_square_band,
-    cramer_rao_bound,
     identifiability,
     moran,
     nees,
     observation_noise,
     zero_mean,
 )
+from tests.estimation.problems import bound
 
 PRIOR = Gaussian(np.array([2.0, 3.0]), np.eye(2))
 
@@ -174,9 +174,9 @@ BAD = {
         lambda: identifiability(np.zeros(3), 1.0, np.ones(1)),
         r"\(n, p\); got \(3,\)",
     ),
-    "bound of no matrix": (lambda: cramer_rao_bound(np.zeros(3), 1.0), r"\(n, p\); got \(3,\)"),
+    "bound of no matrix": (lambda: bound(np.zeros(3), 1.0), r"\(n, p\); got \(3,\)"),
     "Jacobian NaN": (
-        lambda: cramer_rao_bound(np.array([[np.nan]]), 1.0),
+        lambda: bound(np.array([[np.nan]]), 1.0),
         r"Jacobian must be finite; entry \(0, 0\)",
     ),
     "scale zero": (
@@ -188,11 +188,11 @@ BAD = {
         "2 parameters need as many names",
     ),
     "prior of other parameters": (
-        lambda: cramer_rao_bound(np.ones((3, 1)), 1.0, PRIOR),
+        lambda: bound(np.ones((3, 1)), 1.0, PRIOR),
         "must have 1 parameters; it has 2",
     ),
     "singular prior": (
-        lambda: cramer_rao_bound(np.ones((3, 2)), 1.0, Gaussian(np.zeros(2), np.diag([1.0, 0.0]))),
+        lambda: bound(np.ones((3, 2)), 1.0, Gaussian(np.zeros(2), np.diag([1.0, 0.0]))),
         "positive definite here",
     ),
 }

@@ -17,8 +17,8 @@ from mvest.estimation import (
 )
 from mvest.estimation.prediction import Remembered, SharedStart, as_prediction, of_some, predict
 from mvest.observation.vertices import Observation
-from mvest.problem.expectation import expect
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem
+from mvest.reporting.expectation import expectation_text
 
 H = np.random.default_rng(5).standard_normal((6, 2))
 Y = H @ np.array([1.0, 2.0]) + 0.01
@@ -52,7 +52,8 @@ def run_filter(filter_):
 
 def run_expectation(model):
     problem = Problem(("a", "b"), model, PRIOR, IteratedFilter(), Identity(), {})
-    return expect(problem, Observation(("closed",), Y.reshape(1, 2, 3), 0.1, predicted=("closed",)))
+    seen = Observation(("closed",), Y.reshape(1, 2, 3), 0.1, predicted=("closed",))
+    return expectation_text("of a problem", problem, seen, "noise")
 
 
 USES = {

@@ -133,9 +133,7 @@ def test_leaflets_along_the_free_edge_are_those_of_its_triangles():
         assert np.count_nonzero(along == leaflet) == len(along) // 2, number
 
 
-def test_regions_of_an_edge_and_weights_must_fit():
+def test_regions_of_an_edge_must_fit():
     curve = REST[VALVE.free_edge]
     with pytest.raises(InputError, match=r"expected \(40,\)"):
         seen(REST, np.zeros(len(REST), int), free_edge=curve, free_edge_region=np.zeros(3, int))
-    with pytest.raises(InputError, match=r"weights: shape \(\d+, 440\), expected \(r, 441\)"):
-        PredictedSurface(441, FINE.triangles, FINE.region, weights=FINE.weights)

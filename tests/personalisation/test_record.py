@@ -7,7 +7,7 @@ import pytest
 
 from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, label_of, record_of_case
-from mvest.problem.fields import read_case_fields
+from mvest.problem.fields import case_fields
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import ONE_STATE
 from tests.made_up_closure import TISSUE, made_up_case, settings, use
@@ -132,7 +132,7 @@ def test_a_failed_estimation_has_a_record_too():
 def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     fit = fit if corresponds else personalised(corresponds=False)
     np.savez(tmp_path / "fields.npz", **arrays_of_case(fit))
-    fields = read_case_fields(tmp_path / "fields.npz")
+    fields = case_fields(tmp_path / "fields.npz")
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
     assert fields.truth is None

@@ -1,13 +1,28 @@
+import numpy as np
+import pytest
+
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Verdict
-from mvest.reporting.skill import moduli_figure, skill_table, stated, trust_of
+from mvest.reporting.skill import (
+    generic_guess,
+    log_width,
+    moduli_figure,
+    prior_alone,
+    score,
+    share_bounds,
+    skill,
+    skill_table,
+    stated,
+    trust_of,
+)
 
 
 def answered(truth, estimate, low, high, generic) -> Unknown:
     # Believed within a factor of 1.48.
     return Unknown(
-        name="E_f.anterior", unit="MPa", prior_mean=generic, prior_std=0.2 * generic,
-        estimate=estimate, low=low, high=high, truth=truth,
+        name="E_f.anterior", label="", unit="MPa", kind="modulus", treatment="estimated",
+        prior_mean=generic, prior_std=0.2 * generic, estimate=estimate, low=low, high=high,
+        truth=truth,
     )  # fmt: skip
 
 
@@ -17,6 +32,80 @@ ASKED = [
     answered(2.0, 3.0, 1.0, 5.0, 2.0),
     answered(1.0, None, None, None, 2.0),
 ]
+
+
+def test_errors_stand_beside_the_generic_guess_and_lost_estimates_are_counted():
+    row = skill(ASKED)
+    assert (row["n"], row["estimated"], row["inside"]) == (4, 3, 2)
+    assert row["coverage"] == pytest.approx(200 / 3)
+    # Errors of 10, -20 and 50 %; guesses are off by 50, 50 and 0 %, and by 100 % of what is lost.
+    assert (row["mean error"], row["median error"]) == pytest.approx((40 / 3, 20.0))
+    assert (row["generic guess"], row["generic guess, all"]) == (50.0, 50.0)
+    # Of the priors only that of 2 MPa holds its truth.
+    assert row["inside prior"] == 1
+    # Widths of 4, 2 and 4 over estimates of 11, 8 and 3, and over truths of 10, 10 and 2.
+    assert row["relative width"] == pytest.approx(4 / 11)
+    assert row["mean width"] == pytest.approx((40 + 20 + 200) / 3)
+    prior = 2 * 1.959964 * 0.2
+    assert row["width over prior"] == pytest.approx(np.log(13 / 9) / prior, rel=1e-6)
+
+
+def test_without_an_estimate_there_is_no_error_to_compare():
+    row = skill(ASKED[3:])
+    assert (row["n"], row["estimated"], row["inside"], row["inside prior"]) == (1, 0, 0, 0)
+    for column in ("coverage", "coverage low", "median error", "generic guess", "relative width"):
+        assert row[column] is None
+    assert row["generic guess, all"] == 100.0
+
+
+def test_errors_of_displacements_are_in_their_unit():
+    shift = Unknown(
+        name="shift.x", unit="mm", kind="nuisance", prior_mean=0.0, prior_std=1.0, truth=0.1,
+        estimate=-0.2, low=-0.5, high=0.1,
+    )  # fmt: skip
+    row = skill([shift])
+    assert (row["unit"], row["mean error"], row["mean width"]) == ("mm", pytest.approx(-0.3), 0.6)
+    assert row["relative width"] is row["width over prior"] is None
+
+
+def test_what_anyone_could_say():
+    row = answered(10.0, 11.0, 9.0, 13.0, 5.0)
+    guess, before = generic_guess(row), prior_alone(row)
+    assert (guess.estimate, guess.low, guess.inside) == (5.0, None, None)
+    # A relative SD of 0.2 becomes one of the logarithm.
+    assert before.low == pytest.approx(5.0 * np.exp(-1.95996 * 0.2), rel=1e-5)
+    assert log_width(before) == pytest.approx(2 * 1.95996 * 0.2, rel=1e-5)
+    assert before.inside is False
+    shift = Unknown(
+        name="shift.x", label="", unit="mm", kind="nuisance", treatment="estimated",
+        prior_mean=0.0, prior_std=1.0, truth=-1.0,
+    )  # fmt: skip
+    assert (prior_alone(shift).low, prior_alone(shift).high) == pytest.approx((-1.959964, 1.959964))
+    assert score(prior_alone(shift)) == pytest.approx(-1.0)
+    assert score(shift) is None
+
+
+def test_scores_are_of_the_logarithm():
+    middle, sd = 4.0, 0.1
+    row = answered(float(4.0 * np.exp(0.2)), middle, middle * np.exp(-1.959964 * sd),
+                   middle * np.exp(1.959964 * sd), 5.0)  # fmt: skip
+    assert score(row) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("inside", "n", "low", "high"),
+    [
+        # Clopper and Pearson's intervals as R's binom.test prints them: 7 of 20, 18 of 20.
+        (7, 20, 0.1539092, 0.5921885),
+        (18, 20, 0.6830173, 0.9876515),
+        # None and all of n: the root of 0.025, 0.025^(1/20) = 0.8315665.
+        (0, 20, 0.0, 0.1684335),
+        (20, 20, 0.8315665, 1.0),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_bounds_of_a_share(inside, n, low, high):
+    assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)
 
 
 def test_a_table_has_a_row_for_each_group_that_is_not_empty():

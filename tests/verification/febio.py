@@ -47,8 +47,7 @@ from mvest.mechanics.settings import (
 from mvest.mechanics.steps import NewtonSettings, Simulation
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.observation.vertices import FRAMES, Observation
-from mvest.problem.estimate import estimate
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, estimate
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.solid_mesh import SolidMesh

@@ -42,9 +42,7 @@ from mvest.observation.errors import (
     WhiteNoise,
 )
 from mvest.observation.vertices import require_frames
-from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.expectation import expect
-from mvest.problem.problem import Problem
+from mvest.problem.estimate import Problem, StudyResult, estimate
 from mvest.problem.stored import Extrapolated, Store, StoredModel
 from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.reporting.expectation import expectation_text, unknown_text
@@ -297,7 +295,7 @@ def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[Stud
         for seed in seeds:
             data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
             if data.observation is None:
-                return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
+                return [StudyResult.failed(twin.problem, data.reason) for _ in seeds]
             result = estimate(problem, data.observation, on_iterate=bar.iterate)
             results.append(result.against(data.truth))
     return results
@@ -340,9 +338,8 @@ def expect_twin(config: Values, _folder: Path | None = None) -> str:
         return unknown_text(title, first.reason)
     std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
     noise = noise_words("assumed", std.tolist(), config["filter"]["R_correlation_mm"])
-    return expectation_text(
-        title, expect(replace(twin.problem, model=model), data.observation), noise
-    )
+    problem = replace(twin.problem, model=model)
+    return expectation_text(title, problem, data.observation, noise)
 
 
 def noise_words(known: str, std_mm: Sequence[float], length_mm: float) -> str:

@@ -18,14 +18,11 @@ import scipy
 from mvest.errors import InputError
 from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance, observation_noise
-from mvest.estimation.prediction import require_finite, require_positive
+from mvest.estimation.prediction import require_positive
 from mvest.typing import FloatArray
 
 NOISE_RANGE = (1e-6, 1e6)
 """Times the unit of the observation, between which a needed noise is looked for."""
-
-KNOWLEDGE_RANGE = (1e-5, 1e2)
-"""Relative standard deviations between which a needed knowledge is looked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,15 +51,8 @@ class Design:
         Raises
         ------
         InputError
-            If shapes disagree or a value is not admissible.
+            If a value is not positive.
         """
-        H, values = np.asarray(H, dtype=np.float64), np.asarray(values, dtype=np.float64)
-        if H.ndim != 2 or H.shape[1] != len(names) or values.shape != (len(names),):
-            raise InputError(
-                f"a design of {len(names)} parameters has a Jacobian of shape {H.shape} and values "
-                f"of shape {values.shape}"
-            )
-        require_finite(H, "the Jacobian")
         require_positive(values, "a value of a design")
         return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))
 
@@ -109,42 +99,13 @@ class Design:
     ) -> float:
         """Noise with which a parameter is known to a relative standard deviation `target`.
 
-        Zero if it would not be even without noise, infinite if it is so without any data.
+        Zero if it would not be even without noise, infinite if it is so without any data. The mean
+        of N independent observations has their noise / √N.
         """
-        if not target > 0.0:
-            raise InputError(f"target = {target}, expected > 0")
-        return _needed(lambda noise: self.std(name, noise, knowledge) / target, NOISE_RANGE)
-
-    def needed_repeats(
-        self, name: str, target: float, noise: float, knowledge: Mapping[str, float] | None = None
-    ) -> float:
-        """How many independent observations, averaged, make a parameter known to `target`.
-
-        The mean of N has noise / √N. Infinite if no number of them does.
-        """
-        needed = self.needed_noise(name, target, knowledge)
-        return np.inf if needed == 0.0 else (noise / needed) ** 2
-
-    def needed_knowledge(
-        self,
-        name: str,
-        target: float,
-        noise: float,
-        about: str,
-        knowledge: Mapping[str, float] | None = None,
-    ) -> float:
-        """How well another parameter must be known beforehand, as a relative standard deviation.
-
-        Zero if knowing it exactly is not enough, infinite if nothing need be known of it.
-        """
-
-        def relative(std: float) -> float:
-            return self.std(name, noise, {**(knowledge or {}), about: std}) / target
-
-        return _needed(relative, KNOWLEDGE_RANGE)
+        return needed(lambda noise: self.std(name, noise, knowledge) / target, NOISE_RANGE)
 
 
-def _needed(relative: Callable[[float], float], within: tuple[float, float]) -> float:
+def needed(relative: Callable[[float], float], within: tuple[float, float]) -> float:
     """Where an increasing function is 1; 0 if it is more all over the range, infinite if less."""
 
     def excess(log: float) -> float:
@@ -160,21 +121,17 @@ def _needed(relative: Callable[[float], float], within: tuple[float, float]) -> 
 
 
 def together(*designs: Design) -> Design:
-    """All of several observations, whose errors are independent of each other.
+    """All of several observations of the same parameters, whose errors are independent.
 
     Raises
     ------
     InputError
         If there are none, or they are not of the same parameters at the same values.
     """
-    if not designs:
-        raise InputError("no design to put together")
-    first = designs[0]
-    for other in designs[1:]:
-        if other.names != first.names or not np.array_equal(other.values, first.values):
-            raise InputError("designs put together must be of the same parameters and values")
+    if len({(design.names, tuple(design.values)) for design in designs}) != 1:
+        raise InputError("designs put together must be of the same parameters and values")
     stacked = np.concatenate([design.triangle for design in designs])
-    return Design(first.names, first.values, _triangle(stacked))
+    return Design(designs[0].names, designs[0].values, _triangle(stacked))
 
 
 def _triangle(rows: FloatArray) -> FloatArray:

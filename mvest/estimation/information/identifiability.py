@@ -17,6 +17,8 @@ from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
+STEP = 0.1
+"""Change that shows how parameters make up for each other, in parts of a scale."""
 RELEVANT_SHARE = 0.1
 """Smallest share of a parameter in a combination that is worth naming."""
 UNDETERMINED = ("not determined at all", "known to no better than its own size")
@@ -29,17 +31,20 @@ class TradeOff:
 
     Attributes
     ----------
-    names : tuple of str, (q,)
+    parameters : tuple of str, (q,)
         The first is the one that the others follow best.
-    exchange : tuple of float, (q,)
-        How they move together along the valley: change of each, in parts of its scale, that goes
-        with a change of the first by one scale, cov(i, first) / var(first). The first's own is 1.
+    changes : tuple of float, (q,)
+        Changes in their units that hardly show together: the first changes by `STEP` of its scale,
+        the others by cov(i, first) / var(first) of that.
+    relative : tuple of float, (q,)
+        The same in parts of their scales.
     correlation : float
         Smallest size of the correlation of the first with one of the others, at the bound.
     """
 
-    names: tuple[str, ...]
-    exchange: tuple[float, ...]
+    parameters: tuple[str, ...]
+    changes: tuple[float, ...]
+    relative: tuple[float, ...]
     correlation: float
 
 
@@ -105,29 +110,6 @@ class Identifiability:
             if width > limit
         )
 
-    def measured(self, name: str, std: float) -> FloatArray:
-        """Smallest attainable standard deviations (p,) if one parameter is measured besides.
-
-        Parameters
-        ----------
-        name : str
-        std : float
-            Of the measurement, in the parameter's unit.
-
-        Raises
-        ------
-        InputError
-            If there is no such parameter, or the measurement has no positive standard deviation.
-        """
-        if name not in self.names or not std > 0.0:
-            raise InputError(f"measurement of {name!r} to {std}; known: {', '.join(self.names)}")
-        k = self.names.index(name)
-        more = np.zeros(len(self.names))
-        more[k] = self.scale[k] / std
-        rows = self.eigenvectors.T * np.sqrt(self.eigenvalues)[:, None]
-        s, V = _singular(np.vstack([rows, more]))
-        return np.sqrt(np.diagonal(_bound(self.scale, s, V)))
-
     def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[TradeOff, ...]:
         """Groups of parameters that the data hardly tell apart, the largest group first.
 
@@ -148,17 +130,18 @@ class Identifiability:
                 continue
             first = members[np.argmax(size[np.ix_(members, members)].sum(axis=0))]
             others = [int(i) for i in members[np.argsort(-size[first, members])] if i != first]
-            scaled = self.covariance[:, first] / (self.scale * self.scale[first])
-            exchange = scaled / scaled[first]
             order = [int(first), *others]
+            scaled = self.covariance[order, first] / (self.scale[order] * self.scale[first])
+            relative = STEP * (scaled / scaled[0])
             groups.append(
                 TradeOff(
                     tuple(self.names[i] for i in order),
-                    tuple(float(exchange[i]) for i in order),
+                    tuple((relative * self.scale[order]).tolist()),
+                    tuple(relative.tolist()),
                     float(size[first, others].min()),
                 )
             )
-        return tuple(sorted(groups, key=lambda one: -len(one.names)))
+        return tuple(sorted(groups, key=lambda one: -len(one.parameters)))
 
 
 def identifiability(
@@ -224,13 +207,6 @@ def identifiability(
     )
 
 
-def cramer_rao_bound(
-    H: FloatArray, R: NoiseCovariance, prior: Gaussian | None = None
-) -> FloatArray:
-    """Smallest covariance (p, p) of an unbiased estimate; see `Identifiability.covariance`."""
-    return identifiability(H, R, np.ones(np.shape(H)[-1]), prior=prior).covariance
-
-
 def _singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Singular values ``(p,)`` of ``rows (n, p)``, the smallest first, and right vectors (p, p)."""
     p = rows.shape[1]
@@ -283,21 +259,8 @@ def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray
     Returns
     -------
     (p,) in the filter's coordinates
-
-    Raises
-    ------
-    InputError
-        If there is no prediction, or the offset does not belong to it or is not finite.
     """
-    offset = np.asarray(offset, dtype=np.float64)
-    if found.prediction is None:
-        raise InputError("an estimate without a prediction has no derivatives")
-    if offset.shape != found.prediction.y.shape:
-        raise InputError(
-            f"offset of shape {offset.shape}, expected that of the prediction: "
-            f"{found.prediction.y.shape}"
-        )
-    require_finite(offset, "the error of the model")
+    assert found.prediction is not None
     noise, prior = observation_noise(R, len(offset)), to_filter(found.transform, found.prior)
     H = found.prediction.jacobian * found.transform.derivative(found.transformed.mean)
     return kalman_update(prior, offset, H, noise).posterior.mean - prior.mean

@@ -20,7 +20,7 @@ from mvest.exchange.surfaces import Surface, region_arrays, write_surface_series
 from mvest.files import write_atomically
 from mvest.imaging.valve_sequence import ANNULUS_LABELS, slicerheart_labels
 from mvest.imaging.volume import VolumeSequence
-from mvest.problem.fields import CaseFields, read_case_fields
+from mvest.problem.fields import CaseFields, case_fields
 from mvest.reading.npz import read_npz
 from mvest.reading.text import refusing
 from mvest.typing import FloatArray, IntArray
@@ -89,7 +89,7 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     if (source / FIELDS).is_file() and "times" in read_npz(source / FIELDS):
         return write_atomically(target, lambda part: _write_closing(part, source / FIELDS))
     if (source / FIELDS).is_file():
-        fields = read_case_fields(source / FIELDS, turned=False)
+        fields = case_fields(source / FIELDS, turned=False)
         return write_atomically(target, lambda part: _write_run(part, fields, options))
     raise InputError(f"{source}: neither a case ({CASE_FILE}) nor a run with shapes ({FIELDS})")
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
-from mvest.problem.fields import CaseFields, case_fields, read_case_fields, turn_of
+from mvest.problem.fields import CaseFields, case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     UNSEEN,
@@ -141,85 +141,50 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
 
 
 def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
-    """The closed valve coloured by pointwise distance: generic beside personalised, on one scale.
+    """The closed valve coloured by pointwise distance from the observed one, on one scale.
+
+    The generic valve, if there is one, is beside the personalised one.
 
     Parameters
     ----------
     fields : CaseFields or Path
-        A path is read by `mvest.problem.fields.read_case_fields`.
+        A path is read by `mvest.problem.fields.case_fields`.
     names : sequence of str
         Of the leaflets, written beside them.
 
     Raises
     ------
     InputError
-        If a shape or its distances are missing.
+        If the personalised shape or its distances are missing.
     """
-    if isinstance(fields, Path):
-        fields = read_case_fields(fields)
+    fields = case_fields(fields) if isinstance(fields, Path) else fields
+    if fields.fitted is None or fields.distance_fitted is None:
+        raise InputError("Figure 3 needs the personalised closed valve and its distances")
     k = fields.closed
-    if fields.generic is None or fields.fitted is None:
-        raise InputError("Figure 3 needs the generic and the personalised closed valve")
-    if fields.distance_generic is None or fields.distance_fitted is None:
-        raise InputError("Figure 3 needs the distances of the generic and the personalised valve")
-    distances = fields.distance_generic[k], fields.distance_fitted[k]
-    top = distance_top(*distances)
-    scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
-    shapes = [
-        _Shape(
-            f"{title} stiffness\n{Spread.of(distance)} mm",
-            fields,
-            points[k],
-            k + 1,
-            corner_colours(scale, distance, fields.triangles),
-        )
-        for title, points, distance in zip(
-            ("generic", "personalised"), (fields.generic, fields.fitted), distances, strict=True
-        )
-    ]
-    figure, grid = _views_figure(shapes, names, (8.6, 6.6), 0.8)
-    beyond = "max" if np.nanmax(distances) > top else "neither"
-    bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.02, extend=beyond)
-    bar.set_label("distance from the observed closed valve [mm]")
-    return figure
-
-
-def fitted_figure(fields: Path) -> Figure:
-    """A fitted valve open and closed, from the atrium and from the side.
-
-    The closed valve is coloured by the distance of each vertex from where it was observed, and grey
-    where it was not seen (NaN).
-
-    Parameters
-    ----------
-    fields : Path
-        As `mvest.problem.fields.read_case_fields` reads it, with the fitted shape and its
-        distances.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or has none.
-    """
-    valve = read_case_fields(fields)
-    if valve.fitted is None or valve.distance_fitted is None:
-        raise InputError(f"{fields}: no fields of a fitted valve")
-    k = valve.closed
-    distance = valve.distance_fitted[k]
-    largest = float(np.nanmax(distance))
+    models = {"personalised": (fields.fitted[k], fields.distance_fitted[k])}
+    if fields.generic is not None and fields.distance_generic is not None:
+        models = {"generic": (fields.generic[k], fields.distance_generic[k]), **models}
+    largest = max(float(np.nanmax(distance)) for _, distance in models.values())
     # In the unit in which the largest is a number above 0.1.
     unit, factor = next(
         ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * largest >= 0.1), ("nm", 1e6)
     )
-    scale = ScalarMappable(Normalize(0.0, max(factor * largest, 1e-3)), DISTANCE_MAP)
-    coloured = corner_colours(scale, factor * distance, valve.triangles)
-    shapes = (
-        _Shape("open", valve, valve.rest, 0, leaflet_colours(valve.region)),
-        _Shape("closed", valve, valve.fitted[k], k + 1, coloured),
-    )
-    figure, grid = _views_figure(shapes, (), (8.4, 6.4), 1.0)
-    bar = figure.colorbar(scale, ax=grid[:, 1], shrink=0.6, pad=0.02)
-    bar.set_label(f"distance, fitted to observed [{unit}]")
+    top = distance_top(*(factor * distance for _, distance in models.values()))
+    scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
+    shapes = [
+        _Shape(
+            f"{name} stiffness\n{Spread.of(factor * distance)} {unit}",
+            fields,
+            points,
+            k + 1,
+            corner_colours(scale, factor * distance, fields.triangles),
+        )
+        for name, (points, distance) in models.items()
+    ]
+    figure, grid = _views_figure(shapes, names, (4.3 * len(shapes), 6.6), 0.8)
+    beyond = "max" if factor * largest > top else "neither"
+    bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.02, extend=beyond)
+    bar.set_label(f"distance from the observed closed valve [{unit}]")
     return figure
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
 from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
 
@@ -48,12 +47,3 @@ def test_what_the_prior_holds_is_not_shifted():
     assert shift[1] == 0.0
     # One parameter, three observations: 300 of 300 + 1.
     assert shift[0] == pytest.approx(300 / 301)
-
-
-@pytest.mark.parametrize(
-    ("offset", "message"), [(np.ones(4), r"shape \(4,\)"), (np.array([1, 2, np.nan]), "finite")]
-)
-def test_inadmissible_offsets_are_refused(offset, message):
-    found = estimated(np.ones((3, 2)), np.zeros(3), R=0.01)
-    with pytest.raises(InputError, match=message):
-        shift_by_model_error(found, 0.01, offset)

@@ -76,7 +76,7 @@ def test_a_reference_without_draws_is_refused() -> None:
     one = ("~filters.problems.chordae", "~filters.problems.rest_length")
     values = plain(composed("experiment=filters", *SMALL, *one))
     values["filters"]["reference"] = {
-        "_target_": "mvest.estimation.filters.extended.ExtendedFilter"
+        "_target_": "mvest.estimation.filters.iterated.ExtendedFilter"
     }
     settings = build(Settings, {"filters": values["filters"]})
     with pytest.raises(ConfigurationError, match=r"filters\.reference: no draws"):

@@ -24,7 +24,7 @@ from experiments.studies.patient import (
     summary,
 )
 from mvest.errors import InputError
-from mvest.problem.fields import read_case_fields
+from mvest.problem.fields import case_fields
 from mvest.problem.record import Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
 from tests.experiments.studies.made_up import SOURCE
@@ -188,7 +188,7 @@ def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file)
 
 
 def test_figure_3_has_one_scale_for_all(fields_file, monkeypatch):
-    fields = read_case_fields(fields_file)
+    fields = case_fields(fields_file)
     far = copy.copy(fields)
     object.__setattr__(far, "distance_generic", 5 * fields.distance_generic)
     drawn = figure_3({"near": fields, "far": far})
@@ -203,14 +203,14 @@ def test_figure_3_has_one_scale_for_all(fields_file, monkeypatch):
 
 
 def test_figure_3_says_where_there_is_no_estimate(fields_file):
-    fields = read_case_fields(fields_file)
+    fields = case_fields(fields_file)
     drawn = figure_3({"sound": fields, "lost": fields}, ["lost"])
     titles = [axes.get_title() for axes in drawn.axes[:4]]
     assert [title.startswith("NO ESTIMATE") for title in titles] == [False, False, False, True]
 
 
 def test_figure_3_needs_distances(fields_file):
-    fields = copy.copy(read_case_fields(fields_file))
+    fields = copy.copy(case_fields(fields_file))
     object.__setattr__(fields, "distance_fitted", None)
     with pytest.raises(InputError, match="Figure 3 needs the distances"):
         figure_3({"one": fields})

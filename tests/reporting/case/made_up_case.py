@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from mvest.estimation.estimate import InnovationSummary
+from mvest.estimation.information.identifiability import TradeOff
 from mvest.problem.record import (
-    Confounded,
     EstimateRecord,
     FrameFit,
-    Innovation,
     Spread,
     Unknown,
 )
@@ -159,12 +159,12 @@ def _record(fields: dict[str, np.ndarray]) -> EstimateRecord:
         iterates=((4.0, 3.0, 0.0), (5.2, 2.4, 0.02), (5.7, 2.2, 0.025), (5.8, 2.2, 0.026)),
         iterate_std=((2.0, 1.5, 0.02), (1.0, 0.4, 0.01), (0.8, 0.3, 0.008), (0.8, 0.3, 0.008)),
         objective=(920.0, 340.0, 301.0, 300.2),
-        innovation=Innovation(
+        innovation=InnovationSummary(
             size=1428, rms=1.02, max_abs=3.1, nis=1485.0, nis_band=(1325.0, 1535.0)
         ),
         condition_number=48.0,
         confounded=(
-            Confounded(
+            TradeOff(
                 parameters=("E_f.anterior", "chord_slack"),
                 changes=(0.58, -0.0031),
                 relative=(0.1, -0.031),

@@ -7,13 +7,12 @@ import pytest
 from matplotlib.collections import PolyCollection, QuadMesh
 
 from mvest.errors import InputError
-from mvest.problem.fields import read_case_fields
+from mvest.problem.fields import case_fields
 from mvest.reporting.case.drawing import BLOOD, LINE_PIECES, TISSUE, leak_of, quartered
 from mvest.reporting.case.figures import (
     case_figure,
     distance_top,
     estimates_figure,
-    fitted_figure,
     frames_figure,
     shapes_figure,
 )
@@ -32,7 +31,7 @@ def case(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fields(case):
-    return read_case_fields(case[1])
+    return case_fields(case[1])
 
 
 LINES = 2 * COLUMNS * LINE_PIECES
@@ -67,7 +66,7 @@ def test_a_valve_is_turned_the_same_way_however_it_lies(case, fields, tmp_path) 
     for name in ("rest", "observed", "generic", "registered", "fitted", "truth", "tips"):
         arrays[name] = arrays[name] @ turn.T + [50.0, -20.0, 300.0]
     np.savez(tmp_path / "turned.npz", **arrays)
-    turned = read_case_fields(tmp_path / "turned.npz")
+    turned = case_fields(tmp_path / "turned.npz")
     np.testing.assert_allclose(turned.rest, fields.rest, atol=1e-9)
     np.testing.assert_allclose(turned.observed, fields.observed, atol=1e-9)
     np.testing.assert_allclose(turned.tips, fields.tips, atol=1e-9)
@@ -104,7 +103,7 @@ def test_arrays_that_do_not_fit_are_named(case, tmp_path, name, value, message) 
         arrays = dict(stored) | {name: value}
     np.savez(tmp_path / "bad.npz", **arrays)
     with pytest.raises(InputError, match=message):
-        read_case_fields(tmp_path / "bad.npz")
+        case_fields(tmp_path / "bad.npz")
 
 
 # --- Figure 3 -----------------------------------------------------------------------------------
@@ -151,11 +150,13 @@ def test_figure_3_draws_the_frame_that_was_shown_to_the_filter(fields) -> None:
     assert f"{mean:.2f}" in case_figure(late).axes[0].get_title()
 
 
-def test_figure_3_needs_its_fields(fields) -> None:
-    with pytest.raises(InputError, match="needs the generic"):
+def test_figure_3_needs_its_fields(fields, tmp_path) -> None:
+    with pytest.raises(InputError, match="needs the personalised"):
         case_figure(replace(fields, fitted=None))
-    with pytest.raises(InputError, match="needs the distances"):
+    with pytest.raises(InputError, match="and its distances"):
         case_figure(replace(fields, distance_fitted=None))
+    with pytest.raises(InputError, match=r"none\.npz"):
+        case_figure(tmp_path / "none.npz")
 
 
 @pytest.mark.parametrize(("largest", "top"), [(2.1, 2.5), (0.31, 0.35), (5.0, 5.0), (0.0, 1e-3)])
@@ -173,38 +174,19 @@ def test_one_outlier_does_not_hide_the_rest() -> None:
 # --- a fitted valve -----------------------------------------------------------------------------
 
 
-def test_a_fitted_valve_is_drawn_open_and_closed_from_two_sides(case, fields) -> None:
-    figure = fitted_figure(case[1])
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["open", "closed"]
-    sides = [figure.axes[k].texts[-1].get_text() for k in (0, 2)]
-    assert sides == ["seen from the atrium", "seen from the side"]
-    assert figure.axes[4].get_ylabel() == "distance, fitted to observed [mm]"
-    largest = np.nanmax(fields.distance_fitted[0])
-    assert figure.axes[4].get_ylim() == pytest.approx((0.0, largest))
-    touched = np.isnan(fields.distance_fitted[0])[fields.triangles].any(axis=1).sum()
-    colour = faces(figure.axes[1]).get_facecolor()
-    grey = (np.ptp(colour[:, :3], axis=1) < 1e-9) & (colour[:, 0] > 0.3)
-    assert 0 < grey.sum() == touched * pieces(figure.axes[1], fields)
-
-
-def test_distances_of_a_fitted_valve_have_a_unit_that_shows_them(case, tmp_path) -> None:
+def test_a_fitted_valve_without_a_generic_one_is_drawn_alone_in_a_unit_that_shows_it(
+    case, tmp_path
+) -> None:
     with np.load(case[1]) as stored:
-        arrays = dict(stored)
-    for factor, unit in ((1e-3, "µm"), (1e-6, "nm")):
+        arrays = {name: array for name, array in stored.items() if "generic" not in name}
+    for factor, unit in ((1.0, "mm"), (1e-3, "µm"), (1e-6, "nm")):
         np.savez(tmp_path / "small.npz", **arrays | {
             "distance_fitted": factor * arrays["distance_fitted"]
         })  # fmt: skip
-        label = fitted_figure(tmp_path / "small.npz").axes[4].get_ylabel()
-        assert label == f"distance, fitted to observed [{unit}]"
-
-
-def test_missing_or_damaged_fields_of_a_fitted_valve_are_named(case, tmp_path) -> None:
-    with pytest.raises(InputError, match=r"none\.npz"):
-        fitted_figure(tmp_path / "none.npz")
-    with np.load(case[1]) as stored:
-        np.savez(tmp_path / "half.npz", **{k: v for k, v in stored.items() if k != "fitted"})
-    with pytest.raises(InputError, match=r"half\.npz: no fields of a fitted valve"):
-        fitted_figure(tmp_path / "half.npz")
+        figure = case_figure(tmp_path / "small.npz")
+        assert figure.axes[0].get_title().startswith("personalised stiffness")
+        assert len(figure.axes) == 3
+        assert figure.axes[2].get_ylabel() == f"distance from the observed closed valve [{unit}]"
 
 
 # --- the other pictures -------------------------------------------------------------------------
@@ -299,13 +281,9 @@ def test_a_slit_of_touching_leaflets_is_told_from_a_leak_where_their_reach_is_kn
     assert colours(200.0) == [{TISSUE}]
 
 
-def test_every_picture_of_a_closed_valve_shows_its_leak(case, fields, tmp_path):
+def test_every_picture_of_a_closed_valve_shows_its_leak(fields):
     valve = replace(fields, reach_mm=2.0)
     assert [len(leaks(axes)) for axes in case_figure(valve).axes[:4]] == [1, 1, 0, 0]
-    with np.load(case[1]) as stored:
-        np.savez(tmp_path / "reach.npz", **stored, reach_mm=2.0)
-    images = [len(leaks(axes)) for axes in fitted_figure(tmp_path / "reach.npz").axes[:4]]
-    assert images == [0, 1, 0, 0]
 
 
 def test_the_scene_has_the_gap_where_it_is(fields):

@@ -47,19 +47,6 @@ def test_the_second_call_reads_from_disk(tmp_path):
     assert [path.suffix for path in folder.iterdir() if path.name[0] != "."] == [".npz"]
 
 
-def test_a_jacobian_is_kept_where_it_is_wanted_and_never_taken_for_one_without(tmp_path, capsys):
-    model = Model()
-    plain = StoredModel(model, tmp_path, "key")
-    whole = StoredModel(model, tmp_path, "key", jacobian=True)
-    plain(AT)
-    assert whole(AT).jacobian.all()
-    assert StoredModel(model, tmp_path, "key", jacobian=True)(AT).jacobian.all()
-    assert model.calls == 2
-    assert not plain(AT).jacobian.any()
-    assert model.calls == 2
-    assert capsys.readouterr().err == ""
-
-
 @pytest.mark.parametrize("change", [("other", AT), ("key", AT * [1, 1 + 1e-15]), ("key", AT[::-1])])
 def test_another_key_or_other_parameters_are_another_truth(tmp_path, change):
     model = Model()
