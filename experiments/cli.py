@@ -15,6 +15,7 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser, interruptible
@@ -143,7 +144,7 @@ def _dashboard(rest: list[str]) -> int:
     """Serve MLflow's pages until it is interrupted."""
     import webbrowser
 
-    from experiments.common.schema import require_within
+    from experiments.common.schema import validated
     from experiments.runner.dashboard import last_sweep, serving
     from mvest.quantities import within
 
@@ -151,7 +152,7 @@ def _dashboard(rest: list[str]) -> int:
     parser.add_argument("outputs", nargs="?", default="outputs", type=Path, metavar="FOLDER")
     parser.add_argument("--port", default=5000, type=int, help="5000 if not given; 0: a free one")
     parsed = parser.parse_args(rest)
-    require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
+    validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], parsed.port, "--port")
     try:
         place, page, said = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):

@@ -6,14 +6,56 @@ and `experiments.common.schema` read it there; to everything else the type is a 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import Field
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import PydanticCustomError, core_schema
 
 
-def within(low: float, high: float, unit: str, why: str) -> Any:
+@dataclass(frozen=True, slots=True)
+class Within:
+    """The range of a type of settings: pydantic checks what is annotated by it.
+
+    Attributes
+    ----------
+    low, high : float
+        Both ends are admissible.
+    unit, why : str
+    """
+
+    low: float
+    high: float
+    unit: str
+    why: str
+
+    def check(self, value: Any, name: str = "") -> Any:
+        """A number, nested lists of them, or None, all of them inside.
+
+        Raises
+        ------
+        PydanticCustomError
+            With the number, which is called ``name``, and the range.
+        """
+        for part in value if isinstance(value, list | tuple) else ():
+            self.check(part, name)
+        if isinstance(value, int | float) and not self.low <= value <= self.high:
+            said = f"expected {self.low:.10g} to {self.high:.10g} {self.unit}".rstrip()
+            why = f" ({self.why})" if self.why else ""
+            given = {"said": f"{name} = {value:.10g}, {said}{why}"}
+            raise PydanticCustomError("range", "{said}", given)
+        return value
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        """What pydantic asks for."""
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+
+def within(low: float, high: float, unit: str, why: str) -> Within:
     """The range of a type of settings; both ends are admissible."""
-    return Field(ge=low, le=high, description=f"{unit}; {why}" if unit else why)
+    return Within(low, high, unit, why)
 
 
 # Meshes and points.

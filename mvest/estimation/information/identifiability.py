@@ -105,29 +105,6 @@ class Identifiability:
             if width > limit
         )
 
-    def measured(self, name: str, std: float) -> FloatArray:
-        """Smallest attainable standard deviations (p,) if one parameter is measured besides.
-
-        Parameters
-        ----------
-        name : str
-        std : float
-            Of the measurement, in the parameter's unit.
-
-        Raises
-        ------
-        InputError
-            If there is no such parameter, or the measurement has no positive standard deviation.
-        """
-        if name not in self.names or not std > 0.0:
-            raise InputError(f"measurement of {name!r} to {std}; known: {', '.join(self.names)}")
-        k = self.names.index(name)
-        more = np.zeros(len(self.names))
-        more[k] = self.scale[k] / std
-        rows = self.eigenvectors.T * np.sqrt(self.eigenvalues)[:, None]
-        s, V = _singular(np.vstack([rows, more]))
-        return np.sqrt(np.diagonal(_bound(self.scale, s, V)))
-
     def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[TradeOff, ...]:
         """Groups of parameters that the data hardly tell apart, the largest group first.
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.estimation import Gaussian, cramer_rao_bound, identifiability
 
 
@@ -65,28 +64,6 @@ def test_what_is_not_determined_is_told_as_such_and_not_as_a_correlation():
     found = identifiability(H, 1.0, np.ones(3), names=("a", "b", "c"))
     assert found.confounded() == ()
     assert any("a" in words and "not determined at all" in words for words in found.flat())
-
-
-def test_one_measurement_more_is_information_added_to_its_parameter():
-    H = np.array([[1.0, 0.9, 0.0], [0.0, 0.1, 1.0], [1.0, 1.0, 0.2]])
-    found = identifiability(H, 0.04, np.array([2.0, 1.0, 3.0]), names=("a", "b", "c"))
-    information = H.T @ H / 0.04
-    information[1, 1] += 1 / 0.05**2
-    by_hand = np.sqrt(np.diagonal(np.linalg.inv(information)))
-    np.testing.assert_allclose(found.measured("b", 0.05), by_hand, rtol=1e-9)
-
-
-def test_a_measurement_determines_what_was_not_determined():
-    found = identifiability(np.array([[1.0, 1.0]]), 0.01, np.ones(2), names=("a", "b"))
-    assert np.isinf(found.std).all()
-    np.testing.assert_allclose(found.measured("b", 0.3), [np.hypot(0.1, 0.3), 0.3])
-
-
-@pytest.mark.parametrize(("name", "std"), [("d", 0.1), ("a", 0.0)])
-def test_a_measurement_of_nothing_is_refused(name, std):
-    found = identifiability(np.eye(2), 0.01, np.ones(2), names=("a", "b"))
-    with pytest.raises(InputError, match="measurement of"):
-        found.measured(name, std)
 
 
 def test_what_is_known_to_no_better_than_its_size_has_no_percentage():

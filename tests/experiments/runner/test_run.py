@@ -132,7 +132,7 @@ ERRORS = [
     ("force=perhaps", "force: Value 'perhaps'"),
     ("filter=null", "filter=null: "),
     ("mesh=null", "mesh=null: "),
-    ("~filter", "filter.mode has no value"),
+    ("~filter", "filter.initial has no value"),
     ("~seed", "seed has no value"),
     ("--experiment", "unrecognized arguments: --experiment; settings are NAME=VALUE"),
     ("name=../escape", "name = '../escape', expected a name"),

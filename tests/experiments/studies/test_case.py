@@ -145,7 +145,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
     config["personal"]["unknowns"]["shift.x"]["treatment"] = "guessed"
     with pytest.raises(
         ConfigurationError,
-        match=r"shift\.x\.treatment = 'guessed', expected one of estimated, fixed",
+        match=r"shift\.x\.treatment = 'guessed', expected estimated or fixed",
     ):
         personalising(config)
 
