@@ -42,7 +42,6 @@ from mvest.quantities import (
     CellsAlong,
     CellsAround,
     EdgeLength,
-    Factor,
     Gigabytes,
     Layers,
     Length,
@@ -59,6 +58,7 @@ from mvest.quantities import (
     TimeLimit,
     Value,
     Values,
+    within,
 )
 
 GROUP = "study"
@@ -136,7 +136,7 @@ class Truth:
     element: str | None = None
     # Columns and rows of a coarser mesh: both closures are extrapolated to zero mesh size.
     extrapolated_from: tuple[AxisCount, ...] = ()
-    dt_factor: Factor = 1.0
+    dt_factor: Annotated[float, within(0.001, 100, "", "one time step over another")] = 1.0
     reading: str | None = None  # Poisson option
     ratio: dict[str, Ratio] = field(default_factory=dict)  # region -> E_f over E_perp
     fixed: ByParameter = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...

@@ -223,7 +223,7 @@ def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequenc
     MvestError
         A word of another form, an unknown name, or an inadmissible value.
     """
-    defaults = OmegaConf.structured(schema(cls))
+    defaults = OmegaConf.structured(schema(typing.cast(Any, cls)))
     for word in words:
         if "=" not in word:
             raise ConfigurationError(f"{word}: expected NAME=VALUE")

@@ -77,9 +77,9 @@ def test_settings_are_those_of_the_configuration(config):
     assert settings.paper.R == 0.25
 
 
-def test_settings_without_a_configuration_are_those_of_the_commands(config):
+def test_settings_without_a_configuration_are_those_of_the_commands():
     case = made_up_case(0.3, 8.0)
-    assert default_settings(case) == personalising(config)
+    assert default_settings(case) == personalising(plain(composed("experiment=own_valve")))
     samples = np.zeros((4, len(case.frames), 288, 3)), np.zeros((4, len(case.frames), 2, 3))
     imaged = replace(case, error_samples=ErrorSamples(*samples))
     values = plain(composed("experiment=volume"))
