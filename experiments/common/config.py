@@ -253,7 +253,7 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
     _require_names(values)  # of the folder, which Hydra makes next
     study = values.get("study")
     kept = without(values, ("hydra", *_not_hashed(study)))
-    return config_hash(_with_contents(study, kept))
+    return config_hash(with_contents(_marks(study), kept))
 
 
 def is_hashed(key: str, study: str | None) -> bool:
@@ -301,22 +301,19 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
     What a setting reads has its SHA-256 in the place of its name; where results lie is left out.
     """
     kept = {str(key): value for key, value in values.items() if key != "paths"}
-    return dict(_with_contents(kept.get("study"), kept))
-
-
-def _with_contents(study: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
-    return with_contents(_kinds(study), values)
+    return with_contents(_marks(kept.get("study")), kept)
 
 
 @cache
 def _not_hashed(study: str | None) -> tuple[str, ...]:
     """Dotted names of the settings that change no number of a study's results."""
-    return tuple(
-        name
-        for top, kind in _kinds(study).items()
-        for name, mark in marks_in(kind, top)
-        if mark is NOT_HASHED
-    )
+    return tuple(name for name, mark in _marks(study) if mark is NOT_HASHED)
+
+
+@cache
+def _marks(study: str | None) -> tuple[tuple[str, Any], ...]:
+    """Dotted names of a study's settings with each mark."""
+    return tuple(marked for top, kind in _kinds(study).items() for marked in marks_in(kind, top))
 
 
 @cache

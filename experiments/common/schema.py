@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -81,21 +81,20 @@ InputFile = Annotated[str | None, Reads(contents)]
 """Type of a setting that names one file or folder, all of which is read."""
 
 
-def with_contents(kinds: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def with_contents(marks: Iterable[tuple[str, Any]], values: Mapping[str, Any]) -> dict[str, Any]:
     """Values with what their settings read in place of its name, and equal numbers alike.
 
     Parameters
     ----------
-    kinds : mapping
-        Name of a setting -> its type.
+    marks : iterable of (str, object)
+        Those of the settings, see `marks_in`.
     values : mapping
         Plain data. Whole numbers become ints, so that 1 and 1.0 are one setting in a hash.
     """
     found = dict(values)
-    for top, kind in kinds.items():
-        for name, mark in marks_in(kind, top):
-            if isinstance(mark, Reads):
-                found = _changed(found, name.split("."), mark.contents)
+    for name, mark in marks:
+        if isinstance(mark, Reads):
+            found = _changed(found, name.split("."), mark.contents)
     return {name: _alike(value) for name, value in found.items()}
 
 
