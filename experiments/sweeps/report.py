@@ -59,9 +59,9 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
 
     base, drawn = results / f"sweep_{sweep.name}", figures_of(sweep)
     for part in CAPTIONS.keys() - drawn:
-        # An older one would contradict the tables.
         name = f"{base.name}_{part}" if part else base.name
-        base.with_name(f"{name}.png").unlink(missing_ok=True)
+        if (older := base.with_name(f"{name}.png")).is_file():
+            older.unlink()  # it would contradict the tables
     return write_page(
         base,
         sweep.title,
