@@ -314,7 +314,7 @@ def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
     assert status == 0
     assert "force=true runs it again" in out
     overrides = (tmp_path / "here" / ".hydra" / "overrides.yaml").read_text()
-    assert yaml.safe_load(overrides) == [*usual[:3], "force=true"]
+    assert yaml.safe_load(overrides) == [*usual[:2], "force=true"]
 
 
 FAILURES = {
