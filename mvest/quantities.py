@@ -9,8 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import GetCoreSchemaHandler
-from pydantic_core import PydanticCustomError, core_schema
+from pydantic import AfterValidator, GetCoreSchemaHandler
+
+from mvest.errors import InputError
+
+
+class OutsideError(InputError):
+    """A number of a setting is outside its range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +39,7 @@ class Within:
 
         Raises
         ------
-        PydanticCustomError
+        OutsideError
             With the number, which is called ``name``, and the range.
         """
         for part in value if isinstance(value, list | tuple) else ():
@@ -42,15 +47,12 @@ class Within:
         if isinstance(value, int | float) and not self.low <= value <= self.high:
             said = f"expected {self.low:.10g} to {self.high:.10g} {self.unit}".rstrip()
             why = f" ({self.why})" if self.why else ""
-            given = {"said": f"{name} = {value:.10g}, {said}{why}"}
-            raise PydanticCustomError("range", "{said}", given)
+            raise OutsideError(f"{name} = {value:.10g}, {said}{why}")
         return value
 
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
         """What pydantic asks for."""
-        return core_schema.no_info_after_validator_function(self.check, handler(source))
+        return AfterValidator(self.check).__get_pydantic_core_schema__(source, handler)
 
 
 def within(low: float, high: float, unit: str, why: str) -> Within:

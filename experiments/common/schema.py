@@ -21,6 +21,7 @@ from pydantic import AfterValidator, TypeAdapter, ValidationError
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.files import sha256_of
 from mvest.problem.registration import range_of
+from mvest.quantities import OutsideError
 from mvest.reading.text import check_words
 
 T = TypeVar("T")
@@ -182,14 +183,14 @@ def validated(kind: Any, value: Any, key: str = "") -> Any:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         own = first.get("ctx", {}).get("error")
-        if isinstance(own, MvestError):  # of a class itself
-            raise own from error
+        if isinstance(own, MvestError) and not isinstance(own, OutsideError):
+            raise own from error  # of a class itself
         *_, last = place = [key, *first["loc"]]
         name = ".".join(part for part in place if isinstance(part, str) and part)
         given = first["input"]
         match first["type"]:
-            case "range":
-                said = first["msg"]
+            case _ if own is not None:
+                said = str(own)
             case "missing" if isinstance(last, str):
                 said = " has no value"
             case _ if given == MISSING:
