@@ -49,7 +49,7 @@ reproduce: $(INSTALLED) ## Table 1 and its figure, in outputs/results, and wheth
 	$(BIN)/python -m experiments.results.reproduced table1
 
 tables: $(INSTALLED) ## everything in results/
-	$(BIN)/python -m experiments.tables
+	$(BIN)/python -m experiments.cli tables
 
 test: $(DEVELOP) ## the tests that finish in minutes
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile -m "not slow"

@@ -13,8 +13,10 @@ import resource
 import shutil
 import sys
 import textwrap
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Any
 
 from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser, interruptible
@@ -60,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         case "--version":
             print(f"mvest {__version__}")
         case "list":
-            Parser("mvest list", description=COMMANDS[command]).parse_args(rest)
+            _parsed("list", rest)
             width = shutil.get_terminal_size().columns
             print(listing(experiments_in(EXPERIMENTS), width))
         case "run":
@@ -82,21 +84,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             return export_command(rest)
         case "tables":
-            from experiments.tables import main as tables
+            from experiments.tables import write_everything
 
-            parser = Parser("mvest tables", description=COMMANDS[command])
-            parser.add_argument("folder", nargs="?", default="results", metavar="FOLDER")
-            return tables([parser.parse_args(rest).folder])
+            results = _parsed("tables", rest, folder={"nargs": "?", "default": "results"}).folder
+            print(*write_everything(results), sep="\n")
         case "table":
-            return _table(rest)
+            from experiments.results.estimates import write_estimates
+
+            file = {"metavar": "FILE", "help": "NAME.csv or NAME.parquet"}
+            parsed = _parsed("table", rest, folder={"help": "of runs, or results/"}, target=file)
+            print(*write_estimates(parsed.folder, parsed.target), sep="\n")
         case "worker":
             return _worker(rest)
         case "collect":
             from experiments.runner.sweep import collect_sweep
 
-            parser = Parser("mvest collect", description=COMMANDS[command])
-            parser.add_argument("folder", type=Path, metavar="FOLDER")
-            return collect_sweep(parser.parse_args(rest).folder)
+            return collect_sweep(_parsed("collect", rest, folder={}).folder)
         case "sync":
             return _sync(rest)
         case "dashboard":
@@ -114,28 +117,23 @@ def _help() -> str:
     return "\n".join([about, "", *lines, "", "mvest COMMAND --help says more of each."])
 
 
-def _table(rest: list[str]) -> int:
-    """Write all estimates of a folder as one table, and what its columns mean."""
-    from experiments.results.estimates import write_estimates
-
-    parser = Parser("mvest table", description=COMMANDS["table"])
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of runs, or results/")
-    parser.add_argument("target", type=Path, metavar="FILE", help="NAME.csv or NAME.parquet")
-    parsed = parser.parse_args(rest)
-    print(*write_estimates(parsed.folder, parsed.target), sep="\n")
-    return 0
+def _parsed(command: str, rest: list[str], **arguments: dict[str, Any]) -> Namespace:
+    """The words of a command: those arguments, which are folders unless they say otherwise."""
+    parser = Parser(f"mvest {command}", description=COMMANDS[command])
+    for name, how in arguments.items():
+        parser.add_argument(name, **{"type": Path, "metavar": "FOLDER", **how})
+    return parser.parse_args(rest)
 
 
 def _sync(rest: list[str]) -> int:
     """Bring MLflow to the state of folders of outputs."""
     from experiments.runner.tracking import sync
 
-    parser = Parser("mvest sync", description=COMMANDS["sync"])
-    parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="outputs if none")
-    folders: list[Path] = parser.parse_args(rest).folders or [Path("outputs")]
+    some = {"nargs": "*", "help": "outputs if none"}
+    folders: list[Path] = _parsed("sync", rest, folders=some).folders or [Path("outputs")]
     for folder in folders:
         if not folder.is_dir():
-            parser.error(f"{folder}: there is no such folder")
+            raise InputError(f"{folder}: there is no such folder")
     return max(sync(folder) for folder in folders)
 
 
@@ -143,15 +141,14 @@ def _dashboard(rest: list[str]) -> int:
     """Serve MLflow's pages until it is interrupted."""
     import webbrowser
 
-    from experiments.common.schema import require_within
+    from experiments.common.schema import validated
     from experiments.runner.dashboard import last_sweep, serving
     from mvest.quantities import within
 
-    parser = Parser("mvest dashboard", description=COMMANDS["dashboard"])
-    parser.add_argument("outputs", nargs="?", default="outputs", type=Path, metavar="FOLDER")
-    parser.add_argument("--port", default=5000, type=int, help="5000 if not given; 0: a free one")
-    parsed = parser.parse_args(rest)
-    require_within("--port", parsed.port, within(0, 65_535, "", "ports; 0: a free one"))
+    port = {"default": 5000, "type": int, "metavar": "PORT", "help": "5000; 0: a free one"}
+    outputs = {"nargs": "?", "default": "outputs"}
+    parsed = _parsed("dashboard", rest, outputs=outputs, **{"--port": port})
+    validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], parsed.port, "--port")
     try:
         place, page, said = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):
@@ -167,14 +164,15 @@ def _worker(rest: list[str]) -> int:
     from experiments.runner.engine import execute
     from experiments.runner.plan import Plan
 
-    parser = Parser("mvest worker", description=COMMANDS["worker"])
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the sweep, in outputs/")
-    parser.add_argument("--shard", default="1/1", metavar="I/N", help="I from 1 to N")
-    parsed = parser.parse_args(rest)
+    shard = {"default": "1/1", "type": str, "metavar": "I/N", "help": "I from 1 to N"}
+    folder = {"help": "of the sweep, in outputs/"}
+    parsed = _parsed("worker", rest, folder=folder, **{"--shard": shard})
     found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", parsed.shard)
     first, step = (int(found[1]), int(found[2])) if found else (0, 0)
     if not 1 <= first <= step:
-        parser.error(f"shard {parsed.shard}, expected I/N with I from 1 to N, for example 2/8")
+        raise ConfigurationError(
+            f"shard {parsed.shard}, expected I/N with I from 1 to N, for example 2/8"
+        )
     plan = Plan.read(parsed.folder, look=False)
     # Every N-th job of the list, whatever is done: no two shards share one.
     jobs = plan.jobs[first - 1 :: step]

@@ -17,13 +17,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from experiments.common.schema import build, schema
+from experiments.common.schema import from_words
 from experiments.console import Parser, interruptible
 from mvest.cases.folder import require_new, write_case
-from mvest.errors import ConfigurationError
 from mvest.exchange import exporting, importing
 
 
@@ -74,24 +70,4 @@ def _parsed(
         parser.error(f"{name}: nothing to {verb} by this name; known: {', '.join(found)}")
     parsed = parser.parse_intermixed_args(list(given[1:]) if convert else ["--help"])
     assert convert is not None
-    for option in parsed.options:
-        if "=" not in option:
-            parser.error(f"{option}: expected OPTION=VALUE; one source and one target at a time")
-    return convert, parsed.source, parsed.target, _options(name, kind, parsed.options)
-
-
-def _options(name: str, kind: type, given: Sequence[str]) -> Any:
-    """The options from NAME=VALUE words, values as in YAML.
-
-    Raises
-    ------
-    ConfigurationError
-        An unknown name or a value of another type.
-    """
-    defaults = OmegaConf.structured(schema(kind))
-    try:
-        merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(given)))
-    except OmegaConfBaseException as error:
-        said, known = str(error).partition("\n")[0], ", ".join(map(str, defaults))
-        raise ConfigurationError(f"{name}: {said}; known are {known}") from error
-    return build(kind, typing.cast("dict[str, Any]", OmegaConf.to_container(merged)))
+    return convert, parsed.source, parsed.target, from_words(name, kind, parsed.options)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-import typing
 from argparse import RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,21 +14,20 @@ from typing import Any
 import numpy as np
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.config import plain, register
 from experiments.common.places import CONF
 from experiments.common.progress import PartBar, announce_compilation
-from experiments.common.schema import build, schema
+from experiments.common.schema import from_words
 from experiments.console import Parser
 from mvest.cases.from_images.measures import write_landmarks, write_surfaces
-from mvest.errors import ConfigurationError, MvestError
+from mvest.errors import MvestError
 from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
 from mvest.files import write_atomically
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.quantities import Angle, Count, Length, Modulus, Seed
 from mvest.simulation.motion import MotionSettings, close_in_motion
 
 SUFFIX = ".seq.nrrd"
@@ -57,11 +55,11 @@ class SimulatedVolumeOptions:
         The scanner: acquisition.voxel_mm=1, acquisition.gain_db=6 and others.
     """
 
-    moduli: tuple[float, float] = (6.23, 2.09)
-    frames: int = 4
-    seed: int = 3
-    distance_mm: tuple[float, float] = (35.0, 75.0)
-    tilt_deg: tuple[float, float] = (0.0, 25.0)
+    moduli: tuple[Modulus, Modulus] = (6.23, 2.09)
+    frames: Count = 4
+    seed: Seed = 3
+    distance_mm: tuple[Length, Length] = (35.0, 75.0)
+    tilt_deg: tuple[Angle, Angle] = (0.0, 25.0)
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 
@@ -78,9 +76,6 @@ def simulate_command(given: Sequence[str]) -> int:
     parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
     parsed = parser.parse_intermixed_args(list(given))
     try:
-        for word in parsed.options:
-            if "=" not in word:
-                raise ConfigurationError(f"{word}: expected NAME=VALUE")
         began = time.monotonic()
         volume, truth = write_simulated_volume(parsed.target, parsed.options)
     except (MvestError, HydraException, OSError) as error:
@@ -108,7 +103,8 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     """
     checked_path(target, SUFFIX)
     configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
-    options = _options([word for word in words if word not in configured])
+    own = [word for word in words if word not in configured]
+    options = from_words("simulate", SimulatedVolumeOptions, own, CONFIGURED)
     register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         values = plain(compose("config", ["experiment=imaging", *configured]))
@@ -147,24 +143,3 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
         write_landmarks(truth / f"valve_{frame:04d}.mrk.json", true, frame)
     write_atomically(truth / "truth.json", json.dumps(said, indent=1) + "\n")
     return write_sequence_nrrd(target, volume), truth
-
-
-def _options(words: Sequence[str]) -> SimulatedVolumeOptions:
-    defaults = OmegaConf.structured(schema(SimulatedVolumeOptions))
-    try:
-        merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(words)))
-    except OmegaConfBaseException as error:
-        raise ConfigurationError(
-            f"simulate: {str(error).partition(chr(10))[0]}; known are valve, mechanics, "
-            f"{', '.join(map(str, defaults))}"
-        ) from error
-    values = typing.cast("dict[str, Any]", OmegaConf.to_container(merged))
-    for name in ("moduli", "distance_mm", "tilt_deg"):
-        if len(values[name]) != 2:
-            raise ConfigurationError(f"simulate: {name} = {values[name]}, expected two numbers")
-    if not min(values["moduli"]) > 0 or values["seed"] < 0:
-        raise ConfigurationError(
-            f"simulate: moduli {values['moduli']} MPa and seed {values['seed']}, expected "
-            "moduli > 0 and a seed >= 0"
-        )
-    return build(SimulatedVolumeOptions, values)

@@ -1,4 +1,4 @@
-"""Everything in ``results/`` from its records: ``python -m experiments.tables [FOLDER]``.
+"""Everything in ``results/`` from its records: ``mvest tables [FOLDER]``.
 
 ``report.html`` shows all results on one page that needs no other file. Each ``NAME.md`` of the
 results is a section, with the pictures ``NAME.png`` and ``NAME_PART.png`` and their captions in it.
@@ -9,8 +9,6 @@ rendered without raw HTML and pictures from elsewhere.
 from __future__ import annotations
 
 import re
-import sys
-from collections.abc import Sequence
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -18,11 +16,9 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from experiments.console import interruptible
 from experiments.results.keep import RECORDS, regenerate
 from experiments.sweeps.collected import read_sweeps
 from experiments.sweeps.report import write_sweep
-from mvest.errors import ConfigurationError
 from mvest.files import write_atomically
 from mvest.reporting.markup import shown_text
 from mvest.reporting.pictures import embedded, rendered
@@ -86,23 +82,12 @@ def _plain(markdown: str) -> str:
     return unescape(re.sub(r"\\(\W)", r"\1", markdown))
 
 
-@interruptible
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Regenerate the tables and figures; returns the exit status."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    if len(given) > 1:
-        raise ConfigurationError("expected at most one argument, the folder of the results")
-    results = Path(given[0] if given else "results")
+def write_everything(results: Path) -> list[Path]:
+    """Regenerate the tables, figures and page of a folder of results; returns their paths."""
     sweeps = read_sweeps(results)
     # A folder that holds sweeps alone is complete; an empty one says what to run.
     single = (results / RECORDS).is_dir() or not sweeps
     written = regenerate(results) if single else []
     for sweep in sweeps:
         written += write_sweep(results, sweep)
-    written.append(write_report(results))
-    print(*written, sep="\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return [*written, write_report(results)]

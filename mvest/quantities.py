@@ -6,14 +6,58 @@ and `experiments.common.schema` read it there; to everything else the type is a 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import Field
+from pydantic import AfterValidator, GetCoreSchemaHandler
+
+from mvest.errors import InputError
 
 
-def within(low: float, high: float, unit: str, why: str) -> Any:
+class OutsideError(InputError):
+    """A number of a setting is outside its range."""
+
+
+@dataclass(frozen=True, slots=True)
+class Within:
+    """The range of a type of settings: pydantic checks what is annotated by it.
+
+    Attributes
+    ----------
+    low, high : float
+        Both ends are admissible.
+    unit, why : str
+    """
+
+    low: float
+    high: float
+    unit: str
+    why: str
+
+    def check(self, value: Any, name: str = "") -> Any:
+        """A number, nested lists of them, or None, all of them inside.
+
+        Raises
+        ------
+        OutsideError
+            With the number, which is called ``name``, and the range.
+        """
+        for part in value if isinstance(value, list | tuple) else ():
+            self.check(part, name)
+        if isinstance(value, int | float) and not self.low <= value <= self.high:
+            said = f"expected {self.low:.10g} to {self.high:.10g} {self.unit}".rstrip()
+            why = f" ({self.why})" if self.why else ""
+            raise OutsideError(f"{name} = {value:.10g}, {said}{why}")
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        """What pydantic asks for."""
+        return AfterValidator(self.check).__get_pydantic_core_schema__(source, handler)
+
+
+def within(low: float, high: float, unit: str, why: str) -> Within:
     """The range of a type of settings; both ends are admissible."""
-    return Field(ge=low, le=high, description=f"{unit}; {why}" if unit else why)
+    return Within(low, high, unit, why)
 
 
 # Meshes and points.

@@ -16,10 +16,11 @@ from sphinx.util.docutils import SphinxDirective
 from study_pages import comment_of
 
 from experiments.common.config import Config
-from experiments.common.schema import ranges
+from experiments.common.schema import marks_in
 from experiments.common.study import load_settings, study_names
 from experiments.results.keep import records_of
 from mvest.mechanics.parameters import KINDS
+from mvest.quantities import Within
 from mvest.reporting.skill import GENERIC, skill_table, stated
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,10 +69,10 @@ def setting_ranges() -> str:
     """What settings may be, by the kinds of quantities."""
     found: dict[tuple[str, ...], set[str]] = {}
     for kind in [Config, *map(load_settings, study_names())]:
-        for key, within in ranges(kind):
-            bounds = {type(one).__name__: one for one in within.metadata}
-            unit, _, why = (within.description or "").rpartition("; ")
-            row = (f"{bounds['Ge'].ge:.10g}", f"{bounds['Le'].le:.10g}", unit, why)
+        for key, mark in marks_in(kind):
+            if not isinstance(mark, Within):
+                continue
+            row = (f"{mark.low:.10g}", f"{mark.high:.10g}", mark.unit, mark.why)
             found.setdefault(row, set()).add(key.rpartition(".")[2] if "*" not in key else key)
     return markdown(
         ["from", "to", "unit", "why", "settings"],

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import PurePath
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
@@ -25,8 +25,8 @@ from experiments.common.schema import (
     hints_of,
     marks_in,
     require_admissible_values,
-    require_within,
     schema,
+    validated,
     with_contents,
     without,
 )
@@ -42,7 +42,6 @@ from mvest.quantities import (
     CellsAlong,
     CellsAround,
     EdgeLength,
-    Factor,
     Gigabytes,
     Layers,
     Length,
@@ -59,6 +58,7 @@ from mvest.quantities import (
     TimeLimit,
     Value,
     Values,
+    within,
 )
 
 GROUP = "study"
@@ -78,7 +78,8 @@ ByParameter: TypeAlias = Annotated[dict[str, float], BY_PARAMETER]
 class Mesh:
     """The estimator's mesh."""
 
-    source: str = "structured"  # or tetwild: an unstructured mesh of the thickened leaflets
+    # tetwild: an unstructured mesh of the thickened leaflets
+    source: Literal["structured", "tetwild"] = "structured"
     columns: CellsAround = MISSING
     rows: CellsAlong = MISSING
     layers: Layers = 1
@@ -103,7 +104,7 @@ class FilterSettings:
     P0: Values = MISSING  # variance, variances or matrix
     R: Values = 0.01  # mm², one or one for each observed frame
     R_correlation_mm: Length = 0.0  # correlation length of R along the leaflets; 0: independent
-    transform: str = "identity"  # or log
+    transform: Literal["identity", "log"] = "identity"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,14 +129,14 @@ class Truth:
     values: tuple[Value, ...] = MISSING
     label: str = MISSING  # what a table calls it
     refine: Refinement = 1  # cells of the truth's mesh per cell of the estimator's, each way
-    source: str | None = None
+    source: Literal["structured", "tetwild"] | None = None
     columns: CellsAround | None = None
     rows: CellsAlong | None = None
     layers: Layers | None = None
     element: str | None = None
     # Columns and rows of a coarser mesh: both closures are extrapolated to zero mesh size.
     extrapolated_from: tuple[AxisCount, ...] = ()
-    dt_factor: Factor = 1.0
+    dt_factor: Annotated[float, within(0.001, 100, "", "one time step over another")] = 1.0
     reading: str | None = None  # Poisson option
     ratio: dict[str, Ratio] = field(default_factory=dict)  # region -> E_f over E_perp
     fixed: ByParameter = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...
@@ -252,7 +253,7 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
     _require_names(values)  # of the folder, which Hydra makes next
     study = values.get("study")
     kept = without(values, ("hydra", *_not_hashed(study)))
-    return config_hash(_with_contents(study, kept))
+    return config_hash(with_contents(_marks(study), kept))
 
 
 def is_hashed(key: str, study: str | None) -> bool:
@@ -276,13 +277,12 @@ def require_in_range(values: Mapping[str, Any]) -> None:
     _require_names(values)
     kinds = _kinds(values.get("study"))
     for name, value in values.items():
-        require_admissible_values(kinds.get(name, Any), value, name, range_of)
+        require_admissible_values(kinds.get(name, Any), value, name)
     for part, key in (("truth", "values"), ("filter", "initial")):
-        given = (values.get(part) or {}).get(key)
-        for parameter, value in zip(values.get("parameters") or (), given or (), strict=False):
-            within = range_of(str(parameter))
-            if within is not None and isinstance(value, int | float):
-                require_within(f"{part}.{key} of {parameter}", value, within)
+        given = (values.get(part) or {}).get(key) or ()
+        for parameter, value in zip(values.get("parameters") or (), given, strict=False):
+            kind = Annotated[float, range_of(str(parameter))]
+            validated(kind, value, f"{part}.{key} of {parameter}")
 
 
 def _require_names(values: Mapping[str, Any]) -> None:
@@ -301,26 +301,19 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
     What a setting reads has its SHA-256 in the place of its name; where results lie is left out.
     """
     kept = {str(key): value for key, value in values.items() if key != "paths"}
-    return dict(_with_contents(kept.get("study"), kept))
-
-
-def _with_contents(study: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
-    kinds = _kinds(study)
-    return {
-        name: with_contents(kinds[name], value, values) if name in kinds else value
-        for name, value in values.items()
-    }
+    return with_contents(_marks(kept.get("study")), kept)
 
 
 @cache
 def _not_hashed(study: str | None) -> tuple[str, ...]:
     """Dotted names of the settings that change no number of a study's results."""
-    return tuple(
-        name
-        for top, kind in _kinds(study).items()
-        for name, mark in marks_in(kind, top)
-        if mark is NOT_HASHED
-    )
+    return tuple(name for name, mark in _marks(study) if mark is NOT_HASHED)
+
+
+@cache
+def _marks(study: str | None) -> tuple[tuple[str, Any], ...]:
+    """Dotted names of a study's settings with each mark."""
+    return tuple(marked for top, kind in _kinds(study).items() for marked in marks_in(kind, top))
 
 
 @cache

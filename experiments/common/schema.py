@@ -9,16 +9,19 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
-from omegaconf import MISSING
-from pydantic.fields import FieldInfo
+from omegaconf import MISSING, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import AfterValidator, TypeAdapter, ValidationError
 
-from mvest.errors import ConfigurationError, InputError
+from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.files import sha256_of
+from mvest.problem.registration import range_of
+from mvest.quantities import OutsideError
 from mvest.reading.text import check_words
 
 T = TypeVar("T")
@@ -47,18 +50,19 @@ class Reads:
     contents: Callable[[Any, Mapping[str, Any]], Any]
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Mark:
-    """Marks a setting; see `NOT_HASHED` and `BY_PARAMETER`."""
-
-    name: str
+NOT_HASHED = "not hashed"
+"""Marks a setting that changes no number of a result, and stays out of its hash."""
 
 
-NOT_HASHED = Mark("not hashed")
-"""Of a setting that changes no number of a result, and stays out of its hash."""
+def _in_their_ranges(values: dict[str, float]) -> dict[str, float]:
+    for name, value in values.items():
+        if (within := range_of(name)) is not None:
+            within.check(value, f".{name}")
+    return values
 
-BY_PARAMETER = Mark("by parameter")
-"""Of values that are named by parameters, and in the range of what those are."""
+
+BY_PARAMETER = AfterValidator(_in_their_ranges)
+"""Marks values that are named by parameters, and in the range of what those are."""
 
 
 def contents(value: Any, _beside: Mapping[str, Any] | None = None) -> Any:
@@ -78,45 +82,43 @@ InputFile = Annotated[str | None, Reads(contents)]
 """Type of a setting that names one file or folder, all of which is read."""
 
 
-def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None) -> Any:
-    """Values of a schema, or of one of its types, with what its settings read in their place.
+def with_contents(marks: Iterable[tuple[str, Any]], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values with what their settings read in place of its name, and equal numbers alike.
 
-    Equal numbers become alike, so that 1 and 1.0 are one setting in a hash: in a float, and where a
-    type states no more than a range, they are floats, and in what has no type whole ones are ints.
+    Parameters
+    ----------
+    marks : iterable of (str, object)
+        Those of the settings, see `marks_in`.
+    values : mapping
+        Plain data. Whole numbers become ints, so that 1 and 1.0 are one setting in a hash.
     """
-    if value is None or value == MISSING or not _may_change(kind):
-        return value
-    given, (kind, marks) = kind, _unwrapped(kind)
-    for mark in marks:
+    found = dict(values)
+    for name, mark in marks:
         if isinstance(mark, Reads):
-            return mark.contents(value, beside or {})
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if kind is float or (kind is Any and any(isinstance(m, FieldInfo) for m in marks)):
-            return float(value)
-        return int(value) if kind is Any and float(value).is_integer() else value
+            found = _changed(found, name.split("."), mark.contents)
+    return {name: _alike(value) for name, value in found.items()}
+
+
+def _changed(values: Any, path: Sequence[str], change: Callable[[Any, Any], Any]) -> Any:
+    """Nested values with those at a path changed; in it ``*`` stands for every name."""
+    if not isinstance(values, Mapping):
+        return values
+    name, *inner = path
+    found = dict(values)
+    for key in values if name == "*" else {name} & values.keys():
+        if inner:
+            found[key] = _changed(values[key], inner, change)
+        elif values[key] not in (None, MISSING):
+            found[key] = change(values[key], values)
+    return found
+
+
+def _alike(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {k: with_contents(hint, item, value) for k, hint, item in _parts(given, value)}
+        return {key: _alike(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [with_contents(hint, item) for _, hint, item in _parts(given, value)]
-    return value
-
-
-def _parts(given: Any, value: Any) -> Iterator[tuple[Any, Any, Any]]:
-    """Name, type and value of each part of a mapping or list; without its own, the whole's type."""
-    kind, _ = _unwrapped(given)
-    inner = typing.get_args(kind) or (given,)
-    if isinstance(value, Mapping):
-        hints = hints_of(kind) if _is_schema(kind) else {}
-        other = None if hints else inner[-1]
-        yield from ((name, hints.get(name, other), part) for name, part in value.items())
-    else:
-        yield from ((None, inner[0], part) for part in value)
-
-
-@cache
-def _may_change(kind: Any) -> bool:
-    inner = hints_of(kind).values() if _is_schema(kind) else typing.get_args(kind)
-    return kind in (Any, float) or isinstance(kind, Reads) or any(map(_may_change, inner))
+        return [_alike(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _is_schema(kind: Any) -> bool:
@@ -131,19 +133,6 @@ def hints_of(cls: type) -> dict[str, Any]:
     return {name: hint for name, hint in hints.items() if name in names}
 
 
-def _unwrapped(kind: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A type without its marks and without None, and the marks."""
-    marks: tuple[Any, ...] = ()
-    while True:
-        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-        if origin is Annotated:
-            kind, marks = arguments[0], (*marks, *arguments[1:])
-        elif origin in (types.UnionType, typing.Union):
-            kind = next(one for one in arguments if one is not types.NoneType)
-        else:
-            return kind, marks
-
-
 def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """Nested values without those of the dotted names."""
     kept = {key: value for key, value in values.items() if key not in names}
@@ -156,30 +145,26 @@ def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
 
 def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted names of the settings of a schema with each mark; names within mappings are ``*``."""
-    kind, marks = _unwrapped(kind)
-    yield from ((key, mark) for mark in marks)
-    if _is_schema(kind):
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        kind, *marks = arguments
+        yield from ((key, mark) for mark in marks)
+        yield from marks_in(kind, key)
+    elif _is_schema(kind):
         for name, hint in hints_of(kind).items():
             yield from marks_in(hint, f"{key}.{name}".lstrip("."))
-    elif typing.get_origin(kind) in (dict, Mapping):
-        yield from marks_in(typing.get_args(kind)[1], f"{key}.*")
+    elif origin in (dict, Mapping):
+        yield from marks_in(arguments[1], f"{key}.*")
     else:
-        for part in typing.get_args(kind):
+        for part in arguments:
             yield from marks_in(part, key)
 
 
-def ranges(kind: Any) -> list[tuple[str, FieldInfo]]:
-    """Dotted names of all settings of a schema with a range."""
-    return [(key, mark) for key, mark in marks_in(kind) if isinstance(mark, FieldInfo)]
+_adapter = cache(TypeAdapter)
 
 
-def require_admissible_values(
-    kind: Any,
-    value: Any,
-    key: str = "",
-    by_parameter: Callable[[str], FieldInfo | None] = lambda name: None,
-) -> None:
-    """Refuse values of a schema with a number outside its range, or a text that is none.
+def validated(kind: Any, value: Any, key: str = "") -> Any:
+    """A value of a type from plain data; names that a dataclass has not are passed over.
 
     Parameters
     ----------
@@ -187,52 +172,103 @@ def require_admissible_values(
     value : plain data
     key : str
         Dotted name of the value.
-    by_parameter : callable
-        Name of a parameter -> its range, for settings marked `BY_PARAMETER`.
 
     Raises
     ------
-    ConfigurationError
-        One line with the setting, its value and the range.
+    MvestError
+        One line with the setting, its value and what is admissible.
     """
-    given, (kind, marks) = kind, _unwrapped(kind)
-    within = next((mark for mark in marks if isinstance(mark, FieldInfo)), None)
-    if value is None or isinstance(value, bool):
-        return
-    if isinstance(value, int | float):
-        require_within(key, value, within)
-    elif value == MISSING:
+    try:
+        return _adapter(kind).validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        own = first.get("ctx", {}).get("error")
+        if isinstance(own, MvestError) and not isinstance(own, OutsideError):
+            raise own from error  # of a class itself
+        *_, last = place = [key, *first["loc"]]
+        name = ".".join(part for part in place if isinstance(part, str) and part)
+        given = first["input"]
+        match first["type"]:
+            case _ if own is not None:
+                said = str(own)
+            case "missing" if isinstance(last, str):
+                said = " has no value"
+            case _ if given == MISSING:
+                said = " has no value"
+            case "literal_error":
+                said = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
+            case _:
+                said = f" = {given!r}: {first['msg']}"
+        raise ConfigurationError(f"{name}{said}") from error
+
+
+def build(cls: type[T], values: Mapping[str, Any]) -> T:
+    """The frozen ``cls`` from plain data of its schema (`validated`)."""
+    return typing.cast(T, validated(cls, values))
+
+
+def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequence[str] = ()) -> T:
+    """The frozen ``cls`` from words NAME=VALUE of a command, values as in YAML.
+
+    Parameters
+    ----------
+    command : str
+    cls : type
+    words : sequence of str
+    others : sequence of str
+        Names besides its own that the command knows.
+
+    Raises
+    ------
+    MvestError
+        A word of another form, an unknown name, or an inadmissible value.
+    """
+    defaults = OmegaConf.structured(schema(typing.cast(Any, cls)))
+    for word in words:
+        if "=" not in word:
+            raise ConfigurationError(f"{word}: expected NAME=VALUE")
+    try:
+        merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(words)))
+    except OmegaConfBaseException as error:
+        known = ", ".join([*others, *map(str, defaults)])
+        said = str(error).partition("\n")[0]
+        raise ConfigurationError(f"{command}: {said}; known are {known}") from error
+    return build(cls, typing.cast("dict[str, Any]", OmegaConf.to_container(merged)))
+
+
+def require_admissible_values(kind: Any, value: Any, key: str = "") -> None:
+    """Refuse values of a schema with a number outside its range, or a text that is none.
+
+    Raises
+    ------
+    MvestError
+        As `validated`.
+    """
+    validated(kind, value, key)
+    _require_plain(value, key)
+
+
+def _require_plain(value: Any, key: str) -> None:
+    """Refuse plain data of whatever type that no setting has."""
+    if value == MISSING:
         raise ConfigurationError(f"{key} has no value")
-    elif isinstance(value, str):
+    if isinstance(value, str):
         try:
             check_words(value, MAX_LETTERS)
         except InputError as error:
             raise ConfigurationError(f"{key} has {error}") from error
-    elif len(value) > MAX_ENTRIES:
-        raise ConfigurationError(f"{key} has {len(value)} entries, expected at most {MAX_ENTRIES}")
-    else:
-        for name, hint, part in _parts(given, value):
-            own = by_parameter(str(name)) if BY_PARAMETER in marks else None
-            inner = hint if own is None else Annotated[Any, own]
-            whole = key if name is None else f"{key}.{name}".lstrip(".")
-            require_admissible_values(inner, part, whole, by_parameter)
-
-
-def require_within(key: str, value: float, within: FieldInfo | None) -> None:
-    """Refuse a number outside a range; without a range, one that no setting has.
-
-    Raises
-    ------
-    ConfigurationError
-        One line with the setting, its value and the range.
-    """
-    bounds = {} if within is None else {type(one).__name__: one for one in within.metadata}
-    low = bounds["Ge"].ge if "Ge" in bounds else -LARGEST
-    high = bounds["Le"].le if "Le" in bounds else LARGEST
-    if not low <= value <= high:
-        unit, _, why = ((within and within.description) or "").rpartition("; ")
-        text = f"{key} = {value:.10g}, expected {low:.10g} to {high:.10g} {unit}".rstrip()
-        raise ConfigurationError(text + (f" ({why})" if why else ""))
+    elif isinstance(value, Mapping | list | tuple):
+        if len(value) > MAX_ENTRIES:
+            raise ConfigurationError(
+                f"{key} has {len(value)} entries, expected at most {MAX_ENTRIES}"
+            )
+        named = value.items() if isinstance(value, Mapping) else (("", part) for part in value)
+        for name, part in named:
+            _require_plain(part, ".".join(filter(None, (key, str(name)))))
+    elif isinstance(value, int | float) and not abs(value) <= LARGEST:
+        raise ConfigurationError(
+            f"{key} = {value:.10g}, expected {-LARGEST:.10g} to {LARGEST:.10g}"
+        )
 
 
 @cache
@@ -267,6 +303,8 @@ def _config_type(hint: Any) -> Any:
         # OmegaConf takes 1 for a float, but not within a list of lists.
         nested = typing.get_origin(arguments[0]) is tuple
         return list[Any] if nested else list[_config_type(arguments[0])]  # type: ignore[misc]
+    if origin is typing.Literal:
+        return str
     if origin in (dict, Mapping):
         return dict[str, _config_type(arguments[1])]  # type: ignore[misc]
     if origin in (types.UnionType, typing.Union):
@@ -280,33 +318,4 @@ def _config_value(value: Any) -> Any:
         return schema(type(value))(**{name: _config_value(part) for name, part in parts.items()})
     if isinstance(value, tuple):
         return [_config_value(item) for item in value]
-    return value
-
-
-def build(cls: type[T], values: Mapping[str, Any]) -> T:
-    """The frozen ``cls`` from plain data of its schema; what a schema adds is passed over.
-
-    Raises
-    ------
-    ConfigurationError
-        If a field without a default has no value.
-    """
-    hints = hints_of(typing.cast(Any, cls))
-    missing = [name for name in hints if values.get(name, MISSING) == MISSING]
-    if missing:
-        raise ConfigurationError(f"{cls.__name__} needs a value for {', '.join(missing)}")
-    return cls(**{name: _value(hint, values[name]) for name, hint in hints.items()})
-
-
-def _value(hint: Any, value: Any) -> Any:
-    kind, _ = _unwrapped(hint)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if value is None:
-        return None
-    if _is_schema(kind):
-        return build(kind, value)
-    if origin is tuple and isinstance(value, Sequence):
-        return tuple(_value(arguments[0], item) for item in value)
-    if origin in (dict, Mapping) and isinstance(value, Mapping):
-        return {key: _value(arguments[1], item) for key, item in value.items()}
     return value

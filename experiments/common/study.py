@@ -131,8 +131,6 @@ class Study(Generic[S]):
     keeps_failures : bool
         Whether the results also take over a run without an estimate: where a share of runs is
         counted, failed ones count.
-    finish : callable
-        (job, record): done with a run that is on disk, also with one that was done before.
     checks : callable
         () -> what ``check=true`` says without estimating anything, each (configuration, output
         folder) -> text. Made once for all jobs of a sweep.
@@ -151,7 +149,6 @@ class Study(Generic[S]):
     keep: Callable[[Record], Record] = lambda record: record
     keep_arrays: Callable[[Record, Path], Mapping[str, Any]] = lambda record, path: {}
     keeps_failures: bool = False
-    finish: Callable[[Job[S], Record], None] = _nothing
     checks: Callable[[], tuple[Check, ...]] = tuple
     require: Callable[[Mapping[str, Any]], None] = _nothing
 

@@ -89,13 +89,12 @@ def run_job(request: Request) -> Record:
     values, folder = request.values, request.folder
     record = usable_record(request)
     if record is not None:
-        source, study = record.provenance, load_study(record.study)
+        source = record.provenance
         _tell(record, folder)
         print(
             f"Done on {source.finished} by commit {(source.git.sha or 'unknown')[:12]}; "
             "force=true runs it again"
         )
-        study.finish(_job(study, request), record)
         return record
     if values["time_limit_s"] is None:
         memory_gb = values["memory_limit_gb"] or default_memory_gb()
@@ -123,12 +122,10 @@ def compute(request: Request, memory_gb: float) -> None:
     with held_memory(memory_gb):
         write_hydra(request)
         study = load_study(request.values["study"])
-        job = _job(study, request)
         record = last_record(request.folder, request.config_hash, cut_off=True)
-        record = record or _computed(study, job, request)
+        record = record or _computed(study, request)
         try:
             _write_out(study, request, record)
-            study.finish(job, record)
         except MemoryError:
             raise
         except Exception as error:
@@ -137,14 +134,10 @@ def compute(request: Request, memory_gb: float) -> None:
             raise InputError(f"{one_line(message_of(error))}; {missing}") from error
 
 
-def _job(study: Study[Any], request: Request) -> Job[Any]:
-    settings = build(study.settings, request.values)
-    return Job(request.values, settings, request.folder, request.config_hash)
-
-
-def _computed(study: Study[Any], job: Job[Any], request: Request) -> Record:
+def _computed(study: Study[Any], request: Request) -> Record:
     started = time.time()
-    result = study.run(job)
+    settings = build(study.settings, request.values)
+    result = study.run(Job(request.values, settings, request.folder, request.config_hash))
     if hash_of(request.values) != request.config_hash:
         # Nobody can say of which content it is the result.
         reason = "a file or folder that the settings name was changed before the job ended"

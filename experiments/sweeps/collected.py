@@ -10,15 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from experiments.common.records.record import Frozen, Provenance, Record
+from experiments.common.records.record import Frozen, Provenance, Record, checked
 from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping
-from mvest.reading.text import one_line
 
 SWEEPS = "sweeps"
 """Folder of the published sweeps within the results."""
@@ -119,12 +118,8 @@ class Sweep(Frozen):
         """
         if not isinstance(data, Mapping):
             raise InputError(f"{where} is no collected sweep but a {type(data).__name__}")
-        try:
-            sweep = cls.model_validate({k: v for k, v in data.items() if k != "sha256"})
-        except ValidationError as error:
-            first = error.errors()[0]
-            place = one_line(".".join(map(str, first["loc"])), 80)
-            raise InputError(f"{where} is no collected sweep: {place}: {first['msg']}") from error
+        known = {k: v for k, v in data.items() if k != "sha256"}
+        sweep = checked(cls, known, where, "collected sweep")
         require_sealed(data, where)
         return sweep
 

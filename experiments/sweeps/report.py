@@ -10,7 +10,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from experiments.common.records.writer import LONGEST, provenance_of, write_tables
+from experiments.common.records.writer import LONGEST, write_page
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.runs import by_setting, runs_of, shortened
 from mvest.errors import InputError
@@ -56,24 +56,19 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
     if not re.fullmatch(r"[\w-]+", sweep.name):
         raise InputError(f"a sweep's name must be letters, digits, - and _, not {sweep.name!r}")
     from experiments.sweeps.figures import figures_of
-    from mvest.reporting.figures import save_figure_with
 
-    base, line = results / f"sweep_{sweep.name}", provenance_of(sweep.records)
-    drawn, written = figures_of(sweep), []
-    for part in CAPTIONS:
-        target = base.with_name(f"{base.name}_{part}" if part else base.name)
-        if part in drawn:
-            written += save_figure_with(target, drawn[part], line)
-        elif (older := target.with_name(f"{target.name}.png")).is_file():
-            # It would contradict the tables.
-            older.unlink()
-    tables = write_tables(
+    base, drawn = results / f"sweep_{sweep.name}", figures_of(sweep)
+    for part in CAPTIONS.keys() - drawn:
+        name = f"{base.name}_{part}" if part else base.name
+        if (older := base.with_name(f"{name}.png")).is_file():
+            older.unlink()  # it would contradict the tables
+    return write_page(
         base,
         sweep.title,
         {"": shortened(runs_of(sweep))},
         {"table": shortened(by_setting(sweep))},
         sweep.records,
+        figures=drawn,
         captions=CAPTIONS,
         latex=(f"{base.name}_table",),
     )
-    return [*tables, *written]

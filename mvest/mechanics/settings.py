@@ -263,7 +263,7 @@ class ClosureProtocol:
     growth: Factor = 1.5
     end: BeatTime = 0.5
     equilibrium: bool = True
-    curve: tuple[tuple[Count, ...], ...] = ()
+    curve: tuple[tuple[Factor, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.dt > 0:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from mvest.closure.frames import FramesModel, is_frame_pressure
@@ -19,7 +18,7 @@ from mvest.closure.model import ClosedState, ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.parameters import KINDS
-from mvest.quantities import within
+from mvest.quantities import Within, within
 from mvest.typing import FloatArray
 
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
@@ -44,7 +43,7 @@ def unit_of(name: str) -> str:
     return "" if kind is None else kind.unit
 
 
-def range_of(name: str) -> FieldInfo | None:
+def range_of(name: str) -> Within | None:
     """The admissible range of a parameter of a closure or of a displacement; None for others."""
     if name in REGISTRATION:
         unit = unit_of(name)

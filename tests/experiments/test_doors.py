@@ -74,7 +74,7 @@ def test_an_import_writes_a_case_that_can_be_read(package, tmp_path, capsys):
 
 def test_an_export_gets_its_options(package, tmp_path):
     assert cli.main(["export", "other", "run", "out.txt", "tips=[[1, 2.5, 3]]"]) == 0
-    assert (tmp_path / "out.txt").read_text() == "run ((1, 2.5, 3),)"
+    assert (tmp_path / "out.txt").read_text() == "run ((1.0, 2.5, 3.0),)"
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_an_export_gets_its_options(package, tmp_path):
         (["import", "other", "there", "case"], "there: no pressure; give pressure_mmHg="),
         (["import", "other", "there", "case", "presure=1"], "known are pressure_mmHg, tips"),
         (["import", "other", "there", "case", "pressure_mmHg=high"], "could not be converted"),
-        (["import", "other", "there", "case", "more"], "more: expected OPTION=VALUE"),
+        (["import", "other", "there", "case", "more"], "more: expected NAME=VALUE"),
         (["import", "other", "there"], "CASE"),
         (["import", "neighbour", "there", "case"], "known: other"),
     ],

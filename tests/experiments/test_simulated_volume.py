@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import cli, simulated_volume
+from experiments import cli
+from experiments.common.schema import from_words
+from experiments.simulated_volume import SimulatedVolumeOptions
 from mvest.exchange.surfaces import read_surface
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.detection.tracking import detect_valve
@@ -34,7 +36,7 @@ def test_the_valve_in_the_sample_is_where_the_truth_beside_it_says():
 def test_the_command_beside_the_sample_is_one_that_is_understood():
     words = shlex.split(json.loads((TRUTH / "truth.json").read_text())["command"])
     assert words[:4] == ["mvest", "simulate", "volume", "volume.seq.nrrd"]
-    options = simulated_volume._options(words[4:])
+    options = from_words("simulate", SimulatedVolumeOptions, words[4:])
     shape = read_volume(EXAMPLES / "volume.seq.nrrd").frames.shape
     assert (options.frames, *options.acquisition.shape) == shape
     assert isinstance(options.acquisition, Acquisition)
@@ -45,8 +47,8 @@ def test_the_command_beside_the_sample_is_one_that_is_understood():
     [
         (["out.nrrd"], "out.nrrd"),
         (["out.seq.nrrd", "speed=3"], "known are valve, mechanics, moduli"),
-        (["out.seq.nrrd", "moduli=[1]"], "expected two numbers"),
-        (["out.seq.nrrd", "moduli=[0,2]"], "moduli > 0"),
+        (["out.seq.nrrd", "moduli=[1]"], "moduli = [1.0]: "),
+        (["out.seq.nrrd", "moduli=[0,2]"], "moduli = 0, expected 1e-06 to 10000 MPa"),
         (["out.seq.nrrd", "acquisition.voxel_mm=0"], "voxel_mm = 0"),
         (["out.seq.nrrd", "valve=aortic"], "aortic"),
         (["out.seq.nrrd", "fast"], "expected NAME=VALUE"),

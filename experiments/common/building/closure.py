@@ -167,10 +167,6 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
         if isinstance(anatomy, Template):
             return structured_mesh(anatomy, element, *cells)
         return anatomy.layers(element, *cells)
-    if mesh["source"] != "tetwild":
-        raise ConfigurationError(
-            f"mesh.source = {mesh['source']!r}, expected structured or tetwild"
-        )
     if element not in ("tet4", "tet10"):
         raise ConfigurationError(
             f"mechanics.element = {element!r}: an unstructured mesh needs tet10 or tet4"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, cast
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from mvest.mechanics.parameters import is_positive
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
-OURS = "mvest.estimation."
+OURS = "mvest.estimation.filters."
 
 
 def build_filter(
@@ -30,15 +30,9 @@ def build_filter(
     mean = np.array(settings["initial"], dtype=float)
     require_one_each("filter.initial", mean, parameters)
     prior = _gaussian("filter.P0", mean, settings["P0"])
-    transforms: dict[str, Transform] = {
-        "identity": Identity(),
-        "log": Log(None if positive else tuple(map(is_positive, parameters))),
-    }
-    if settings["transform"] not in transforms:
-        raise ConfigurationError(
-            f"filter.transform = {settings['transform']!r}, expected identity or log"
-        )
-    transform = transforms[settings["transform"]]
+    transform: Transform = Identity()
+    if settings["transform"] == "log":
+        transform = Log(None if positive else tuple(map(is_positive, parameters)))
     transform.forward(mean)
     return filter_of(settings["method"]), transform, prior
 
@@ -51,45 +45,22 @@ def filter_of(method: Values) -> Filter:
     ConfigurationError
         If there is no such filter, or a setting is none of its or inadmissible.
     """
-    from hydra.errors import InstantiationException
-    from hydra.utils import instantiate
-
-    for target in {method.get("_target_"), *_targets(method)}:
-        _require_class(target)
-    try:
-        return cast(Filter, instantiate(dict(method), _convert_="all"))
-    except InstantiationException as error:
-        # Hydra's own error, whose cause says what is wrong.
-        raise ConfigurationError(f"filter.method: {one_line(error.__cause__ or error)}") from error
-
-
-def _targets(settings: Any) -> Iterator[Any]:
-    """Every ``_target_``, however deep."""
-    parts: Iterable[Any] = ()
-    if isinstance(settings, Mapping):
-        parts = settings.values()
-        if "_target_" in settings:
-            yield settings["_target_"]
-    elif isinstance(settings, Sequence) and not isinstance(settings, str):
-        parts = settings
-    for part in parts:
-        yield from _targets(part)
-
-
-def _require_class(target: Any) -> None:
-    """Refuse what is no class of `mvest.estimation`: Hydra would call anything that is named."""
-    from hydra.utils import get_class
-
+    target, settings = method.get("_target_"), {k: v for k, v in method.items() if k != "_target_"}
+    module, _, name = str(target).rpartition(".")
     try:
         # Not even imported where the name is not ours.
-        ours = str(target).startswith(OURS) and get_class(target).__module__.startswith(OURS)
-    except (ImportError, ValueError):
-        ours = False
-    if not ours:
+        kind = getattr(import_module(module), name) if module.startswith(OURS) else None
+    except (ImportError, AttributeError):
+        kind = None
+    if not (isinstance(kind, type) and issubclass(kind, Filter)):
         raise ConfigurationError(
             f"filter.method: _target_ {target!r}, expected the full name of a filter, for example "
             "mvest.estimation.filters.paper.PaperFilter"
         )
+    try:
+        return kind(**settings)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"filter.method: {one_line(error)}") from error
 
 
 def require_one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:

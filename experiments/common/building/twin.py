@@ -32,7 +32,7 @@ from mvest.estimation.prediction import ObservationModel, SharedStart
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
-from mvest.mechanics.valve_system import check_parameters
+from mvest.mechanics.valve_system import check_parameters, material_law
 from mvest.observation.errors import (
     AnnulusOffset,
     CoaptationDropout,
@@ -229,12 +229,8 @@ def build_twin(config: Values) -> Twin:
         )
     values = np.array(truth["values"], dtype=float)
     require_one_each("truth.values", values, parameters)
-    _require_tissue(settings, parameters, values, prior.mean)
     linear_solver(settings.solver)
-    if not truth["dt_factor"] > 0:
-        raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
     true_settings = truth_mechanics(settings, truth)
-    _require_tissue(true_settings, parameters, values)
 
     anatomy = anatomy_of(config)
     observation = config["observation"]
@@ -256,6 +252,9 @@ def build_twin(config: Values) -> Twin:
         model.anchors = Anchors(Path(config["paths"]["outputs"]) / "anchors")
 
     truth_model, source = build_truth(config, plain, true_settings, anatomy)
+    for own, point in ((model, prior.mean), (model, values), (truth_model, values)):
+        given = dict(zip(parameters, map(float, point), strict=True))
+        material_law(own.mesh, own.settings, {**own.fixed, **given})  # refuses what is none
     problem = Problem(parameters, model, prior, filter_, transform, settings.tissue)
     return Twin(
         problem,
@@ -299,29 +298,6 @@ def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[Stud
             result = estimate(problem, data.observation, on_iterate=bar.iterate)
             results.append(result.against(data.truth))
     return results
-
-
-def _require_tissue(
-    settings: MechanicsSettings, parameters: tuple[str, ...], *points: FloatArray
-) -> None:
-    """Refuse moduli of a region without tissue, and values that no tissue can have."""
-    for parameter in parameters:
-        kind_of(parameter)
-        kind, _, region = parameter.partition(".")
-        if kind == "E_f" and region not in settings.tissue:
-            raise ConfigurationError(
-                f"parameter {parameter!r}: no tissue is given for the region {region!r}; known: "
-                f"{', '.join(settings.tissue)}"
-            )
-    for point in points:
-        values = dict(zip(parameters, map(float, point), strict=True))
-        for region, tissue in settings.tissue.items():
-            if tissue.law == "exponential":
-                given = {k: f"{k}.{region}" for k in tissue.kinds if f"{k}.{region}" in values}
-                tissue.coefficients({k: values[name] for k, name in given.items()})
-            elif f"E_f.{region}" in values:
-                own = [values.get(f"{kind}.{region}") for kind in ("ratio", "G")]
-                _ = tissue.moduli(values[f"E_f.{region}"], *own).material  # refuses what is none
 
 
 def expect_twin(config: Values, _folder: Path | None = None) -> str:

@@ -56,18 +56,14 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
     MvestError
         If a setting is inadmissible.
     """
-    known = [treatment.value for treatment in Treatment]
-    unknowns = []
-    for name, about in personal.unknowns.items():
-        if about.treatment not in known:
-            raise ConfigurationError(
-                f"personal.unknowns.{name}.treatment = {about.treatment!r}, expected one of "
-                f"{', '.join(known)}"
-            )
-        unknowns.append(Prior(name, about.mean, about.std, Treatment(about.treatment)))
+    unknowns = tuple(
+        Prior(name, about.mean, about.std, Treatment(about.treatment))
+        for name, about in personal.unknowns.items()
+    )
     # All other settings have the names of the library's.
     others = {f.name: getattr(personal, f.name) for f in fields(personal) if f.name != "unknowns"}
-    return with_stiffening(PersonaliseSettings(tuple(unknowns), mechanics_of(values), **others))
+    others |= {"unknowns": unknowns, "mechanics": mechanics_of(values)}
+    return with_stiffening(PersonaliseSettings(**others))
 
 
 def read_configured(place: str | None) -> ValveCase:

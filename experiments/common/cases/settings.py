@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from experiments.common.schema import InputFile, Reads, contents
 from mvest.cases.from_images.settings import ImagedSettings
@@ -42,7 +42,7 @@ class UnknownSettings:
 
     mean: Value
     std: Value
-    treatment: str = "estimated"  # or fixed
+    treatment: Literal["estimated", "fixed"] = "estimated"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

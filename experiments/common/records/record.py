@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -39,6 +39,7 @@ NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
 """What the gate has said of an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
+M = TypeVar("M", bound=BaseModel)
 Number: TypeAlias = float | int | str | bool | None
 
 
@@ -364,6 +365,22 @@ def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:
     return sealed({ARRAYS: digest, **record.model_dump(mode="json")})
 
 
+def checked(kind: type[M], data: Mapping[str, Any], where: str, what: str) -> M:
+    """Plain data as a model of pydantic; in an error ``where`` names them, ``what`` the model.
+
+    Raises
+    ------
+    InputError
+        One line with the first field that is wrong.
+    """
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = one_line(".".join(map(str, first["loc"])) or "it", 80)
+        raise InputError(f"{where} is no {what}: {field}: {first['msg']}") from error
+
+
 def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None) -> Record:
     """A record from plain data, which must be as they were written.
 
@@ -383,12 +400,7 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
     known = {key: value for key, value in data.items() if key not in ("sha256", ARRAYS)}
     if known.get("version") != VERSION:
         raise InputError(f"{where} is no record of this version ({VERSION})")
-    try:
-        record = Record.model_validate(known)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = one_line(".".join(map(str, first["loc"])) or "it", 80)
-        raise InputError(f"{where} is no record of a run: {field}: {first['msg']}") from error
+    record = checked(Record, known, where, "record of a run")
     require_sealed(data, where)
     if arrays is not None and data.get(ARRAYS) != (sha256_of(arrays) if arrays.is_file() else None):
         raise InputError(f"{where}: the arrays beside it are not those that it was written with")

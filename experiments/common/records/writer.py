@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from experiments.common.records.record import Record
 from experiments.common.study import Results, Study
@@ -17,52 +17,54 @@ from mvest.files import write_atomically
 from mvest.reporting.markup import markdown_text
 from mvest.reporting.tables import Table
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 LONGEST = 60
 """Rows of a table that a page shows; a longer one is named as a file."""
 
 
-def write_results(folder: Path, study: Study[Any], results: Results, name: str = "") -> list[Path]:
+def write_results(folder: Path, study: Study[Any], results: Results) -> list[Path]:
     """Write everything that follows from records; returns the paths, tables first.
 
     Parameters
     ----------
     folder : Path
-        Existing folder.
+        Existing folder. Files are called as the table that the records belong to.
     study : Study
     results : Results
-    name : str
-        What files are called; by default as the table that the records belong to.
 
     Raises
     ------
     InputError
         If a file cannot be written.
     """
-    base = folder / (name or results.first.table)
-    drawn = _write_figures(base, study, results)
-    written = write_tables(
-        base,
+    drawn = None if study.figure is None or results.is_empty else study.figure(results)
+    figures = drawn if isinstance(drawn, Mapping) else {"": drawn} if drawn else {}
+    return write_page(
+        folder / results.first.table,
         results.first.title,
         {part: results.table(part) for part in results.table_names},
         None if study.summary is None or results.is_empty else study.summary(results),
         list(results.records.values()),
+        figures=figures,
         captions=study.captions,
         latex=study.latex,
     )
-    return [*written, *drawn]
 
 
-def write_tables(
+def write_page(
     base: Path,
     title: str,
     tables: Mapping[str, Table],
     summary: Mapping[str, Table] | None,
     records: Sequence[Record],
     *,
-    captions: Mapping[str, str] | None = None,
-    latex: Collection[str] = (),
+    figures: Mapping[str, Figure],
+    captions: Mapping[str, str],
+    latex: Collection[str],
 ) -> list[Path]:
-    """Write tables as CSV, and the page that shows them and the figures that are there already.
+    """Write tables as CSV, figures, and the page that shows these and figures of earlier.
 
     Parameters
     ----------
@@ -75,10 +77,11 @@ def write_tables(
         What readers see in place of `tables`; of the same name it replaces one.
     records : sequence of Record
         Those that the tables follow from.
+    figures : mapping of str to Figure
     captions : mapping of str to str
         Part -> caption of its figure.
     latex : collection of str
-        Names of readers' tables that are written as LaTeX, too.
+        Names of readers' tables that are written as LaTeX, too, and of figures as PDF.
 
     Raises
     ------
@@ -88,7 +91,13 @@ def write_tables(
     lines = sorted({record.line for record in records})
     comments = "".join(f"# {line}\n" for line in lines[:1])
     shown = tables if summary is None else summary
-    written = []
+    written, drawn = [], []
+    for part, figure in figures.items():
+        from mvest.reporting.figures import save_figure_with
+
+        place = _named(base, part)
+        line = provenance_of(records)
+        drawn += save_figure_with(place, figure, line, pdf=place.name in latex)
     for part, table in {**tables, **shown}.items():
         path = _named(base, part, ".csv")
         written.append(write_atomically(path, comments + table.csv()))
@@ -103,12 +112,12 @@ def write_tables(
         if _named(base, part).name in latex:
             text = f"% {provenance_of(records)}\n{table.latex()}"
             written.append(write_atomically(_named(base, part, ".tex"), text))
-    for part, caption in (captions or {}).items():
+    for part, caption in captions.items():
         if (picture := _named(base, part, ".png")).is_file():
             parts.append(f"![{markdown_text(caption)}]({picture.name})")
     parts.append(f"<sub>{provenance_of(records)}</sub>")
     page = "\n\n".join(part for part in parts if part) + "\n"
-    return [*written, write_atomically(base.with_name(f"{base.name}.md"), page)]
+    return [*written, write_atomically(base.with_name(f"{base.name}.md"), page), *drawn]
 
 
 def words_of(study: Study[Any], record: Record) -> str:
@@ -150,22 +159,6 @@ def provenance_of(records: Sequence[Record]) -> str:
     """Where the first of several records came from, and how many there are besides."""
     lines = sorted({record.line for record in records})
     return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
-
-
-def _write_figures(base: Path, study: Study[Any], results: Results) -> list[Path]:
-    if study.figure is None or results.is_empty:
-        return []
-    from mvest.reporting.figures import save_figure_with
-
-    drawn = study.figure(results)
-    if drawn is None:
-        return []
-    line = provenance_of(list(results.records.values()))
-    written = []
-    for part, figure in (drawn if isinstance(drawn, Mapping) else {"": drawn}).items():
-        place = _named(base, part)
-        written += save_figure_with(place, figure, line, pdf=place.name in study.latex)
-    return written
 
 
 def _named(base: Path, part: str, suffix: str = "") -> Path:

@@ -1,6 +1,6 @@
 """Clinical measurements of a valve in one frame: plain arrays in, numbers with their units out.
 
-Lengths follow the usual echocardiographic definitions; `clinical_meaning` says which. Annulus,
+Lengths follow the usual echocardiographic definitions, which the names below state. Annulus,
 contact and orifice have modules of their own beside this one.
 """
 
@@ -33,9 +33,6 @@ from mvest.valve.measure.coaptation import (
 
 Numbers: TypeAlias = dict[str, float]
 """Name with its unit -> number."""
-
-UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "ratio": ""}
-"""By the last part of a measurement's name."""
 
 _MEANING = {
     "annulus_circumference_mm": "length of the annulus in space",
@@ -93,19 +90,6 @@ class MeasuredLeaflets(Protocol):
         """Of the leaflets, the anterior one first."""
 
 
-def clinical_meaning(name: str) -> tuple[str, str]:
-    """Unit (empty for ratios) and meaning of a measurement that `clinical_measurements` names."""
-    unit = UNITS[name.rpartition("_")[2]]
-    if name in _MEANING:
-        return unit, _MEANING[name]
-    # The longest ending first: `tip_0_annulus_distance_mm`.
-    for ending in sorted(_MEANING_OF_PART, key=len, reverse=True):
-        if name.endswith(f"_{ending}"):
-            part = name.removesuffix(f"_{ending}").replace("_", " ")
-            return unit, _MEANING_OF_PART[ending].format(part)
-    raise KeyError(name)
-
-
 def clinical_names(region_names: Sequence[str], tip_names: Sequence[str] = ()) -> list[str]:
     """Every name that `clinical_measurements` can give two leaflets and two tips, in order."""
     leaflet, tip = list(_MEANING_OF_PART)[:2], list(_MEANING_OF_PART)[2:]
@@ -126,7 +110,7 @@ def clinical_measurements(
 
     Diameters, areas, height and circumference of the annulus are those of three-dimensional
     echocardiography (Grewal et al. 2010, Circulation 121:1423), its height over its width that of
-    Salgo et al. 2002 (Circulation 106:711); `clinical_meaning` says what each number is.
+    Salgo et al. 2002 (Circulation 106:711).
 
     Parameters
     ----------

@@ -12,17 +12,19 @@ from experiments.common.config import Config, plain, require_in_range
 from experiments.common.schema import (
     BY_PARAMETER,
     hints_of,
-    ranges,
     require_admissible_values,
-    require_within,
+    validated,
 )
 from experiments.common.study import load_settings, study_names
 from experiments.runner.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION, range_of
+from mvest.quantities import Length, Refinement, Within
 from tests.experiments.configured import composed
 from tests.places import CONF
+
+RANGES = (Within, FieldInfo)
 
 HAVING = {
     "personal": "own_valve",
@@ -37,7 +39,8 @@ def without_range(kind: object, key: str = "") -> Iterator[str]:
     """Dotted names of numbers of a schema that have no range."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
-        if not any(mark == BY_PARAMETER or isinstance(mark, FieldInfo) for mark in arguments[1:]):
+        known = (mark is BY_PARAMETER or isinstance(mark, RANGES) for mark in arguments[1:])
+        if not any(known):
             yield from without_range(arguments[0], key)
     elif dataclasses.is_dataclass(kind):
         for name, hint in hints_of(kind).items():  # type: ignore[arg-type]
@@ -127,9 +130,10 @@ def test_a_number_outside_its_range_is_refused_by_name(override: str, message: s
 
 
 def test_ends_are_admissible_and_nan_is_not() -> None:
-    (within,) = (one for key, one in ranges(Config) if key == "truth.refine")
     for value in (1, 4):
-        require_within("x", value, within)
-    for value in (0, 5, float("nan")):
-        with pytest.raises(ConfigurationError, match="expected 1 to 4"):
-            require_within("x", value, within)
+        assert validated(Refinement, value) == value
+    for value in (0, 5):
+        with pytest.raises(ConfigurationError, match=f"x = {value}, expected 1 to 4"):
+            validated(Refinement, value, "x")
+    with pytest.raises(ConfigurationError, match="x = nan, expected 0 to 1000 mm"):
+        validated(Length, float("nan"), "x")

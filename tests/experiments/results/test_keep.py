@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.cli import main
 from experiments.common.records.record import Record
 from experiments.results.keep import publish, records_of, regenerate
 from experiments.studies.twin import STUDY
-from experiments.tables import main
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import made_up_twin
 from tests.places import ROOT
@@ -99,7 +99,7 @@ def test_a_record_with_other_numbers_is_refused(tmp_path, capsys) -> None:
         path.write_text(json.dumps(changed))
         with pytest.raises(InputError, match=r"record table1: its content is not what was written"):
             regenerate(tmp_path)
-    assert main([str(tmp_path)]) == 2
+    assert main(["tables", str(tmp_path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     # The order of keys is no content.

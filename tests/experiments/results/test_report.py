@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experiments.cli import main
 from experiments.results.keep import publish
 from experiments.studies.twin import STUDY
 from experiments.sweeps.collected import Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
-from experiments.tables import main, write_report
+from experiments.tables import write_report
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import made_up_twin
 from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep
@@ -129,17 +130,17 @@ def test_tables_are_made_again_from_published_sweeps_alone(tmp_path, capsys) -> 
     before = {path.name: path.read_bytes() for path in tmp_path.glob("sweep_*")}
     for name in before:
         (tmp_path / name).unlink()
-    assert main([str(tmp_path)]) == 0
+    assert main(["tables", str(tmp_path)]) == 0
     assert before == {path.name: path.read_bytes() for path in tmp_path.glob("sweep_*")}
     assert "report.html" in capsys.readouterr().out
     publish(STUDY, tmp_path, {"table1": (made_up_twin(), tmp_path / "no such folder")})
-    assert main([str(tmp_path)]) == 0
+    assert main(["tables", str(tmp_path)]) == 0
     assert "Moduli of a synthetic valve" in (tmp_path / "report.html").read_text(encoding="utf-8")
     (tmp_path / "sweeps" / "filter.json").write_text("{", encoding="utf-8")
-    assert main([str(tmp_path)]) == 2
+    assert main(["tables", str(tmp_path)]) == 2
     assert "filter.json is not JSON" in capsys.readouterr().err
 
 
 def test_an_empty_folder_still_says_what_to_run(tmp_path, capsys) -> None:
-    assert main([str(tmp_path)]) == 2
+    assert main(["tables", str(tmp_path)]) == 2
     assert "experiment=table1" in capsys.readouterr().err

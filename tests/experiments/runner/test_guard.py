@@ -76,7 +76,11 @@ def request(folder: Path, **order) -> Request:
         },
         **{"parameters": ["x"], "factors": {"k": 1}, "truth": TRUTH},
         **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
-        **{"mechanics": {"element": "hex18"}, "tracking": {"enabled": False}, "force": False},
+        **{
+            "mechanics": {"element": "hex18", "tissue": {}},
+            "tracking": {"enabled": False},
+            "force": False,
+        },
         **{"mesh": MESH, "figures": False},
         "time_limit_s": order.pop("limit", None),
         "memory_limit_gb": None,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments import tables
+from experiments import cli
 from experiments.common.records.record import read_record
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
@@ -85,7 +85,7 @@ ERRORS = [
     ("observation.noise_mm=[1]", "observation.noise_mm"),
     ("filter=[", "filter=[: no viable alternative"),
     ("mechanics.protocol.dt=0", "mechanics.protocol.dt = 0, expected 1e-05 to 10 s"),
-    ("truth.dt_factor=0", "truth.dt_factor = 0.0, expected > 0"),
+    ("truth.dt_factor=0", "truth.dt_factor = 0, expected 0.001 to 100"),
     ("truth.refine=0", "truth.refine = 0"),
     ("truth.values=[1]", "truth.values has 1 values"),
     ("truth.values=[-1,2]", "truth.values of E_f.anterior = -1, expected 1e-06 to"),
@@ -114,7 +114,7 @@ ERRORS = [
     ("mesh=unstructured", "an unstructured mesh needs tet10 or tet4"),
     ("valve.leaflets.edge_thinning=0", "template leaflets.edge_thinning = 0.0"),
     ("valve.leaflets.anterior.length=3", "leaflet at phi"),
-    ("parameters=[E_f.middle,E_f.posterior]", "no tissue is given for the region 'middle'"),
+    ("parameters=[E_f.middle,E_f.posterior]", "parameter 'E_f.middle': unknown 'middle'"),
     ("parameters=[E_f.anterior,luck]", "unknown parameter 'luck'"),
     ("seed=-1", "seed = -1, expected 0 to 4294967295"),
     ("time_limit_s=1e12", "time_limit_s = 1e+12, expected 0.01 to 2592000 s"),
@@ -132,7 +132,7 @@ ERRORS = [
     ("force=perhaps", "force: Value 'perhaps'"),
     ("filter=null", "filter=null: "),
     ("mesh=null", "mesh=null: "),
-    ("~filter", "filter.mode has no value"),
+    ("~filter", "filter.initial has no value"),
     ("~seed", "seed has no value"),
     ("--experiment", "unrecognized arguments: --experiment; settings are NAME=VALUE"),
     ("name=../escape", "name = '../escape', expected a name"),
@@ -268,7 +268,7 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     for name in kept:
         if "valve" not in name:
             (tmp_path / "published" / name).unlink()
-    assert tables.main([str(tmp_path / "published")]) == 0
+    assert cli.main(["tables", str(tmp_path / "published")]) == 0
     capsys.readouterr()
     again = {path.name: path.read_bytes() for path in (tmp_path / "published").glob("table1*")}
     assert again == kept
@@ -314,7 +314,7 @@ def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
     assert status == 0
     assert "force=true runs it again" in out
     overrides = (tmp_path / "here" / ".hydra" / "overrides.yaml").read_text()
-    assert set(yaml.safe_load(overrides)) == {*usual, "force=true"}
+    assert yaml.safe_load(overrides) == [*usual[:2], "force=true"]
 
 
 FAILURES = {
@@ -404,9 +404,10 @@ def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
 
 
 def test_tables_without_records_say_what_to_do(tmp_path, capsys) -> None:
-    assert tables.main([str(tmp_path)]) == 2
+    assert cli.main(["tables", str(tmp_path)]) == 2
     assert "experiment=table1" in capsys.readouterr().err
-    assert tables.main(["a", "b"]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["tables", "a", "b"])
     assert capsys.readouterr().err.startswith("error: ")
 
 

@@ -326,7 +326,7 @@ WRONG = [
     (("sweep=debug", "filter.P0=0.01,-1"), "filter.P0 = -1: the variance has a negative variance"),
     (("sweep=debug", "filter.P0=1,[[1,2],[3,4]]"), "must be symmetric"),
     (("sweep=debug", "filter.P0=1,[[1,2],[2,1]]"), "positive semi-definite"),
-    (("sweep=debug", "filter.method.tolerance=0"), "tolerance = 0, expected > 0"),
+    (("sweep=debug", "filter.method.tolerance=0"), "filter tolerance = 0, expected > 0"),
     (("sweep=debug", "filter.R=1,0"), "filter.R = 0: variance in R is 0, expected > 0"),
     (("sweep=debug", "filter=paper,magic"), "Could not find 'filter/magic'; known: "),
     (("sweep=debug", "filter.initial=[5,3],[1,2,3]"), "filter.initial has 3 values"),

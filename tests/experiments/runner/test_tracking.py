@@ -58,7 +58,7 @@ def make_config(outputs: Path, **changes) -> dict:
         "factors": {"noise": 0.5, "kind": "white"},
         "valve": {"chordae": {"basal": [[-60.0, 0.5], [50.0, 0.55], [75.0, 0.55]]}},
         "mesh": {"source": "structured", "columns": 24, "rows": 3, "layers": 1},
-        "mechanics": {"element": "hex18"},
+        "mechanics": {"element": "hex18", "tissue": {}},
         "filter": {
             **{"mode": "paper", "initial": [5.0, 3.0], "P0": 0.01, "R": 1e-4},
             "method": {"Q": 0.01},

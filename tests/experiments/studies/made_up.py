@@ -94,7 +94,7 @@ def made_up_twin(values: tuple[float, ...] | None = (6.2296, 2.0901), **header: 
     config = {
         "row": given["row"],
         "parameters": NAMES,
-        "mechanics": {"element": "hex18"},
+        "mechanics": {"element": "hex18", "tissue": {}},
         "mesh": {"columns": 24, "rows": 3, "layers": 1, "source": "structured"},
         "filter": {"mode": "paper"},
         "observation": {"noise_mm": 0.0},

@@ -77,9 +77,9 @@ def test_settings_are_those_of_the_configuration(config):
     assert settings.paper.R == 0.25
 
 
-def test_settings_without_a_configuration_are_those_of_the_commands(config):
+def test_settings_without_a_configuration_are_those_of_the_commands():
     case = made_up_case(0.3, 8.0)
-    assert default_settings(case) == personalising(config)
+    assert default_settings(case) == personalising(plain(composed("experiment=own_valve")))
     samples = np.zeros((4, len(case.frames), 288, 3)), np.zeros((4, len(case.frames), 2, 3))
     imaged = replace(case, error_samples=ErrorSamples(*samples))
     values = plain(composed("experiment=volume"))
@@ -145,7 +145,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
     config["personal"]["unknowns"]["shift.x"]["treatment"] = "guessed"
     with pytest.raises(
         ConfigurationError,
-        match=r"shift\.x\.treatment = 'guessed', expected one of estimated, fixed",
+        match=r"shift\.x\.treatment = 'guessed', expected estimated or fixed",
     ):
         personalising(config)
 

@@ -113,6 +113,7 @@ def edit(place: Path, old: str, new: str) -> None:
 def test_a_truth_outlives_comments_docstrings_and_layout(truth):
     place = truth.code / "mvest" / "mechanics" / "forces" / "contact.py"
     for old, new in (
+        ('"""Whether a point has moved so far', '"""Whether one has moved so far'),
         ("self.skin = skin\n", "self.skin = skin  # why\n\n\n"),
         ("# Pairs still apart", "# Those still apart"),
         ("BARRIER = 0.85", "BARRIER = (0.85)"),
