@@ -426,7 +426,6 @@ def _nearer(problem: CaseProblem, result: StudyResult, place: Place) -> Place | 
             tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
             problem.transform.inverse(begin + share * (end - begin)),
             posterior,
-            place,
         )
         return there if isinstance(there, str) else (improbability(there), there)
 
@@ -455,27 +454,18 @@ def joint(problem: CaseProblem, result: StudyResult, errors: FrameErrors) -> Joi
 
 
 def _displaced(
-    problem: CaseProblem,
-    modes: tuple[FloatArray, ...],
-    m: FloatArray,
-    posterior: JointPosterior,
-    place: Place,
+    problem: CaseProblem, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
 ) -> Place | str:
     """The valve with a geometry displaced by modes, or why it does not close.
 
-    It is closed at ``m (p,)``, from where it was closed at ``place`` or else from the open valve,
-    and from there with what fits best to this geometry.
+    It is closed at ``m (p,)``, and from there with what fits best to this geometry.
     """
     kinds = [source.modes for source in posterior.errors.geometry if source.modes is not None]
-    parts = displacement(kinds, modes)
     try:
-        closure = problem.stated.displaced(parts, m, place.closure.model)
-        first = closure.shared(m)
-        if not first.converged:
-            closure = problem.stated.displaced(parts, m)
-            first = closure.shared(m)
+        closure = problem.stated.displaced(displacement(kinds, modes), m)
     except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
         return str(error)
+    first = closure.shared(m)
     if not first.converged:
         return first.reason
     errors = posterior.errors.displaced(modes)

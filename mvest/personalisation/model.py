@@ -11,7 +11,7 @@ import numpy as np
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.closure.anchors import Anchors
 from mvest.closure.frames import FramesModel, is_frame_pressure
-from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
@@ -194,36 +194,23 @@ class CaseClosure:
         names: tuple[str, ...],
         start: FloatArray,
         displacement: Mapping[str, FloatArray] | None = None,
-        begin: ClosedState | None = None,
     ) -> CaseClosure:
-        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``.
-
-        It begins with the open valve, or with a closed state that is ``begin``.
-        """
-        registered = RegisteredModel(frames or model, names, begin)
+        """The closure of a valve, gone on from ``start (p,)`` in the order of ``names``."""
+        registered = RegisteredModel(frames or model, names)
         return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
 
-    def displaced(
-        self,
-        parts: Mapping[str, FloatArray],
-        start: FloatArray,
-        near: ClosureModel | None = None,
-    ) -> CaseClosure:
+    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> CaseClosure:
         """Of the valve with another geometry, see `RestGeometry.displaced`.
 
-        All closed frames have the same errors of annulus and tips, as their derivatives say. It
-        begins where ``near`` is closed, if that has another geometry of the same valve: displaced
-        as the mesh at rest is, that is nearly an equilibrium, and it is the same closed state.
+        All closed frames have the same errors of annulus and tips, as their derivatives say.
         """
-        model = RestGeometry(self.model).displaced(parts)
-        begin = None if near is None else _carried(near, model)
-        names = self.registered.names
-        closure = self.of(model, self.frames, names, start, parts, begin)
+        model, names = RestGeometry(self.model).displaced(parts), self.registered.names
+        closure = self.of(model, self.frames, names, start, parts)
         if self.frames is None:
             return closure
         states = {name: closure.held(state) for name, state in self.frames.states.items()}
         frames = replace(self.frames, model=model, states=states)
-        return self.of(model, frames, names, start, parts, begin)
+        return self.of(model, frames, names, start, parts)
 
     def held(self, state: HeldState) -> HeldState:
         """A state as it was seen, whose annulus and tips are off as those of this valve."""
@@ -232,18 +219,6 @@ class CaseClosure:
             annulus=state.annulus + self.displacement.get("annulus", 0.0),
             papillary_tips=state.papillary_tips + self.displacement.get("tips", 0.0),
         )
-
-
-def _carried(near: ClosureModel, model: ClosureModel) -> ClosedState | None:
-    """The closed state of a valve, displaced as the mesh at rest of another geometry is."""
-    closed = near.closed
-    if closed is None:
-        return None
-    guide = None
-    if near.guide is not None and model.guide is not None:
-        guide = _carried(near.guide, model.guide)
-    moved = closed.positions + model.mesh.nodes - near.mesh.nodes
-    return replace(closed, positions=moved, guide=guide)
 
 
 def gate_case(

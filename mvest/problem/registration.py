@@ -97,8 +97,6 @@ class RegisteredModel:
         Predicts the open frame and closed ones.
     names : tuple of str, (p,)
         Those of the model, and some of ``REGISTRATION``, in any order.
-    begin : ClosedState, optional
-        From where a closure begins anew; default: the open valve.
 
     Raises
     ------
@@ -106,12 +104,7 @@ class RegisteredModel:
         If a parameter of the model is missing or an unknown one is named.
     """
 
-    def __init__(
-        self,
-        model: ClosureModel | FramesModel,
-        names: tuple[str, ...],
-        begin: ClosedState | None = None,
-    ) -> None:
+    def __init__(self, model: ClosureModel | FramesModel, names: tuple[str, ...]) -> None:
         own = [k for k, name in enumerate(names) if name not in REGISTRATION]
         if tuple(names[k] for k in own) != model.names:
             raise InputError(
@@ -120,7 +113,6 @@ class RegisteredModel:
             )
         self.model = model
         self.names = names
-        self._begin = begin
         self._own = np.array(own, dtype=np.int64)
         self._frames = 1 + (len(model.frames) if isinstance(model, FramesModel) else 1)
         self.centre: FloatArray = model.valve.motion.annulus[-1].mean(axis=0)
@@ -132,7 +124,7 @@ class RegisteredModel:
 
     def restart(self, closed: ClosedState | None) -> None:
         """Forget everything but where to start from."""
-        self.model.restart(closed or self._begin)
+        self.model.restart(closed)
 
     def mechanical(self, m: FloatArray) -> FloatArray:
         """The parameters of the closure out of all."""
