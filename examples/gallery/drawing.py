@@ -14,9 +14,10 @@ def fields_of(valve, reach=None):
     surface, chords = valve.surface, valve.chordae
     gaps = np.linalg.norm(surface.vertices[:, None] - chords.insertion, axis=2)
     return CaseFields(
-        surface.triangles, surface.region, surface.vertices, valve.annulus, valve.free_edge,
-        ("closed",), np.array([True]), valve.motion.papillary_tips, chords.tip,
-        gaps.argmin(axis=0), {}, reach_mm=reach,
+        triangles=surface.triangles, region=surface.region, rest=surface.vertices,
+        annulus=valve.annulus, free_edge=valve.free_edge, frames=("closed",),
+        seen=np.array([True]), tips=valve.motion.papillary_tips, chord_tip=chords.tip,
+        chord_insertion=gaps.argmin(axis=0), observed_points={}, reach_mm=reach,
     )  # fmt: skip
 
 

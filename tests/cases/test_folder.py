@@ -246,7 +246,9 @@ def test_everything_derived_is_said_and_nothing_else(tmp_path):
     del document["chordae"]
     case = read_case(save(tmp_path, document))
     fields = [sentence.split(":")[0] for sentence in case.derived]
-    assert fields == ["annulus and free edge", "thickness", "fibre", "chordae", "observation"]
+    assert fields == [
+        "annulus and free edge", "thickness", "thickness", "fibre", "chordae", "observation"
+    ]  # fmt: skip
     document["observation"] = {"std_mm": 0.5, "correlation_length_mm": 0}
     document["thickness"] = {"anterior": 1.5, "posterior": 1.0}
     document["frames"][0]["annulus"] = list(range(24))

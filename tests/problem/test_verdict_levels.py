@@ -35,7 +35,7 @@ class Level:
 
 def indications(grounds: str) -> Indications:
     """What was seen of an estimate, from what spoke against it."""
-    names = "|".join(map(re.escape, (*CHECKS, *OLD)))
+    names = "|".join(map(re.escape, (*{check.name for check in CHECKS}, *OLD)))
     parts = re.split(rf"; (?=(?:{names}): )", grounds) if grounds else []
     texts: dict[str, list[str]] = {}
     for part in parts:
