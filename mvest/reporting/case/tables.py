@@ -103,7 +103,7 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             generic="::generic valve",
         ),
         "data_alone": table(
-            rows("data_alone"),
+            ({**row, "parameter": label_of(row["parameter"])} for row in rows("data_alone")),
             parameter="::modulus",
             estimate=Column("MPa", low="low", high="high", label="by the data alone"),
             prior_stds=":.1f:from its prior [SD]",
