@@ -78,6 +78,14 @@ def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -
     return {name: file for name, file in files.items() if file.is_file()}
 
 
+def _of_users() -> dict[str, str]:
+    """The environment of a user's program, which may import what lies beside it.
+
+    `mvest.processes.side_by_side` forbids that to the processes of its own.
+    """
+    return {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+
+
 @dataclass(frozen=True, slots=True)
 class Command:
     """How a program is started, and how long it may take.
@@ -130,7 +138,7 @@ class Command:
                 Program(
                     [self._filled(text, folder.resolve()) for text in self.arguments],
                     cwd=folder,
-                    env={**os.environ, **self.environment},
+                    env={**_of_users(), **self.environment},
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=errors,

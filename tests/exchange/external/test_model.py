@@ -52,7 +52,8 @@ def test_differences_are_of_their_order(tmp_path, processes):
     assert (program.runs, ran(tmp_path)) == (0, 5)
 
 
-def test_programs_side_by_side_find_what_lies_beside_them(tmp_path):
+def test_programs_side_by_side_find_what_lies_beside_them(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")  # as processes side by side leave it
     (tmp_path / "helper.py").write_text("HEIGHT = 1\n")
     command = Command((sys.executable, str(tmp_path / "solve.py"), "{request}", "{folder}"))
     (tmp_path / "solve.py").write_text("import helper\n" + SPRINGS)
