@@ -46,7 +46,7 @@ axes.set_yticks(range(len(plans)), plans)
 axes.invert_yaxis()
 axes.legend(frameon=False)
 for group in bounds[-1].confounded():
-    print("hardly distinguished:", ", ".join(group.names))
+    print("hardly distinguished:", ", ".join(group.parameters))
 
 # %%
 # Fewer vertices cost accuracy; an unknown pressure costs more than anything else, because a stiffer
