@@ -267,7 +267,8 @@ class FrameErrors:
 
     def displaced(self, modes: tuple[FloatArray, ...]) -> FrameErrors:
         """Errors about a valve whose geometry is displaced by modes, before it is linearised."""
-        return FrameErrors(self.fitted, self.modes, modes)
+        kept = tuple(source for source in self.sources if source.modes is None)
+        return FrameErrors(self.fitted, self.modes, modes, kept)
 
     def as_stated(self) -> FrameErrors:
         """The same where geometry and law are known: error samples of the frames remain."""
@@ -285,12 +286,15 @@ def linearise(
     predicted: FloatArray,
     seen: ClosureModel | None = None,
 ) -> FrameErrors:
-    """Errors of the geometry and of the law about a closed valve.
+    """Errors of the geometry about a closed valve, and of law and mesh unless they are known.
+
+    What law and mesh do hardly differs from one place to the next, and takes as long to find as
+    what the geometry does.
 
     Parameters
     ----------
     errors : FrameErrors
-        Without sources.
+        Those of another closed valve, or without sources.
     registered : RegisteredModel
         Its last closed state is gone on from.
     m : (p,)
@@ -307,6 +311,7 @@ def linearise(
         return errors
     if not settings.mechanics.protocol.equilibrium:
         return replace(errors, unaccounted=("the closure does not end in an equilibrium",))
+    known = tuple(source for source in errors.sources if source.modes is None)
     found: list[tuple[ErrorSource, ...] | str] = []
     if geometry is not None:
         if errors.modes is None:
@@ -315,10 +320,12 @@ def linearise(
         assert errors.modes is not None
         found.append(
             geometry_sources(
-                errors.modes, registered, observation, errors.noise(), m, predicted, seen
+                errors.modes, registered, observation, errors.single_noise(), m, predicted, seen
             )
         )
-    if laws or mesh:
+    if known:
+        found.append(known)
+    elif laws or mesh:
         found.append(law_and_mesh_sources(laws, mesh, registered, observation, m, predicted))
     return replace(
         errors,

@@ -389,7 +389,7 @@ def _step(problem: CaseProblem, result: StudyResult, place: Place) -> float:
 def _renewed(problem: CaseProblem, place: Place) -> tuple[Place, StudyResult] | str:
     """A place with its errors and a rough estimate about it, or why there is none."""
     place = linearised(place, problem)
-    if place.errors.unaccounted:
+    if not place.errors.geometry:
         return "; ".join(place.errors.unaccounted)
     result = _estimate_about(problem, place, final=False)
     return f"{result.reason} ({result.detail})" if result.estimate is None else (place, result)

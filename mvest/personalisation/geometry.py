@@ -18,7 +18,7 @@ from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError, require_numbers
 from mvest.estimation.spectrum import smooth_basis
-from mvest.quantities import Angle, Count, Factor, Length, Share, Thickness
+from mvest.quantities import Angle, Count, Factor, Length, Share
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -79,7 +79,7 @@ class ConsideredGeometry:
     tips_mm: Length = 1.0
     insertions_mm: Length = 0.5
     rest_lengths: Share = 0.0
-    thickness: Thickness = 0.1
+    thickness: Share = 0.1
     fibre_degrees: Angle = 10.0
     factor: Factor = 2.0
     share: Share = 0.9

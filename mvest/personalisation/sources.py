@@ -34,7 +34,7 @@ LAW, MESH = "law", "mesh"
 VISIBLE = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
 
-TOLERANCE = 1e-4
+TOLERANCE = 1e-3
 """Of derivatives, relative, far below what is known of the size of errors."""
 
 

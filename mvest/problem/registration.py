@@ -115,6 +115,7 @@ class RegisteredModel:
         self.names = names
         self._own = np.array(own, dtype=np.int64)
         self._frames = 1 + (len(model.frames) if isinstance(model, FramesModel) else 1)
+        self._last: tuple[FloatArray, Prediction] | None = None
         self.centre: FloatArray = model.valve.motion.annulus[-1].mean(axis=0)
 
     @property
@@ -124,6 +125,7 @@ class RegisteredModel:
 
     def restart(self, closed: ClosedState | None) -> None:
         """Forget everything but where to start from."""
+        self._last = None
         self.model.restart(closed)
 
     def mechanical(self, m: FloatArray) -> FloatArray:
@@ -140,8 +142,11 @@ class RegisteredModel:
         return displace(points, registration_of(self.names, m), self.centre)
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict, as an ``ObservationModel`` does."""
-        prediction = self.model(self.own(m))
+        """Predict, as an ``ObservationModel`` does; only another displacement closes nothing."""
+        own = self.own(m)
+        if self._last is None or not np.array_equal(self._last[0], own):
+            self._last = own, self.model(own)
+        prediction = self._last[1]
         if not prediction.converged:
             return prediction
         start = len(prediction.y) // self._frames

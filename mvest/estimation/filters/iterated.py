@@ -263,16 +263,16 @@ def _with_second_derivatives(
     Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``, which of thousands of
     observations may amount to as much as what is kept, though the model is all but linear over a
     standard deviation. Here the Hessian is that of differences of J's exact gradients over ± one
-    standard deviation along the principal axes of a Gaussian, first of Gauss-Newton's (Nocedal and
-    Wright 2006, section 8.1); its inverse is the covariance (Laplace). Newton steps with it lead to
+    standard deviation along conjugate directions of a Gaussian, first of Gauss-Newton's (Nocedal
+    and Wright 2006, section 8.1); its inverse is the covariance (Laplace). The directions are the
+    columns of Cholesky's factor: the last ones change the last parameters alone. Newton steps with it lead to
     the minimum; where that is more than a standard deviation away, it is found anew there.
 
     Returns None where a run fails, J is no valley, or its minimum is not come to.
     """
     covariance = gaussian.covariance
     for _ in range(MAX_HESSIANS):
-        values, axes = np.linalg.eigh(covariance)
-        C = axes * np.sqrt(values)
+        C = np.linalg.cholesky(covariance)
         rows = []
         for axis in C.T:
             ends = [_evaluate(run, point.x + sign * axis) for sign in (1.0, -1.0)]
