@@ -29,6 +29,7 @@ from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
+from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
@@ -50,6 +51,7 @@ from mvest.reporting.skill import (
 from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.drawn_patient import PatientSettings
 from mvest.typing import FloatArray
+from mvest.valve.measure.strain import mean_strains
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -142,7 +144,33 @@ def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, see
     numbers |= {f"paper_{own.region}_MPa": value for own, value in paper}
     distances = zip(("generic", "personalised"), patient.paper_distance_mm, strict=False)
     numbers |= {f"paper_{which}_mm": value for which, value in distances}
+    numbers |= _true_quantities(estimate, read_case(place.case), positions)
     return estimated.changed(tables={}, numbers=numbers, estimates=(estimate,), arrays=arrays)
+
+
+def _true_quantities(
+    estimate: EstimateRecord, case: ValveCase, positions: Mapping[str, FloatArray]
+) -> dict[str, Number]:
+    """Ratio and strains that an estimate states, as they truly are and as they are without it.
+
+    ``true NAME`` and ``else NAME``: of a ratio the generic guess, of a strain that between the
+    frames as they were seen.
+    """
+    known = {str(own["name"]): own for own in estimate.details.get("known", ())}
+    first, second = (own.truth for own in estimate.moduli[:2])
+    numbers: dict[str, Number] = {}
+    for name in known:
+        if name.startswith("ratio") and first and second:
+            numbers |= {f"true {name}": first / second, f"else {name}": known[name]["generic"]}
+    strains, rest = [own for own in known if own.startswith("strain")], case.surface.vertices
+    seen = case.frame(Role.CLOSED)
+    if strains and seen.corresponds:
+        for label, frame in ("true", positions[seen.name]), ("else", seen.vertices):
+            values = 100.0 * mean_strains(rest, frame, case.surface).ravel()
+            numbers |= {
+                f"{label} {name}": float(value) for name, value in zip(strains, values, strict=True)
+            }
+    return numbers
 
 
 def _to_truth(
@@ -199,6 +227,7 @@ def summary(results: Results) -> dict[str, Table]:
         return {
             "": skill_table("estimation, unknown", _by_name(groups)),
             "moduli": skill_table("estimation", moduli),
+            "quantities": skill_table("quantity", _quantities(patients)),
             "verdicts": verdict_table(estimates),
             "distances": _distances(distances),
             "estimates": _estimates(patients),
@@ -251,6 +280,30 @@ def _by_name(groups: Mapping[str, Sequence[Unknown]]) -> dict[str, list[Unknown]
         for group, unknowns in groups.items()
         for name in _names(unknowns)
     }
+
+
+def _quantities(patients: Patients) -> dict[str, list[Unknown]]:
+    """Ratio and strains of all estimates that are stated; what they are without one as their guess.
+
+    See `_true_quantities`.
+    """
+    groups: dict[str, list[Unknown]] = {}
+    for record, estimate in patients:
+        for own in estimate.details.get("known", ()) if estimate.is_stated else ():
+            name, numbers = str(own["name"]), record.numbers
+            if f"true {name}" in numbers:
+                ends = {end: own[end] for end in ("estimate", "low", "high")}
+                truth, guess = numbers[f"true {name}"], numbers[f"else {name}"]
+                row = Unknown(
+                    name=name,
+                    kind="quantity",
+                    unit=own["unit"],
+                    prior_mean=guess,
+                    truth=truth,
+                    **ends,
+                )
+                groups.setdefault(name, []).append(row)
+    return groups
 
 
 def _names(unknowns: Sequence[Unknown]) -> list[str]:

@@ -74,8 +74,9 @@ class Unknown(Frozen):
     ----------
     name, label, unit : str
         ``E_f.anterior``; what a reader calls it; empty for a factor.
-    kind : {"modulus", "nuisance", "derived"}
-        A derived modulus follows from an estimated one through a fixed ratio.
+    kind : {"modulus", "nuisance", "derived", "quantity"}
+        A derived modulus follows from an estimated one through a fixed ratio; a quantity is a ratio
+        of moduli or a strain (%).
     treatment : {"estimated", "fixed"}
     prior_mean, prior_std : float or None
     estimate, std : float or None
@@ -91,7 +92,7 @@ class Unknown(Frozen):
     name: str
     label: str = ""
     unit: str = ""
-    kind: Literal["modulus", "nuisance", "derived"] = "modulus"
+    kind: Literal["modulus", "nuisance", "derived", "quantity"] = "modulus"
     treatment: Literal["estimated", "fixed"] = "estimated"
     prior_mean: float | None = None
     prior_std: float | None = None
@@ -115,6 +116,8 @@ class Unknown(Frozen):
     @property
     def is_positive(self) -> bool:
         """Whether its interval is that of its logarithm."""
+        if self.kind == "quantity":
+            return self.unit != "%"
         return self.name not in REGISTRATION and is_positive(self.name)
 
     @property

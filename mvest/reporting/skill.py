@@ -66,7 +66,9 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
     -------
     dict
         ``n`` unknowns, ``estimated`` of them, ``inside`` their 95 % intervals; ``coverage`` (%),
-        the share of the intervals that hold the truth, with exact 95 % bounds. Errors (``mean
+        the share of the intervals that hold the truth, with exact 95 % bounds; ``mean square`` of
+        errors in posterior standard deviations, 1 where intervals are as wide as they should be.
+        Errors (``mean
         error``, ``median error`` of their sizes, of the generic guess for the same and for all) and
         the ``mean width`` of intervals are in ``unit``: relative to the truth (%) for moduli and
         factors, otherwise as the unknown is. ``relative width`` is the median over the estimate,
@@ -76,6 +78,7 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
     judged = [own.inside for own in unknowns if own.inside is not None]
     inside, n = sum(judged), len(judged)
     bounds = share_bounds(inside, n)
+    scores = [z**2 for own in unknowns if (z := score(own)) is not None]
     unit = "" if unknowns[0].is_modulus else unknowns[0].unit
     errors = _errors(known, unit)
     sizes = (
@@ -100,6 +103,7 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
         "coverage": 100 * inside / n if n else None,
         "coverage low": 100 * bounds[0] if n else None,
         "coverage high": 100 * bounds[1] if n else None,
+        "mean square": mean(scores) if scores else None,
         "unit": unit or "%",
         "mean error": mean(errors) if errors else None,
         "median error": median(map(abs, errors)) if errors else None,
@@ -162,6 +166,7 @@ COLUMNS = {
     "coverage": Column("%", ".0f", low="coverage low", high="coverage high"),
     "coverage low": Column("%"),
     "coverage high": Column("%"),
+    "mean square": Column(digits=".2f", label="mean square of standardised errors"),
     "unit": Column(label="unit of errors"),
     "mean error": Column(digits=".2f"),
     "median error": Column(digits=".2f", label="median size of the error"),
