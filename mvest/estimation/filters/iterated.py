@@ -266,7 +266,8 @@ def _with_second_derivatives(
     standard deviation along conjugate directions of a Gaussian, first of Gauss-Newton's (Nocedal
     and Wright 2006, section 8.1); its inverse is the covariance (Laplace). The directions are the
     columns of Cholesky's factor: the last ones change the last parameters alone. Newton steps with
-    it lead to the minimum; where that is more than a standard deviation away, it is found anew there.
+    it lead to the minimum; where that is more than a standard deviation away, the Hessian is found
+    anew there.
 
     Returns None where a run fails, J is no valley, or its minimum is not come to.
     """
