@@ -19,6 +19,7 @@ class Closure:
     """Stands for a closure: closed positions that are a curved function of two parameters."""
 
     names = NAMES[:2]
+    closed_times = 0
     valve = SimpleNamespace(motion=SimpleNamespace(annulus=np.stack([REST[:4], REST[:4] + 1.0])))
     closed = None
 
@@ -26,6 +27,7 @@ class Closure:
         self.closed = closed
 
     def __call__(self, m):
+        self.closed_times += 1
         if m[0] < 0:
             return Prediction.failed("no equilibrium")
         closed = REST + MOVE @ np.sin(m)
@@ -54,6 +56,22 @@ def test_jacobian_against_central_differences(turn):
     assert errors[1] < 1e-5
     # Second order: the error falls by a hundred until rounding takes over.
     assert errors[1] < 0.02 * errors[0]
+
+
+def test_a_valve_that_is_only_displaced_is_not_closed_again():
+    closure = Closure()
+    model = RegisteredModel(closure, NAMES)
+    m = np.array([0.7, 1.1, 0.3, -0.8, 1.2, 2.0, -1.0, 3.0])
+    moved = m + np.array([0, 0, 0.1, 0, 0, 0, 0.5, 0])
+    at(model, m)
+    found = at(model, moved)
+    assert closure.closed_times == 1
+    fresh = at(RegisteredModel(Closure(), NAMES), moved)
+    np.testing.assert_array_equal(found.y, fresh.y)
+    np.testing.assert_array_equal(found.jacobian, fresh.jacobian)
+    model.restart(None)
+    at(model, moved)
+    assert closure.closed_times == 2
 
 
 def test_shift_and_turn_do_what_they_say():
