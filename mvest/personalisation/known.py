@@ -395,7 +395,7 @@ def derived_quantities(filtered: Estimate) -> tuple[Quantity, ...]:
     regions = {k: names[k].partition(".")[2] for k in moduli}
     found = [
         quantity(
-            f"ratio of E_f, {regions[moduli[0]]} to {regions[k]}", "", {moduli[0]: 1.0, k: -1.0}
+            f"ratio of E_f {regions[moduli[0]]} to {regions[k]}", "", {moduli[0]: 1.0, k: -1.0}
         )
         for k in moduli[1:]
     ]

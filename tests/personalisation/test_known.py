@@ -132,7 +132,7 @@ def test_a_wrong_pressure_moves_the_moduli_and_not_their_ratio(monkeypatch):
     wide = [replace(u, std=0.4) if u.name == "pressure_scale" else u for u in given]
     fit = fitted(monkeypatch, *wide)
     known = {one.name: one for one in fit.known.quantities}
-    ratio = known["ratio of E_f, anterior to posterior"]
+    ratio = known["ratio of E_f anterior to posterior"]
     m = fit.result.estimate
     assert ratio.estimate == pytest.approx(m[0] / m[1])
     assert ratio.generic == pytest.approx(6.23 / 2.09, rel=1e-2)

@@ -220,7 +220,7 @@ def _record(fields: dict[str, np.ndarray]) -> EstimateRecord:
             ),
             "known": (
                 {
-                    "name": "ratio of E_f, anterior to posterior",
+                    "name": "ratio of E_f anterior to posterior",
                     "unit": "",
                     "estimate": 2.6,
                     "low": 2.3,

@@ -341,7 +341,7 @@ def test_where_the_variance_comes_from_is_told_as_far_as_it_matters(case, html) 
         ("thickness", 60.0),
         ("pressure (factor)", 39.5),
     ]
-    assert "ratio of E_f, anterior to posterior" in Page(html).text
+    assert "ratio of E_f anterior to posterior" in Page(html).text
 
 
 def test_units_of_measurements_are_read_from_their_names(case) -> None:
