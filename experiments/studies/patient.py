@@ -655,8 +655,9 @@ def ecdf_band(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 def keep(record: Record) -> Record:
     """What tables and figures need of a record; all of it stays in the folder of the run."""
     kept = []
+    details = {POPULATION: ("known",), CALIBRATION: ()}.get(record.table, ("narrower",))
     for estimate in record.estimates:
-        short = estimate.without_details(*(() if record.table in MANY else ("narrower",)))
+        short = estimate.without_details(*details)
         few = short.moduli if record.table == CALIBRATION else short.parameters
         kept.append(short.model_copy(update={"unknowns": few}))
     return record.model_copy(update={"estimates": tuple(kept)})
