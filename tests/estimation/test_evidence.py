@@ -189,7 +189,7 @@ def test_it_is_learned_where_it_is_generated_from_the_belief() -> None:
     z, error = [], []
     for _ in range(200):
         log = FAMILY.prior.mean + FAMILY.prior.factor @ rng.standard_normal(FAMILY.prior.size)
-        std = np.sqrt(FAMILY.rows.variances(log)[0])
+        std = np.sqrt(FAMILY.variances(log)[0])
         white, x = rng.standard_normal((len(POINTS), 3)), rng.standard_normal(8)
         noise = std[-1] * white + U @ ((std[:-1] - std[-1])[:, None] * (U.T @ white))
         e = B @ x + noise.ravel()
