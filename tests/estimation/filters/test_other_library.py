@@ -28,12 +28,12 @@ def test_on_a_linear_model_all_filters_are_filterpys_kalman_filter() -> None:
         EnsembleFilter(members=12),
         EnsembleFilter(members=12, steps=3),
     ):
-        found = filter_(problem.differentiated, problem.prior, problem.y, problem.R)
+        found = problem.by(filter_)
         np.testing.assert_allclose(found.mean, np.ravel(other.x), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(found.covariance, other.P, rtol=1e-8, atol=1e-12)
         assert found.innovation is not None
     # The innovation and its likelihood are those of the prior, not of the posterior.
-    found = IteratedFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    found = problem.by(IteratedFilter())
     assert found.innovation is not None
     np.testing.assert_allclose(found.log_likelihood[-1], other.log_likelihood, rtol=1e-9)
     innovation = np.ravel(other.y)
