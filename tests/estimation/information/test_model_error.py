@@ -14,9 +14,13 @@ def estimated(H, y, prior=PRIOR, R=R):
     return IteratedFilter(1e-12)(lambda m: Prediction(H @ m, H), prior, y, R)
 
 
+def drawn(seed):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(6, 2)), rng.normal(size=6), rng.normal(size=6)
+
+
 def test_the_shift_is_the_difference_of_two_estimates_of_a_linear_model():
-    rng = np.random.default_rng(2)
-    H, y, offset = rng.normal(size=(6, 2)), rng.normal(size=6), rng.normal(size=6)
+    H, y, offset = drawn(2)
     found, moved = estimated(H, y), estimated(H, y + offset)
     shift = shift_by_model_error(found, R, offset)
     np.testing.assert_allclose(shift, moved.mean - found.mean, rtol=1e-9)
@@ -26,8 +30,7 @@ def test_the_shift_is_the_difference_of_two_estimates_of_a_linear_model():
 
 
 def test_the_shift_is_in_the_coordinates_of_the_filter():
-    rng = np.random.default_rng(6)
-    H, y, offset = (rng.normal(size=shape) for shape in ((6, 2), 6, 6))
+    H, y, offset = drawn(6)
     prior = Gaussian.from_variance(np.ones(2), np.ones(2))
     # Linear in the logarithms.
     found, moved = (

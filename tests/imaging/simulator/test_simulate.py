@@ -50,8 +50,6 @@ def test_leaflets_are_bright_where_the_truth_says_in_every_frame():
         assert bright > seen(volume, mirrored, k).mean() + 30
         assert seen(volume, blood, k).mean() < 60
 
-
-def test_the_truth_is_the_valve_in_the_world():
     truth = true_sequence(VALVE, PROBE, [0, 2])
     np.testing.assert_allclose(truth.vertices[1], PROBE.to_world(VALVE.vertices[2]))
     np.testing.assert_allclose(truth.tips[1], PROBE.to_world(VALVE.tips[2]))
@@ -188,6 +186,7 @@ def test_levels_land_where_the_beams_run_in_the_world():
 def test_it_is_dark_outside_the_pyramid_only():
     grid = BeamGrid.of(SMALL)
     volume = scan_convert(np.full(grid.shape, 200, dtype=np.float32), grid)
+    assert [k for a, b in grid.windows() for k in range(a, b)] == list(range(grid.azimuth.count))
     places = np.indices(SMALL.shape).T.swapaxes(0, 2) * SMALL.voxel_mm
     x, y, z = np.moveaxis(volume_origin(SMALL) + places, -1, 0)
     r = np.sqrt(x**2 + y**2 + z**2)
