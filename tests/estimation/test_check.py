@@ -100,43 +100,6 @@ def test_false_alarms_on_mildly_nonlinear_models_are_rare(noise) -> None:
     assert alarms <= 1
 
 
-def lorenz(states):
-    """Lorenz 63 from states (k, 3): the first component at ten times within 1.5 units, (k, 10)."""
-
-    def rate(s):
-        x, y, z = s
-        return np.array([10.0 * (y - x), x * (28.0 - z) - y, x * y - 8.0 / 3.0 * z])
-
-    s, step, seen = np.array(states, dtype=float).T, 0.01, []
-    for k in range(150):
-        a = rate(s)
-        b = rate(s + 0.5 * step * a)
-        c = rate(s + 0.5 * step * b)
-        s = s + step / 6.0 * (a + 2.0 * b + 2.0 * c + rate(s + step * c))
-        if k % 15 == 14:
-            seen.append(s[0])
-    return np.array(seen).T
-
-
-def test_an_ensemble_on_lorenz_63_says_that_it_failed() -> None:
-    truth, rng = np.array([1.5, -1.5, 25.5]), np.random.default_rng(2)
-    prior = Gaussian(truth + rng.standard_normal(3), np.eye(3))
-    y = lorenz(truth[None])[0] + rng.standard_normal(10)
-    found = EnsembleFilter(members=100)(
-        lambda m: Prediction.undifferentiated(lorenz(m[None])[0]), prior, y, 1.0
-    )
-    assert found.reason is Reason.COMPLETED
-    # The posterior by weighted draws from the prior, some 3000 of 50 000 effective.
-    drawn = prior.mean + rng.standard_normal((50_000, 3))
-    misfit = 0.5 * np.sum((y - lorenz(drawn)) ** 2, axis=1)
-    weights = np.exp(misfit.min() - misfit)
-    weights /= weights.sum()
-    mean = weights @ drawn
-    std = np.sqrt(weights @ (drawn - mean) ** 2)
-    assert np.max(np.abs(found.mean - mean) / std) > 0.6
-    assert not found.trusted
-
-
 def test_a_check_is_about_its_limit() -> None:
     assert ApproximationCheck("a", 0.2, 0.25, 1).holds
     assert not ApproximationCheck("a", np.inf, 0.25, 1).holds

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.estimation import Gaussian, IteratedFilter, Log, PaperFilter, Prediction, Reason
-from tests.estimation.problems import Linear, square
+from tests.estimation.problems import square
 
 NEVER = 1e-300
 """A tolerance that only an exact fixed point meets."""
@@ -38,53 +38,6 @@ def tight(tolerance=NEVER, **more):
 
 
 # --- Linear models -------------------------------------------------------------------------------
-
-
-def dense_kalman_filter(m, P, Q, y, H, R, rounds):
-    """Textbook filter for a random walk, covariance form; returns all states and likelihoods."""
-    states, log_likelihoods = [(m, P)], []
-    for _ in range(rounds):
-        P = P + Q
-        S = H @ P @ H.T + R
-        e = y - H @ m
-        log_likelihoods.append(
-            -0.5 * (np.linalg.slogdet(2 * np.pi * S)[1] + e @ np.linalg.solve(S, e))
-        )
-        K = P @ H.T @ np.linalg.inv(S)
-        m, P = m + K @ e, P - K @ S @ K.T
-        states.append((m, P))
-    return states, log_likelihoods
-
-
-def textbook(problem, Q, rounds):
-    m, P, R = problem.prior.mean, problem.prior.covariance, np.diag(problem.R)
-    return dense_kalman_filter(m, P, Q, problem.y, problem.H, R, rounds)
-
-
-def test_paper_mode_on_a_linear_model_is_the_textbook_kalman_filter():
-    problem, Q = Linear(), np.diag([0.1, 0.2, 0.3])
-    estimate = problem.by(PaperFilter(Q=Q, tolerance=NEVER, max_iterations=4))
-    states, log_likelihoods = textbook(problem, Q, rounds=5)
-    for k in range(5):
-        np.testing.assert_allclose(estimate.iterates[k], states[k][0], rtol=1e-12)
-        np.testing.assert_allclose(estimate.iterate_covariances[k], states[k][1], rtol=1e-11)
-    np.testing.assert_allclose(estimate.log_likelihood, log_likelihoods, rtol=1e-12)
-    assert estimate.reason is Reason.MAX_ITERATIONS
-    assert not estimate.converged
-
-
-def test_iterated_mode_on_a_linear_model_is_one_kalman_update():
-    problem = Linear()
-    estimate = problem.by(IteratedFilter())
-    states, log_likelihoods = textbook(problem, 0.0, rounds=1)
-    np.testing.assert_allclose(estimate.mean, states[1][0], rtol=1e-12)
-    # The reference subtracts K S K' from P (entries of order 5), which costs it the last digits.
-    np.testing.assert_allclose(estimate.covariance, states[1][1], rtol=1e-12, atol=1e-12)
-    assert estimate.log_likelihood[-1] == pytest.approx(log_likelihoods[0], rel=1e-12)
-    # Twice the objective at the minimum of a linear problem is the NIS of the prior's innovation.
-    assert 2.0 * estimate.objective[-1] == pytest.approx(estimate.innovation.nis, rel=1e-12)
-    assert estimate.converged
-    assert (estimate.iterations, estimate.forward_solves) == (1, 2)
 
 
 @pytest.mark.parametrize(("rounds", "variance"), [(1, 1 / 2), (2, 1 / 3), (5, 1 / 6)])
