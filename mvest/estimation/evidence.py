@@ -197,12 +197,8 @@ class Evidence:
         value, slope = self.misfit(self.log(u))
         return value + 0.5 * float(u @ u), self.root.T @ slope + u
 
-    def log_likelihood(self, log: FloatArray) -> float:
-        """Logarithm of p(e | θ) at the logarithms ``(h,)`` of θ."""
-        return -self.misfit(log)[0] - 0.5 * self.family.size * float(np.log(2.0 * np.pi))
-
     def misfit(self, log: FloatArray) -> tuple[float, FloatArray]:
-        """−log p(e | θ) without its constant, and its derivatives by log θ.
+        """−log p(e | θ) − ½ n log 2π, and its derivatives by log θ.
 
         With V the diagonal R, B all columns and M = I + Bᵀ V⁻¹ B::
 

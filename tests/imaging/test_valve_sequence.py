@@ -20,23 +20,23 @@ LAYOUT = ValveLayout(8, 3)
 
 
 SIZE = LAYOUT.size
+BOTH = {
+    "layout": LAYOUT,
+    "times": np.array([0.0, 0.1]),
+    "vertices": np.random.default_rng(0).normal(size=(2, SIZE, 3)),
+    "tips": np.zeros((2, 2, 3)),
+}
 FIELDS = {
-    ValveSequence: {
-        "layout": LAYOUT,
-        "times": np.array([0.0, 0.1]),
-        "vertices": np.random.default_rng(0).normal(size=(2, SIZE, 3)),
-        "tips": np.zeros((2, 2, 3)),
+    ValveSequence: BOTH
+    | {
         "frame_confidence": np.ones(2),
         "vertex_confidence": np.ones((2, SIZE)),
         "std_mm": np.ones(SIZE),
         "correlation_length_mm": 5.0,
     },
-    MovingValve: {
+    MovingValve: BOTH
+    | {
         "name": "made up",
-        "layout": LAYOUT,
-        "times": np.array([0.0, 0.1]),
-        "vertices": np.zeros((2, SIZE, 3)),
-        "tips": np.zeros((2, 2, 3)),
         "thickness": np.ones(SIZE),
         "chord_phi": np.zeros(4),
         "chord_s": np.zeros(4),

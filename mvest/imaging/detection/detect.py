@@ -28,7 +28,7 @@ ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
 """Largest number of modes in each round of the fit, and the distance (mm) along normals within
 which leaflets are looked for."""
 
-ALIKE = 8.0
+CORRELATED = 8.0
 """Divides the number of vertices in the fit, as errors of neighbouring vertices are correlated."""
 
 STIFFNESS, HOLD = 4.0, 0.3
@@ -118,7 +118,7 @@ def _merit(frame: StandardFrame, model: DetectionModel, pose: Poses) -> float:
     b = np.zeros(min(ROUNDS[0][0], len(shape.std)))
     b[:MODES] = start[0]
     seen = np.zeros(0)
-    wide = np.sqrt(max(1.0, ALIKE * coarse.size / layout.size))
+    wide = np.sqrt(max(1.0, CORRELATED * coarse.size / layout.size))
     for _, reach in (ROUNDS[0], ROUNDS[-1]):
         vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
         normals, offset, std, seen = find_boundary(frame, model.boosters, vertices, coarse, reach)
@@ -205,13 +205,13 @@ def _seen(
     layout, boosters, (hand, points) = model.shape.layout, model.boosters, by_hand
     vertices = pose.world(model.shape.shape(b[None]))[0]
     normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
-    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(ALIKE) * std)]
+    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(CORRELATED) * std)]
     for rim, at in (("annulus", layout.annulus), ("free_edge", layout.free_edge)):
         axes, off, spread = find_rim(
             frame, boosters, rim, vertices, layout, float(pose.log_scale[0])
         )
         # Errors of neighbouring columns are correlated as those of rows are.
-        wide = np.sqrt(np.sqrt(ALIKE)) * np.hypot(RIM_STD_MM, spread)
+        wide = np.sqrt(np.sqrt(CORRELATED)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
     parts.append(Pulls.to_points(hand, vertices[hand], points, np.full(len(hand), hand_std)))
     return vertices, Pulls.joined(parts), confidence

