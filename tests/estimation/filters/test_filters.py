@@ -195,6 +195,10 @@ def test_only_decreases_are_accepted():
     # J' = 0 at m close to 0: 16 m/1e-4 = (2 - m)/100 gives m = 1.25e-7, to 1e-4 of its standard
     # deviation 1/sqrt(16/1e-4) = 2.5e-3, which is what the tolerance asks for.
     assert estimate.mean[0] == pytest.approx(1.25e-7, abs=2.5e-7)
+    # Damping goes away again: the errors of the last two steps square instead of creeping.
+    estimate = tight(1e-12)(overshooting, prior, np.full(1, 0.5), 1e-4)
+    assert estimate.converged
+    assert estimate.iterations < 15
 
 
 def test_a_decrease_far_below_the_predicted_one_is_refused():
@@ -230,14 +234,6 @@ def test_full_steps_that_overshoot_again_and_again_are_damped():
     assert result.converged
     assert abs(result.mean[0]) < 1e-5
     assert result.iterations < 20
-
-
-def test_damping_goes_away_again():
-    # Without that, the last steps would creep: with it, the errors of the last two steps square.
-    prior = Gaussian.from_variance(np.array([2.0]), 100.0)
-    estimate = tight(1e-12)(overshooting, prior, np.full(1, 0.5), 1e-4)
-    assert estimate.converged
-    assert estimate.iterations < 15
 
 
 def test_a_curved_valley_is_descended():

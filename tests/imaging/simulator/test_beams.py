@@ -8,17 +8,10 @@ from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.beams import BeamGrid, losses_of, render_window
 from mvest.imaging.simulator.scene import Echoes, cell_volume
 
-QUIET = replace(
-    Acquisition(),
-    azimuth_deg=36.0,
-    elevation_span_deg=36.0,
-    depth_mm=(30.0, 70.0),
-    compensation_db_per_cm_mhz=0.15,
-    blood_db=-200.0,
-    electronics_db=-200.0,
-    haze_db=-200.0,
-    beats=1,
-)
+QUIET = Acquisition(
+    azimuth_deg=36.0, elevation_span_deg=36.0, depth_mm=(30.0, 70.0), beats=1,
+    compensation_db_per_cm_mhz=0.15, blood_db=-200.0, electronics_db=-200.0, haze_db=-200.0,
+)  # fmt: skip
 FLAT = np.zeros((3, 3))
 
 
@@ -34,12 +27,13 @@ def echoes(points, amplitude=1.0, loss=0.0):
     return Echoes(np.asarray(points, float), np.full(n, amplitude), np.full(n, loss))
 
 
-def block(seed=0, per_cell=12.0, side=22.0):
-    """Homogeneous tissue around 50 mm, of mean power 1."""
-    density = per_cell / cell_volume(QUIET, 50.0)
-    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (int(density * side**3), 3)) * side
+def block(seed=0, count=None, side=(22.0, 22.0, 22.0)):
+    """Homogeneous tissue around 50 mm, of mean power 1; by default 12 scatterers per cell."""
+    side = np.array(side)
+    count = count or int(12.0 / cell_volume(QUIET, 50.0) * side.prod())
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3)) * side
     points[:, 2] += 50.0
-    return echoes(points, 1 / math.sqrt(density))
+    return echoes(points, math.sqrt(side.prod() / count))
 
 
 def samples(grid):
@@ -65,10 +59,7 @@ def test_tissue_of_0_db_has_mean_power_1_at_any_depth_and_angle():
     # A wrong size of the resolution cell would show as a trend; without the Jacobian of the angles,
     # corners would be 20 % off.
     wide = replace(QUIET, azimuth_deg=80.0, elevation_span_deg=70.0)
-    count, side = 400_000, np.array([120.0, 100.0, 44.0])
-    points = np.random.default_rng(3).uniform(-0.5, 0.5, (count, 3)) * side
-    points[:, 2] += 50.0
-    grid, envelope = render(wide, echoes(points, math.sqrt(side.prod() / count)))
+    grid, envelope = render(wide, block(3, 400_000, (120.0, 100.0, 44.0)))
     power = envelope.astype(float) ** 2
     a, e, d = samples(grid)
     a, e = np.abs(np.rad2deg(a)), np.abs(np.rad2deg(e))
