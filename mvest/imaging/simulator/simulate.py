@@ -17,13 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition, Probe
-from mvest.imaging.simulator.beams import BeamGrid, losses_of, render_window
+from mvest.imaging.simulator.beams import BeamGrid, Float32Array, losses_of, render_window
 from mvest.imaging.simulator.scene import make_scene, scene_echoes
 from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
-
-Float32Array = NDArray[np.float32]
 
 
 def compress(envelope: Float32Array, acquisition: Acquisition) -> Float32Array:
