@@ -123,7 +123,7 @@ class SampledErrors:
         UH, count = U.T @ H, self.samples.shape[1]
 
         def gain(used: BoolArray) -> tuple[FloatArray, FloatArray]:
-            """Gain ``(p, n)`` by some samples, and the factor M P P⁻¹ = M on an error of the prior.
+            """Gain ``(p, n)`` by some samples, and the factor M on an error of the prior.
 
             For whitened observations with noise I + U B Uᵀ, U orthonormal, the gain is M P Hᵀ R⁻¹
             with M = (I + P (Hᵀ R⁻¹ H + S))⁻¹ and R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ.
