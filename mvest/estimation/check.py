@@ -1,4 +1,4 @@
-"""Is a posterior what a filter took it for? Its Gaussian against runs of the model themselves."""
+"""Is a posterior the Gaussian that a filter assumes? A check against runs of the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,18 +20,17 @@ STEP_LIMIT = 0.5
 """Standard deviations by which one more update may move an estimate."""
 
 TIMES_LIMIT = 2.0
-"""How many times too far from the estimate, or too near, a place may be in the posterior, where it
-is not beyond `BEYOND` both there and by the model."""
+"""How many times too far or too near a point may be in the posterior, if it is within `BEYOND` by
+the posterior or by the model."""
 
 BEYOND = 6.0
-"""Standard deviations further than which a place is out of the question."""
+"""Standard deviations beyond which a point is out of the question."""
 
 NEAREST, FURTHEST = 0.2, 10.0
-"""Standard deviations between which a run tells of the curvature: rounding hides it nearer by, and
-further away it is that of another place."""
+"""Standard deviations between which a run measures the curvature at the estimate."""
 
 LEVEL = 0.95
-"""Probability of the region in which a posterior is to be a Gaussian."""
+"""Probability of the region in which a posterior must be Gaussian."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,18 +44,18 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class ApproximationCheck:
-    """One statement of a filter about its own posterior, against what it should be.
+    """One property of a filter's posterior, with its limit.
 
     Attributes
     ----------
     compared : str
-        What was compared with what.
+        What was compared.
     value : float
-        How far they differ; infinite where that could not even be told.
+        The difference; infinite where it could not be computed.
     limit : float
-        Largest value at which the estimate's interval means what it says.
+        Largest value at which the estimate's interval is valid.
     runs : int
-        Runs of the model that it rests on.
+        Runs of the model that were compared.
     """
 
     compared: str
@@ -106,34 +105,24 @@ def check_against_runs(
     have ``τ = √(2 (J(zₖ) − J(z))) = δ``, the profile of Bates and Watts (Nonlinear Regression
     Analysis and Its Applications, 1988, section 6.1). Two comparisons are made at every run:
 
-    * τ with δ, wherever either says that the point is probable, and roughly where either says that
-      it is not out of the question. A place that is as likely as the estimate, but lies far beyond
-      its intervals, is seen so.
+    * τ with δ, wherever the point is probable by either, and roughly where it is within `BEYOND` by
+      either. This finds a point that is as likely as the estimate but far beyond its intervals.
     * The residual of linearisation q = W (h(zₖ) − h(z) − H (zₖ − z)), which grows with δ², brought
       to one standard deviation: q/δ² (their curvature, section 7.1). With e = W (y − h(z)),
       a = W H (zₖ − z)/δ and x = L⁻¹ (zₖ − z)/δ for a prior covariance L Lᵀ, J differs at a distance
-      of ± 1 from its Gaussian by ``½ (|a|² + |x|² − 1) − (q/δ²)·(e ∓ a) + ½ |q/δ²|²``, where what
-      is in brackets is 0 unless P counts second derivatives. A run with derivatives tells
-      ½ W (Hₖ − H) C u/δ of other directions u as well.
+      of ± 1 from its Gaussian by ``½ (|a|² + |x|² − 1) − (q/δ²)·(e ∓ a) + ½ |q/δ²|²``, where the
+      brackets are 0 unless P includes second derivatives. A run with derivatives gives
+      ½ W (Hₖ − H) C u/δ for other directions u as well.
 
     Further, with H and e an update of the prior should lead to N(z, P) itself.
 
-    Parameters
-    ----------
-    y : (n,)
-    noise : ObservationNoise
-    prior, posterior : Gaussian
-        In filter coordinates.
-    predicted : (n,)
-        At the posterior's mean.
-    H : (n, p)
-        Derivative, or slope, of the prediction there.
-    runs : sequence of Run
+    ``prior`` and ``posterior`` are in filter coordinates. ``predicted (n,)`` and its derivative or
+    slope ``H (n, p)`` are those at the posterior's mean.
     """
     z, C = posterior.mean, posterior.factor
     e = noise.whiten(y - predicted)
     WH = noise.whiten(H)
-    # By how much the Hessian of the linearised J is more than that of the Gaussian.
+    # The Hessian of the linearised J less that of the Gaussian.
     WC = WH @ C
     X = np.linalg.lstsq(prior.factor, C, rcond=None)[0]
     counted = WC.T @ WC + X.T @ X - np.linalg.lstsq(C, C, rcond=None)[0]
@@ -195,14 +184,14 @@ def check_against_runs(
 def _change_of_distance(q: FloatArray, e: FloatArray, a: FloatArray, more: float) -> float:
     """Error of the distance 1 in the direction a (n,), to either side, by the curvature q (n,).
 
-    ``more`` is by how much the linearised J is above its Gaussian there.
+    ``more`` is the linearised J less its Gaussian there.
     """
     changes = [more + 0.5 * float(q @ q) - float(q @ (e - sign * a)) for sign in (1.0, -1.0)]
     return max(abs(_signed_root(1.0 + 2.0 * change) - 1.0) for change in changes)
 
 
 def _coordinates(factor: FloatArray, offset: FloatArray) -> tuple[FloatArray, bool]:
-    """C⁻¹ d (p,), and whether part of d lies where the Gaussian holds everything fixed."""
+    """C⁻¹ d (p,), and whether part of d is in a direction of zero variance."""
     u = np.asarray(np.linalg.lstsq(factor, offset, rcond=None)[0], dtype=np.float64)
     left = np.linalg.norm(factor @ u - offset)
     return u, bool(left > 1e-6 * np.linalg.norm(offset))

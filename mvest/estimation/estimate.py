@@ -1,4 +1,4 @@
-"""What a filter returns: the estimate, how it came about, and why the filter stopped."""
+"""What a filter returns: the estimate, its history, and why the filter stopped."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from mvest.estimation.update import Update
 from mvest.typing import FloatArray
 
 NOT_THE_POSTERIOR = ", but the posterior is not what the filter assumes"
-"""In the reason of a filter whose check fails, before the check's sentence."""
+"""Stands before the sentence of a check that fails."""
 
 OnIterate: TypeAlias = Callable[[int, FloatArray, float], None]
 """Called after each iterate with its number, the parameters (p,) and the objective."""
@@ -43,14 +43,14 @@ class Reason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class InnovationSummary:
-    """The innovation of the prior and how well its covariance S explains it.
+    """The innovation of the prior, and how well its covariance S explains it.
 
-    It is what the prior leaves unexplained, e = y − h(z) + H (z − m), linearised at the estimate z:
-    with a linear model y less what the prior's mean m predicts. What the estimate leaves is the
-    residual y − h(z), and smaller (`residual_rms`).
+    The innovation e = y − h(z) + H (z − m) is linearised at the estimate z. For a linear model it
+    is y less the prediction at the prior's mean m. The residual y − h(z) of the estimate is
+    smaller.
 
-    The paper's filter sees the same y again in each round, so that there y is not independent of
-    the state it is compared with, and its `nis` is smaller than a chi-square number.
+    The paper's filter sees the same y in each round. There y depends on the state it is compared
+    with, and `nis` is smaller than a chi-square number.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class InnovationSummary:
     nis_band : (float, float)
         Band that holds such a number with 95 % probability.
     residual_rms : float, in units of the observation
-        Root mean square of the residual y − h(z), of the estimate itself.
+        Root mean square of the residual.
     """
 
     size: int
@@ -77,7 +77,7 @@ class InnovationSummary:
     def of(
         cls, innovation: FloatArray, update: Update, residual: FloatArray
     ) -> "InnovationSummary":
-        """Summarise the innovation of one update, and the residual of what came of it."""
+        """Summarise the innovation of one update, and the residual after it."""
         return cls(
             size=innovation.size,
             rms=float(np.sqrt(np.mean(innovation**2))),
@@ -92,7 +92,7 @@ class InnovationSummary:
 class Estimate:
     """Estimate of p parameters after k iterates, the start included; the last is the estimate.
 
-    "Filter coordinates" are z = T(m) of the transform. Covariances are carried over to first order.
+    Filter coordinates are z = T(m) of the transform. Covariances are transformed to first order.
 
     Attributes
     ----------
@@ -103,37 +103,35 @@ class Estimate:
     transformed_iterates : (k, p), filter coordinates
     transformed_iterate_covariances : (k, p, p), filter coordinates
         Paper's filter: covariance after round k, row 0 the prior's. Iterated filter: covariance of
-        the posterior linearised at iterate k. Filters of points and ensembles: as in each filter's
-        own words.
+        the posterior linearised at iterate k. Others: see each filter.
     objective : (k,)
-        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). All others: the same plus the prior's term; filters
-        that do not run the model at an iterate but around it put the mean of these predictions in
-        the place of h there. NaN in the last row if the model failed there.
+        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Others: the same plus the prior's term; filters that
+        run the model around an iterate take the mean of these predictions for h. NaN in the last
+        row if the model failed there.
     log_likelihood : (k,)
         log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`, and where a filter
         does not compute it.
     prediction : Prediction or None
-        Observation predicted at the estimate itself and its Jacobian with respect to the
-        parameters; None if the model failed there. Of a model without derivatives the Jacobian is
-        the slope that the filter found with its points.
+        At the estimate; None if the model failed there. Without derivatives of the model its
+        Jacobian is the slope between the filter's points.
     innovation : InnovationSummary or None
-        Innovation at the last iterate; None if the model failed there.
+        At the last iterate; None if the model failed there.
     standardised : (n,) or None
         S^(-1/2) e of the same, to be tested for whiteness.
     reason : Reason
     detail : str
-        Numbers to the reason, or the failed model's own words.
+        Numbers to the reason, or the failed model's reason.
     forward_solves : int
-        How often the model was run, failed runs included.
+        Runs of the model, failed ones included.
     transformed_samples : (s, p), filter coordinates, or None
-        Draws from the posterior, of a filter that makes them; intervals are then their quantiles.
+        Draws from the posterior, if the filter makes them; intervals are then their quantiles.
     learned : LearnedNoise or None
-        What was learned of the noise, if it was not given.
+        The noise, if it was learned.
     check : ApproximationCheck or None
-        Whether the posterior is what the filter took it for; None where nothing was compared.
+        Whether the posterior is as the filter assumes; None where nothing was compared.
     curvature : (p, p), filter coordinates, or None
         Second derivatives of the objective that its linearisation leaves out,
-        ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, where the filter has found them.
+        ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, if the filter found them.
     """
 
     names: tuple[str, ...]
@@ -158,13 +156,7 @@ class Estimate:
         return self.summary()
 
     def summary(self, units: Sequence[str] = ()) -> str:
-        """The estimate in a few lines: each parameter ± one standard deviation, and how it ended.
-
-        Parameters
-        ----------
-        units : sequence of str, (p,), optional
-            Of the parameters; an empty one for what has none.
-        """
+        """Each parameter ± one standard deviation and its unit, and why the filter stopped."""
         width = max(map(len, self.names))
         rows = [
             f"{name:<{width}}  {mean:.4g} ± {std:.2g} {unit}".rstrip()
@@ -178,17 +170,17 @@ class Estimate:
 
     @property
     def converged(self) -> bool:
-        """Whether the filter stopped because it had converged; this is about iterations only."""
+        """Whether the iterations converged."""
         return self.reason.converged
 
     @property
     def trusted(self) -> bool:
-        """Whether the filter converged, and no check of its posterior fails."""
+        """Whether the filter converged and no check of its posterior fails."""
         return self.converged and (self.check is None or self.check.holds)
 
     @property
     def why(self) -> str:
-        """Why the filter stopped, and what is wrong with its posterior if anything is."""
+        """Why the filter stopped, and which check of its posterior fails."""
         if self.check is None or self.check.holds:
             return self.reason.value
         return f"{self.reason.value}{NOT_THE_POSTERIOR}: {self.check.sentence}"
@@ -237,9 +229,8 @@ class Estimate:
     def interval(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
         """Lower and upper ends (p,) of each parameter's central credible interval.
 
-        The interval is symmetric in filter coordinates, so that of a positive parameter that is
-        estimated by its logarithm stays positive. With `transformed_samples` its ends are their
-        quantiles, and the interval is as skew as the posterior.
+        The interval is symmetric in filter coordinates: that of a parameter estimated by its
+        logarithm stays positive. With `transformed_samples` its ends are their quantiles.
         """
         if not 0.0 < level < 1.0:
             raise InputError(f"an interval's level must lie between 0 and 1; got {level:g}")

@@ -1,4 +1,4 @@
-"""Learning the noise together with the parameters, from one linearisation of a model.
+"""Learns the noise together with the parameters, from one linearisation of a model.
 
 With the innovation e = y − h(z) + H (z − m) of the prior N(m, P), linearised at z, and the noise
 R(θ) of quantities θ (see `mvest.estimation.noise`)::
@@ -6,12 +6,12 @@ R(θ) of quantities θ (see `mvest.estimation.noise`)::
     log p(e | θ) = log N(e; 0, S),   S = R(θ) + H P Hᵀ + C Cᵀ
 
 is the evidence of θ (MacKay 1992, Neural Comput. 4:415), maximised together with the prior of
-log θ. Everything is projected once on the basis of the smooth part and on what is across it, of
-which the triangular factor is kept: of n observations there remain a few hundred rows that are
-independent whatever θ is, so that an evaluation with derivatives costs p² times these.
+log θ. All columns are projected once on the basis of the smooth part and across it, where only
+their triangular factor is needed. A few hundred rows remain of n observations. They are independent
+for every θ, so that an evaluation with derivatives costs p² times their number.
 
-What is not known of θ widens the covariance of z (Kass and Steffey 1989, J. Am. Stat. Assoc.
-84:717), with the covariance of log θ from the second derivatives (Laplace) and the mean over it::
+The uncertainty of θ widens the covariance of z (Kass and Steffey 1989, J. Am. Stat. Assoc. 84:717),
+with the covariance of log θ from the second derivatives (Laplace) and the mean over it::
 
     P⁺ = E P⁺(θ) + (dz/dθ) cov(θ) (dz/dθ)ᵀ
 """
@@ -43,15 +43,15 @@ RANGE = 1.5
 """Of these distances, in lengths of the reference correlation."""
 
 SMOOTH, LENGTH = "smooth part", "length of the smooth part"
-"""What the bands amount to."""
+"""Names of the two quantities that summarise the bands."""
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedQuantity:
-    """One quantity of the noise, as it was believed and as it was learned.
+    """Prior and posterior of one quantity of the noise.
 
-    It is a factor, as of a frame or of added columns, or has the unit of the observation (a length
-    that of the points).
+    It is a factor (of a frame, of added columns) or has the unit of the observation (a length: of
+    the points).
     """
 
     name: str
@@ -61,7 +61,7 @@ class LearnedQuantity:
 
     @property
     def stretch(self) -> float:
-        """By how many standard deviations of what was believed it was moved; 0 if it is held."""
+        """Change of the median in standard deviations of the prior; 0 if the quantity is held."""
         if self.believed.factor == 1.0:
             return 0.0
         return float(np.log(self.learned.median / self.believed.median) / self.believed.log_std)
@@ -73,21 +73,18 @@ class LearnedNoise:
 
     Attributes
     ----------
-    names : tuple of str, (h,)
-    prior, posterior : Gaussian
+    posterior : Gaussian
         Of the logarithms of the family's quantities.
     quantities : tuple of LearnedQuantity
-        In a reader's terms: standard deviation and length of the smooth part (the length at which
-        its correlation is that of a Matérn one at its own), and all others; the resolution is part
-        of what is rough.
+        For a reader: standard deviation and length of the smooth part (the length at which its
+        correlation is that of a Matérn one at its own), and all others; the rough part includes the
+        resolution.
     noise : ObservationNoise
         At the mean, added columns included.
     covariance : (p, p) in filter coordinates
-        What the doubt of θ adds to the covariance of the estimate.
+        What the uncertainty of θ adds to the covariance of the estimate.
     """
 
-    names: tuple[str, ...]
-    prior: Gaussian
     posterior: Gaussian
     quantities: tuple[LearnedQuantity, ...]
     noise: ObservationNoise
@@ -106,23 +103,15 @@ class Posterior:
 class Evidence:
     """log p(e | θ) as a function, after everything is projected.
 
-    Coordinates u are those in which the prior of log θ is N(0, I): log θ = mean + L u.
-
-    Parameters
-    ----------
-    family : NoiseFamily
-    innovation : (n,)
-        e.
-    B : (n, p)
-        H L, with the prior's covariance P = L Lᵀ.
+    It is made of the innovation e (n,) and of B = H L (n, p), with the prior's covariance P = L Lᵀ.
+    Coordinates u are those in which the prior of log θ is N(0, I): log θ = mean + root u.
 
     Attributes
     ----------
     family : NoiseFamily
     prior : Gaussian
+        Of log θ.
     root : (h, h)
-        L.
-    variances : VarianceRows
     rows : (r, 1 + p + q)
         Innovation, columns of the parameters, and added columns.
     kind : (r,)
@@ -137,7 +126,7 @@ class Evidence:
 
     def __init__(self, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> None:
         self.family, self.prior = family, family.prior
-        self.root, self.variances = self.prior.factor, family.rows
+        self.root = self.prior.factor
         columns = [own.columns for own in family.columns]
         data = np.concatenate([innovation[:, None], B, *columns], axis=1)
         ends = np.cumsum([B.shape[1], *(own.shape[1] for own in columns)]).tolist()
@@ -145,10 +134,10 @@ class Evidence:
         self.added = list(zip(quantities, map(slice, ends, ends[1:]), strict=True))
         width = data.shape[1]
         rows, kind = [], []
-        self.count = np.zeros(sum(self.variances.sizes))
+        self.count = np.zeros(len(family.terms.weight))
         self.log_scale, at, first = 0.0, 0, 0
-        for block, size in zip(family.blocks, self.variances.sizes, strict=True):
-            k, copies, m = len(block.scale), block.coordinates, size - 1
+        for block in family.blocks:
+            k, copies, m = len(block.scale), block.coordinates, block.variance_count - 1
             part = data[at : at + block.size].reshape(k, -1) / block.scale[:, None]
             at += block.size
             self.log_scale += 2.0 * copies * float(np.sum(np.log(block.scale)))
@@ -163,7 +152,7 @@ class Evidence:
                 rows.append(triangle)
                 kind.append(np.full(len(triangle), first + m))
                 self.count[first + m] = (k - m) * copies
-            first += size
+            first += m + 1
         self.rows, self.kind = np.concatenate(rows), np.concatenate(kind)
 
     def log(self, u: FloatArray) -> FloatArray:
@@ -171,9 +160,9 @@ class Evidence:
         return np.asarray(self.prior.mean + self.root @ u)
 
     def posterior(self, start: FloatArray | None = None) -> Posterior:
-        """What is known of u, near normal about its mean.
+        """Approximate posterior of u.
 
-        Of a variance that few observations tell the most probable value is too small. The mean is
+        The most probable value of a variance is too small if few observations tell it. The mean is
         to first order ``u − ½ H⁻¹ d(log det H)/du`` with the second derivatives H (Tierney and
         Kadane 1986, J. Am. Stat. Assoc. 81:82); with the columns s of a root of H⁻¹ and the slope g
         of the objective that is ``u − ½ H⁻¹ Σ (g(u + s) − 2 g(u) + g(u − s))``.
@@ -192,7 +181,7 @@ class Evidence:
             step = DIFFERENCE * np.eye(h)[k]
             hessian[k] = self.objective(u + step)[1] - self.objective(u - step)[1]
         values, V = np.linalg.eigh((hessian + hessian.T) / (4.0 * DIFFERENCE))
-        # Data do not make less known what was known before.
+        # Data make nothing less certain than before.
         values = np.maximum(values, 1.0)
         spread = V / np.sqrt(values)
         slope = self.objective(u)[1]
@@ -208,19 +197,16 @@ class Evidence:
         value, slope = self.misfit(self.log(u))
         return value + 0.5 * float(u @ u), self.root.T @ slope + u
 
-    def log_likelihood(self, log: FloatArray) -> float:
-        """Logarithm of p(e | θ) at the logarithms ``(h,)`` of θ."""
-        return -self.misfit(log)[0] - 0.5 * self.family.size * float(np.log(2.0 * np.pi))
-
     def misfit(self, log: FloatArray) -> tuple[float, FloatArray]:
-        """−log p(e | θ) without its constant, and its derivatives by log θ.
+        """−log p(e | θ) − ½ n log 2π, and its derivatives by log θ.
 
         With V the diagonal R, B all columns and M = I + Bᵀ V⁻¹ B::
 
             log det S = log det V + log det M,   S⁻¹ = V⁻¹ − V⁻¹ B M⁻¹ Bᵀ V⁻¹
             d/dθ (½ log det S + ½ eᵀ S⁻¹ e) = ½ tr(S⁻¹ dS/dθ) − ½ eᵀ S⁻¹ dS/dθ S⁻¹ e
         """
-        v, smooth, rough = self.variances.variances(log)
+        v, smooth, rough = self.family.variances(log)
+        of = self.family.terms
         e, B, root, mean = self._solved(log, v)
         residual = e - B @ mean
         half = _forward(root, B.T)
@@ -230,11 +216,11 @@ class Evidence:
         by_row = np.sum(half**2, axis=0) + residual**2
         by_std = self.count - np.bincount(self.kind, by_row, len(v))
         slope = np.zeros(len(log) + 1)
-        np.add.at(slope, self.variances.rough, by_std * rough)
-        # Without a frame's factor it is what is added to the end.
-        np.add.at(slope, self.variances.frame, by_std)
+        np.add.at(slope, of.rough, by_std * rough)
+        # Rows without a frame's factor have the index -1: they add to the entry that is dropped.
+        np.add.at(slope, of.frame, by_std)
         if self.family.bands is not None:
-            np.add.at(slope, self.variances.band, by_std * smooth)
+            np.add.at(slope, of.band, by_std * smooth)
         for k, members in self.added:
             # For unit variances Bᵀ S⁻¹ B = I − M⁻¹, and Bᵀ S⁻¹ e is the mean.
             inverse = _forward(root, np.eye(len(mean))[:, members])
@@ -244,7 +230,7 @@ class Evidence:
 
     def update(self, log: FloatArray, p: int) -> tuple[FloatArray, FloatArray]:
         """Posterior mean ``(p,)`` and covariance of the first p unit quantities, for log θ."""
-        _, _, root, mean = self._solved(log, self.variances.variances(log)[0])
+        _, _, root, mean = self._solved(log, self.family.variances(log)[0])
         inverse = _forward(root, np.eye(len(mean))[:, :p])
         return mean[:p], inverse.T @ inverse
 
@@ -262,7 +248,7 @@ class Evidence:
         return e, B, root, scipy.linalg.cho_solve((root, True), B.T @ e, check_finite=False)
 
     def learned(self, posterior: Posterior, L: FloatArray) -> LearnedNoise:
-        """What is known of the noise, in a reader's terms; P = L Lᵀ is the prior's covariance."""
+        """The noise learned, for a prior covariance P = L Lᵀ of the parameters."""
         u, h, p = posterior.mean, self.prior.size, len(L)
         P = self.update(self.log(u), p)[1]
         more = np.zeros((p, p))
@@ -274,8 +260,6 @@ class Evidence:
         spread = self.root @ posterior.spread
         found = Gaussian(self.log(u), spread @ spread.T)
         return LearnedNoise(
-            self.family.names,
-            self.prior,
             found,
             _in_words(self.family, self.prior, found),
             self.family.at(found.mean),
@@ -290,9 +274,8 @@ def _forward(root: FloatArray, columns: FloatArray) -> FloatArray:
 def _in_words(
     family: NoiseFamily, prior: Gaussian, posterior: Gaussian
 ) -> tuple[LearnedQuantity, ...]:
-    """What the quantities of a family amount to."""
-    quantities = []
-    first = 0
+    """The quantities of a family for a reader."""
+    quantities, first = [], 0
     factors = {block.frame for block in family.blocks} | {c.name for c in family.columns}
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:

@@ -1,4 +1,4 @@
-"""Normal distributions of parameters, checked when they are made."""
+"""Normal distributions of parameters, checked on construction."""
 
 from dataclasses import dataclass
 
@@ -72,7 +72,7 @@ class Gaussian:
             root = np.linalg.cholesky(correlation)
         except np.linalg.LinAlgError:
             values, vectors = np.linalg.eigh(correlation)
-            # Negative values here are round-off: the constructor has refused all others.
+            # Negative values are round-off: the constructor refuses all others.
             root = vectors * np.sqrt(np.maximum(values, 0.0))
         return std[:, None] * root
 
@@ -87,13 +87,7 @@ def standard(prior: Gaussian, other: Gaussian) -> Gaussian:
 
 
 def as_covariance(variance: float | FloatArray, size: int, what: str) -> FloatArray:
-    """Checked (p, p) covariance from one variance, p variances or a full matrix.
-
-    Raises
-    ------
-    InputError
-        If the shape is none of these, or the result is no covariance.
-    """
+    """Covariance (p, p) from one variance, p variances or a full matrix; InputError if none."""
     values = np.asarray(variance, dtype=np.float64)
     if values.ndim == 0:
         values = np.full(size, values)

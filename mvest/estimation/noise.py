@@ -1,23 +1,23 @@
 """The noise of an observation: covariance R, used only through W with Wᵀ W = R⁻¹.
 
-R is known, or known up to a few quantities: a smooth part, a rough part, and further columns.
-Errors of neighbouring points are alike in part. Of a block of k points, each observed in several
-coordinates that are independent of each other::
+R is known, or known up to a few quantities. Errors of neighbouring points are correlated in part.
+For a block of k points, each observed in several independent coordinates::
 
     R = f² D (Σ s_b² U_b diag(w_b) U_bᵀ + τ² I + δ² I) D
 
-with U_b and w_b of the bands of `mvest.estimation.spectrum`. s_b is the standard deviation of the
-smooth part in one band, τ that of the rough part, δ a resolution below which nothing is believed, f
-the factor of a frame and D the scales of single points. The logarithms of the quantities have a
-normal prior; `mvest.estimation.evidence` learns them. Columns C, by which what is not known beside
-the observation changes it, add C Cᵀ.
+U_b and w_b belong to the bands of `mvest.estimation.spectrum`. s_b is the standard deviation of the
+smooth part in one band, τ that of the rough part, δ the resolution, the least standard deviation of
+a point, f the factor of a frame and D the scales of single points. The logarithms of the quantities
+have a normal prior; `mvest.estimation.evidence` learns them. Other unknown quantities, which change
+the observation by columns C, add C Cᵀ.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from functools import cached_property
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import scipy
@@ -29,7 +29,7 @@ from mvest.estimation.spectrum import BANDS, Basis, LogNormal, bands_of
 from mvest.typing import FloatArray, IntArray
 
 LARGEST = 300.0
-"""Logarithm of a standard deviation beyond which it is that: a search may try any."""
+"""Largest logarithm of a standard deviation; a search may try any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +53,7 @@ class ObservationNoise:
 
 
 def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
-    """Check a noise covariance and factorise it once.
-
-    Parameters
-    ----------
-    R : NoiseCovariance, in squared units of the observation
-    size : int
-        Number n of observations.
+    """Check the noise covariance of ``size`` observations and factorise it once.
 
     Raises
     ------
@@ -99,16 +93,10 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
 
 
 def kronecker_noise(variance: float, root: FloatArray, copies: int) -> ObservationNoise:
-    """Noise of points, each observed in several coordinates, R = variance · (L Lᵀ ⊗ I).
+    """Noise of points, R = variance · (L Lᵀ ⊗ I) with the lower triangular ``root (k, k)`` L.
 
-    Parameters
-    ----------
-    variance : float
-        In squared units of the observation.
-    root : (k, k)
-        Lower triangular L with a positive diagonal.
-    copies : int
-        Coordinates of each point; they are independent and follow one another in the observation.
+    Each point is observed in ``copies`` independent coordinates, which follow one another in the
+    observation.
     """
     k = len(root)
     scale = 1.0 / np.sqrt(variance)
@@ -123,7 +111,7 @@ def kronecker_noise(variance: float, root: FloatArray, copies: int) -> Observati
 
 
 def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
-    """Noise of observations one after another that are independent of each other."""
+    """Noise of several independent observations, one after another."""
     ends = np.cumsum([part.size for part in parts])
 
     def whiten(values: FloatArray) -> FloatArray:
@@ -136,14 +124,7 @@ def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
 
 
 def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
-    """Noise of which every observation is multiplied by a factor of its own, D R D.
-
-    Parameters
-    ----------
-    base : ObservationNoise
-        R of n observations.
-    scale : (n,)
-        The positive diagonal of D.
+    """Noise D R D with R of ``base`` and the positive diagonal ``scale (n,)`` of D.
 
     Raises
     ------
@@ -164,21 +145,15 @@ def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
 
 
 def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNoise:
-    """Noise with what q unknown quantities add to it, R + C Cᵀ.
+    """Noise R + C Cᵀ with R of ``base`` and C of ``columns (n, q)``, in units of the observation.
 
-    With W of ``base`` and the thin singular value decomposition W C = U diag(s) Vᵀ::
+    C has one column for each of q independent quantities of unit variance. With W of ``base`` and
+    the thin singular value decomposition W C = U diag(s) Vᵀ::
 
         W (R + C Cᵀ) Wᵀ = I + U diag(s²) Uᵀ
         log det (R + C Cᵀ) = log det R + Σ log(1 + s²)
 
     so that (I − U diag(1 − 1 / √(1 + s²)) Uᵀ) W whitens the sum.
-
-    Parameters
-    ----------
-    base : ObservationNoise
-        R of n observations.
-    columns : (n, q) in units of the observation
-        C, one column for each independent quantity of unit variance.
 
     Raises
     ------
@@ -228,8 +203,14 @@ class NoiseBlock:
         """Number of observations."""
         return len(self.scale) * self.coordinates
 
-    def noise(self, v: FloatArray, flat: float) -> ObservationNoise:
-        """Noise with the variances ``v (m,)`` along the basis and ``flat`` across it."""
+    @property
+    def variance_count(self) -> int:
+        """Number of different variances: those along the basis, and the one across it."""
+        return 1 if self.basis is None else 1 + len(self.basis.w)
+
+    def noise(self, variances: FloatArray) -> ObservationNoise:
+        """Noise with these ``variances``, that across the basis last."""
+        v, flat = variances[:-1], float(variances[-1])
         k, copies, scale = len(self.scale), self.coordinates, self.scale[:, None]
         log_determinant = (k - len(v)) * np.log(flat) + float(np.sum(np.log(v)))
         log_determinant += 2.0 * float(np.sum(np.log(self.scale)))
@@ -247,7 +228,7 @@ class NoiseBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorColumns:
-    """What q independent quantities that are not known add to the noise, s² C Cᵀ.
+    """Noise s² C Cᵀ of q independent unknown quantities.
 
     Attributes
     ----------
@@ -264,7 +245,24 @@ class ErrorColumns:
     factor: float = 1.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class VarianceTerms(NamedTuple):
+    """Terms of the variances f² (s_b² w + τ² + δ²) along and across the bases of all blocks.
+
+    Attributes
+    ----------
+    weight : (r,)
+        w; of each block those of its basis, then that across it.
+    band, rough, frame : (r,)
+        Which of the quantities are s_b, τ and f; no f where it is -1.
+    """
+
+    weight: FloatArray
+    band: IntArray
+    rough: IntArray
+    frame: IntArray
+
+
+@dataclass(frozen=True, eq=False)
 class NoiseFamily:
     """Noise of n observations as a function of a few positive quantities.
 
@@ -275,9 +273,9 @@ class NoiseFamily:
     blocks : tuple of NoiseBlock
         One after another in the observation.
     quantities : mapping of str to LogNormal
-        What is believed of the rough parts and the factors of frames.
+        Prior of the rough parts and of the factors of frames.
     bands : Gaussian or None
-        What is believed of the logarithms of s_b ``(BANDS,)``; needed if there is a smooth part.
+        Prior of the logarithms of s_b ``(BANDS,)``; needed if there is a smooth part.
     resolution : float
         δ.
     columns : tuple of ErrorColumns
@@ -299,7 +297,7 @@ class NoiseFamily:
                 f"for {', '.join(sorted(self.quantities)) or 'none'}"
             )
         if self.bands is None and any(block.basis is not None for block in self.blocks):
-            raise InputError("a smooth part, of which nothing is believed; expected its bands")
+            raise InputError("a smooth part has no prior; expected its bands")
         if len(set(self.names)) != len(self.names):
             raise InputError(f"noise of {', '.join(self.names)}: expected different names")
 
@@ -316,11 +314,9 @@ class NoiseFamily:
 
     @property
     def prior(self) -> Gaussian:
-        """What is believed of their logarithms."""
-        others = [
-            *self.quantities.values(),
-            *(LogNormal(1.0, columns.factor) for columns in self.columns),
-        ]
+        """Prior of the logarithms of the quantities."""
+        factors = (LogNormal(1.0, columns.factor) for columns in self.columns)
+        others = [*self.quantities.values(), *factors]
         mean = np.log([belief.median for belief in others])
         covariance = np.diag([belief.log_std**2 for belief in others])
         if self.bands is None:
@@ -359,14 +355,11 @@ class NoiseFamily:
             raise InputError(f"mean of {beats} beats, expected >= 1")
         if np.isinf(beats) and not self.resolution > 0.0:
             raise InputError("the mean of any number of beats has no noise without a resolution")
-        of = self.rows
-        parts, start = [], 0
-        v = of.variances(log, beats)[0]
-        for block, count in zip(self.blocks, of.sizes, strict=True):
-            own = v[start : start + count]
-            parts.append(block.noise(own[: count - 1], float(own[-1])))
-            start += count
-        noise = stacked_noise(parts)
+        ends = np.cumsum([block.variance_count for block in self.blocks])
+        variances = np.split(self.variances(log, beats)[0], ends[:-1])
+        noise = stacked_noise(
+            [block.noise(own) for block, own in zip(self.blocks, variances, strict=True)]
+        )
         for k, columns in enumerate(self.columns, start=len(self.names) - len(self.columns)):
             noise = low_rank_noise(noise, np.exp(log[k]) * columns.columns)
         return noise
@@ -375,9 +368,9 @@ class NoiseFamily:
         """The noise at the medians."""
         return self.at(self.prior.mean)
 
-    @property
-    def rows(self) -> VarianceRows:
-        """Variances of all blocks along their bases and across them, as a function."""
+    @cached_property
+    def terms(self) -> VarianceTerms:
+        """Terms of the variances of all blocks."""
         each = []
         for block in self.blocks:
             w, band = np.zeros(1), np.zeros(1, dtype=np.int64)
@@ -388,33 +381,7 @@ class NoiseFamily:
             rough = self.names.index(block.rough)
             frame = -1 if block.frame is None else self.names.index(block.frame)
             each.append((w, band, np.full(len(w), rough), np.full(len(w), frame)))
-        weight, band, roughs, frames = (np.concatenate(own) for own in zip(*each, strict=True))
-        sizes = tuple(len(w) for w, *_ in each)
-        return VarianceRows(weight, band, roughs, frames, sizes, self.resolution**2)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VarianceRows:
-    """Variances along and across the bases of all blocks, f² (s_b² w + τ² + δ²).
-
-    Attributes
-    ----------
-    weight : (r,)
-        w; of each block those of its basis, then that across it.
-    band, rough, frame : (r,)
-        Which of the quantities are s_b, τ and f; no f where it is -1.
-    sizes : tuple of int
-        Rows of each block.
-    resolution : float
-        δ².
-    """
-
-    weight: FloatArray
-    band: IntArray
-    rough: IntArray
-    frame: IntArray
-    sizes: tuple[int, ...]
-    resolution: float
+        return VarianceTerms(*(np.concatenate(own) for own in zip(*each, strict=True)))
 
     def variances(
         self, log: FloatArray, beats: float = 1.0
@@ -423,13 +390,13 @@ class VarianceRows:
 
         See `NoiseFamily.at` for the arguments.
         """
-        log = np.clip(log, -LARGEST, LARGEST)
-        smooth = np.where(self.weight > 0.0, np.exp(2.0 * log[self.band]) * self.weight, 0.0)
-        smooth, rough = smooth / beats, np.exp(2.0 * log[self.rough]) / beats
-        within = smooth + rough + self.resolution
-        f = np.where(self.frame >= 0, np.exp(2.0 * log[self.frame]), 1.0)
+        of, log = self.terms, np.clip(log, -LARGEST, LARGEST)
+        smooth = np.where(of.weight > 0.0, np.exp(2.0 * log[of.band]) * of.weight, 0.0)
+        smooth, rough = smooth / beats, np.exp(2.0 * log[of.rough]) / beats
+        within = smooth + rough + self.resolution**2
+        f = np.where(of.frame >= 0, np.exp(2.0 * log[of.frame]), 1.0)
         return f * within, smooth / within, rough / within
 
 
 NoiseCovariance: TypeAlias = float | FloatArray | ObservationNoise | NoiseFamily
-"""R as one variance, n variances (n,), a covariance (n, n), factorised, or not quite known."""
+"""R as one variance, n variances (n,), a covariance (n, n), factorised, or to be learned."""

@@ -1,6 +1,6 @@
 """What a filter needs from a model: the observation it predicts, and its Jacobian.
 
-Beside it models that are made of others: of some of the parameters, with a memory.
+Some models wrap another one: a function of fewer parameters, a model with a cache.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,21 +22,20 @@ class Prediction:
     y : (n,) in units of the observation
         Predicted observation; empty where the model failed.
     jacobian : (n, p) in units of the observation per unit of each parameter
-        Derivative of `y`; empty where the model failed, and of shape (n, 0) where the model does
-        not differentiate (`Prediction.undifferentiated`).
+        Derivative of `y`; empty where the model failed, of shape (n, 0) where the model does not
+        differentiate (`Prediction.undifferentiated`).
     converged : bool
         False if the model found no answer. Filters then read nothing but `reason`.
     reason : str
-        Why the model stopped; must say something where it failed.
+        Why the model stopped; not empty where it failed.
     aux : object
-        Whatever else the model hands on to who asked for the estimate; filters carry it along
-        unread.
+        Anything else for the caller of the filter, which passes it on unread.
 
     Raises
     ------
     InputError
-        If a prediction that claims convergence has wrong shapes or values that are not finite, or
-        a failed one carries values that could be taken for a result, or gives no reason.
+        If a converged prediction has wrong shapes or values that are not finite, or a failed one
+        has values or no reason.
     """
 
     y: FloatArray
@@ -92,8 +91,7 @@ class ObservationModel(Protocol):
     """Any function from parameters (p,) to a prediction; this is all a filter knows of a model.
 
     The model must accept every finite m. Where m is inadmissible, or the computation does not
-    converge, it returns `Prediction.failed(reason)`: filters try steps that may leave the
-    admissible range and shorten them when a prediction has failed.
+    converge, it returns `Prediction.failed(reason)`: filters shorten a step that fails.
     """
 
     def __call__(self, m: FloatArray, /) -> Predicted:
@@ -104,14 +102,9 @@ class ObservationModel(Protocol):
 def predict(
     model: ObservationModel, m: FloatArray, n: int | None = None, *, derivatives: bool = False
 ) -> Prediction:
-    """Run a model; where it refuses m as no tissue can have it, the prediction has failed.
+    """Run a model at m (p,) and check its prediction, see `as_prediction`.
 
-    Parameters
-    ----------
-    model : ObservationModel
-    m : (p,)
-    n, derivatives
-        See `as_prediction`.
+    Where the model raises MaterialError the prediction has failed.
     """
     try:
         returned = model(np.array(m, dtype=np.float64))
@@ -123,22 +116,13 @@ def predict(
 def as_prediction(
     returned: Predicted, p: int, n: int | None = None, *, derivatives: bool = False
 ) -> Prediction:
-    """What a model of p parameters returned, checked; the one place where that is done.
-
-    Parameters
-    ----------
-    returned : Prediction or (y, jacobian)
-    p : int
-    n : int, optional
-        How many observations are expected; default any number.
-    derivatives : bool
-        Whether the Jacobian is needed.
+    """Check what a model of p parameters returned; n observations are expected, if n is given.
 
     Raises
     ------
     InputError
-        If the model breaks its contract: it returned something else, or other shapes than (n,) and
-        (n, p).
+        If that is no prediction, its shapes are not (n,) and (n, p), or ``derivatives`` are needed
+        and missing.
     """
     if isinstance(returned, Prediction):
         prediction = returned
@@ -168,18 +152,10 @@ def as_prediction(
 def of_some(
     model: ObservationModel, values: FloatArray, kept: IntArray, *, snap: float = 0.0
 ) -> Callable[[FloatArray], Prediction]:
-    """A model as a function of some of its parameters, the others held.
+    """A model as a function of its parameters ``kept (k,)``; the others stay at ``values (p,)``.
 
-    Parameters
-    ----------
-    model : ObservationModel
-    values : (p,)
-        Of all parameters.
-    kept : (k,)
-        Which are the function's.
-    snap : float
-        A parameter whose relative distance from its value in ``values`` is no larger is taken for
-        it, so that a run that is known is met to the last bit.
+    A parameter within the relative distance ``snap`` of its value is set to it, so that a cached
+    run is found again bit for bit.
     """
 
     def part(m: FloatArray) -> Prediction:
@@ -197,18 +173,13 @@ def of_some(
 class Remembered:
     """A model that runs once for each parameter vector.
 
-    Parameters
-    ----------
-    model : ObservationModel
-    runs : iterable of ((p,), Prediction)
-        What is known already.
-    rtol : float
-        Relative distance within which parameters are the same.
-
     Attributes
     ----------
+    model : ObservationModel
     runs : list of ((p,), Prediction)
-        What is known, failures included.
+        Runs so far, failed ones included.
+    rtol : float
+        Parameters within this relative distance are the same.
     """
 
     def __init__(
@@ -230,19 +201,12 @@ class Remembered:
 
 
 class SharedStart:
-    """A model for many estimations that all begin with one and the same prediction.
+    """A model for many estimations that all begin at the same parameters ``start (p,)``.
 
-    The prediction at the common start is computed once, and whenever it is asked for the model goes
-    on from there as if nothing else had been computed before. So an estimation gives the same
-    numbers, to the last bit, by itself and after any others.
-
-    Parameters
-    ----------
-    model : ObservationModel
-        ``model.closed`` is where its next prediction starts from, ``model.restart(closed)`` forgets
-        everything else. Nobody else may use it meanwhile.
-    start : (p,)
-        Parameters at which every estimation begins.
+    The prediction there is computed once. Each request for it also resets the model to its state
+    after that run, so that an estimation gives the same numbers, bit for bit, alone or after
+    others. ``model.closed`` is that state and ``model.restart(closed)`` resets the model; no other
+    code may use the model meanwhile.
     """
 
     def __init__(self, model: Any, start: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""One run of a filter: its problem in filter coordinates, its count of solves, its history."""
+"""One run of a filter: its problem in filter coordinates, its runs of the model, its iterates."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,10 +24,9 @@ from mvest.typing import FloatArray
 
 
 class FilterRun:
-    """The checked problem of a filter and what has happened so far.
+    """The checked problem of a filter, and its history so far.
 
-    Holds two invariants: every run of the model is counted, and none is repeated at the parameters
-    of the run before.
+    Every run of the model is counted, and none is repeated at the parameters of the run before.
 
     Attributes
     ----------
@@ -39,8 +38,8 @@ class FilterRun:
     prior : Gaussian
         Prior in filter coordinates.
     L : (p, p)
-        Root of its covariance: x with z = m + L x are coordinates in which the prior is N(0, I),
-        also where it holds a parameter fixed.
+        Root of its covariance. With z = m + L x the prior of x is N(0, I), also where the prior
+        holds a parameter fixed.
     unit : Gaussian
         N(0, I) of p parameters.
     y : (n,) in units of the observation
@@ -88,12 +87,7 @@ class FilterRun:
     def predict(self, z: FloatArray, *, derivatives: bool = True) -> Prediction:
         """Run the model at filter coordinates z (p,), unless it was just run there.
 
-        A filter that needs no ``derivatives`` also takes a model that has none.
-
-        Raises
-        ------
-        InputError
-            If the model breaks its contract: a prediction of other shapes than (n,), (n, p).
+        See `as_prediction` for the errors; a filter that needs no ``derivatives`` takes any model.
         """
         if self._last is not None and np.array_equal(self._last[0], z):
             return self._last[1]
@@ -120,8 +114,7 @@ class FilterRun:
     def negligible(self, change: FloatArray, z: FloatArray, P: FloatArray, limit: float) -> bool:
         """Whether a change of z moves no parameter by more than `limit`, relatively.
 
-        Relative to ``|m|``, or to the standard deviation of m where that is larger: a change far
-        below the standard deviation is none that matters, and m may be zero.
+        Relative to ``|m|``, or to the standard deviation of m where that is larger.
         """
         D = np.abs(self.transform.derivative(z))
         std = D * np.sqrt(np.diagonal(P))
@@ -148,16 +141,12 @@ class FilterRun:
     ) -> Estimate:
         """The estimate at the last recorded iterate, at which `prediction` was made.
 
-        Parameters
-        ----------
-        prior : Gaussian, optional
-            What was updated last, if that is not the prior of the problem.
-        **more
-            Further fields of the `Estimate`. Noise that was ``learned`` widens the covariance.
+        ``prior`` was updated last, if not that of the problem; ``more`` are further fields of the
+        `Estimate`. Noise that was ``learned`` widens the covariance.
         """
         summary = InnovationSummary.of(innovation, update, self.y - prediction.y)
         if "check" not in more:
-            # Of the posterior with the noise as it is; what widens it has no part in its form.
+            # The posterior for this noise is checked, before the noise's uncertainty widens it.
             more["check"] = self.check(prediction, prior=prior)
         if learned := more.get("learned"):
             z, P, *values = self._history[-1]
@@ -174,7 +163,7 @@ class FilterRun:
     ) -> ApproximationCheck | None:
         """The worst check of the last iterate's posterior, at whose mean `prediction` was made.
 
-        All runs of the model are compared with. ``others`` are what the filter itself has compared.
+        It is compared with all runs of the model. ``others`` are the filter's own checks.
         """
         z, P, *_ = self._history[-1]
         if not np.all(np.isfinite(P)) or not np.any(P):
@@ -204,17 +193,16 @@ class FilterRun:
 
         Parameters
         ----------
-        z : (p,)
-            Filter coordinates.
-        P : (p, p)
+        z, P : (p,), (p, p)
+            In filter coordinates.
         slope : (n, p)
-            dh/dz as the filter's points say. The model's own derivative is used where it has one.
+            dh/dz between the filter's points, used where the model has no derivative.
         reason, detail
+            See `Estimate`.
         samples : (s, p), optional
-            Draws from the posterior in filter coordinates. Their posterior may have any form, and
-            is checked by ``checks`` alone.
-        checks
-            What the filter itself has compared.
+            Draws from the posterior in filter coordinates; only ``checks`` then apply to it.
+        checks : sequence of ApproximationCheck
+            The filter's own.
         """
         prediction = self.predict(z, derivatives=False)
         if not prediction.converged:
@@ -236,7 +224,7 @@ class FilterRun:
         )
 
     def fail(self, z: FloatArray, P: FloatArray, prediction: Prediction) -> Estimate:
-        """The end of a run whose next iterate (z, P) has no prediction."""
+        """End a run whose next iterate (z, P) has no prediction."""
         self.record(z, P, np.nan, np.nan)
         detail = f"at {self.transform.inverse(z)}: {prediction.reason}"
         return self._estimate(Reason.MODEL_FAILED, detail, prediction=None, innovation=None)
@@ -261,9 +249,9 @@ class FilterRun:
 
 
 class Filter:
-    """What every filter is: settings that can be called on a model, a prior and observations.
+    """Settings of a filter, which can be called on a model, a prior and observations.
 
-    A filter is written as a function of its `FilterRun`, with which all of them begin.
+    A filter overrides `estimate`, a function of its `FilterRun`.
     """
 
     __slots__ = ()

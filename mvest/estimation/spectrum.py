@@ -1,18 +1,16 @@
-"""Smooth errors over points: bands of how finely they vary, and what is believed of each.
+"""Smooth errors over points in bands of their length of variation, and the prior of each band.
 
 U and w are eigenvectors and eigenvalues of a smooth correlation K over k points, in bands b of half
-a decade of w / k. Errors whose standard deviation is s_b in each band have the covariance
-``Σ s_b² U_b diag(w_b) U_bᵀ``: the kernel of the errors is not assumed. One of a few parameters,
-fitted to thousands of points, follows the finest detail, of which there is most, while parameters
-of a model depend on the coarse: fitted to fields of an exponential or a Gaussian kernel a Matérn
-kernel with a nugget gave intervals of 95 % that held 84 and 75 %; bands, each from what varies as
-finely, 92 to 95 %. Errors that anticorrelate at a distance are those without coarse bands.
+a decade of w / k. Errors whose standard deviation is s_b in each band have the covariance ``Σ s_b²
+U_b diag(w_b) U_bᵀ``, so that no kernel is assumed. A kernel of a few parameters, fitted to
+thousands of points, follows the finest detail, while the parameters of a model depend on the
+coarse: fitted to fields of an exponential or a Gaussian kernel, a Matérn kernel with a nugget gave
+95 % intervals that held 84 and 75 %; bands gave 92 to 95 %.
 
-K enters by its best part of low rank. Of m points that are spread evenly (the farthest from those
-chosen before, Gonzalez 1985, Theoret. Comput. Sci. 38:293) its columns give the approximation of
-Nyström (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 8.1); what
-it leaves is spread evenly over all directions across them. It costs k m² once, and k m for
-whitening a vector.
+K enters by an approximation of low rank. Its columns for m points that are spread evenly (Gonzalez
+1985, Theoret. Comput. Sci. 38:293) give that of Nyström (Rasmussen and Williams, Gaussian Processes
+for Machine Learning, 2006, section 8.1); the rest is spread evenly over all directions across them.
+It costs k m² once, and k m for whitening a vector.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ JITTER = 1e-9
 """Added to the correlation of the chosen points, above its rounding errors."""
 
 NEGLIGIBLE = 1e-9
-"""Part of the largest eigenvalue below which what is left of one belongs to the rough part."""
+"""Part of the largest eigenvalue below which an eigenvalue is left out."""
 
 BANDS = 14
 """Bands of a smooth part: half decades of w / k from 1 down; what is finer is in the last."""
@@ -57,13 +55,9 @@ def matern(distance: FloatArray, length: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """What is believed of a positive quantity.
+    """Log-normal distribution of a positive quantity.
 
-    Attributes
-    ----------
-    median : float
-    factor : float
-        One standard deviation of the logarithm, as a factor; 1 holds the quantity at its median.
+    ``factor`` is one standard deviation of the logarithm; 1 holds the quantity at its median.
     """
 
     median: float
@@ -156,17 +150,17 @@ def spread_points(points: FloatArray, count: int) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """What is believed of a smooth part, from a standard deviation and a length that are stated.
+    """Prior of a smooth part with a stated standard deviation and length.
 
     Attributes
     ----------
     std, length : LogNormal
-        As of a Matérn correlation.
+        Those of a Matérn correlation.
     deviation : float
-        Factor by which a band may deviate from it, one standard deviation; neighbours alike.
+        Factor by which a band may deviate from it, one standard deviation; neighbouring bands are
+        correlated.
     reference : float
-        Length of K, in parts of the stated one. Eigenvectors of a long one are nearly those of any
-        other; of a short one they mix what is coarse.
+        Length of K over the stated one. Eigenvectors of a short one mix coarse detail.
     """
 
     std: LogNormal
@@ -180,7 +174,7 @@ class Spectrum:
         return self.reference * self.length.median
 
     def prior(self, points: FloatArray) -> Gaussian:
-        """What is believed of the logarithms of s_b ``(BANDS,)``, over points ``(k, d)``."""
+        """Prior of the logarithms of s_b ``(BANDS,)``, over points ``(k, d)``."""
         some = points[spread_points(points, min(len(points), SPECTRUM_POINTS))]
         distance = cdist(some, some)
         w, U = np.linalg.eigh(matern(distance, self.reference_length))
@@ -191,7 +185,7 @@ class Spectrum:
 
         def log_std(length: float) -> FloatArray:
             share = np.bincount(band, np.sum(U * (matern(distance, length) @ U), axis=0), BANDS)
-            # Finer than these points tell, spectra of one smoothness are parallel.
+            # Beyond the resolution of these points, spectra of one smoothness are parallel.
             return np.interp(np.arange(BANDS), known, 0.5 * np.log(share[known] / whole[known]))
 
         median, step = self.length.median, 0.1

@@ -1,29 +1,17 @@
-"""Coordinates in which a filter works: the parameters themselves, or their logarithms."""
+"""Coordinates z in which a filter works: the parameters m themselves, or their logarithms.
+
+Each transform is a smooth increasing map of each parameter by itself. ``forward`` is z = T(m),
+``inverse`` is m of z (infinite where it overflows) and ``derivative`` is dm/dz; all are (p,).
+"""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
-from mvest.typing import FloatArray
-
-
-class Transform(Protocol):
-    """Smooth increasing map z = T(m) of each parameter by itself."""
-
-    def forward(self, m: FloatArray, /) -> FloatArray:
-        """Filter coordinates z (p,) of parameters m (p,); InputError outside the domain."""
-        ...
-
-    def inverse(self, z: FloatArray, /) -> FloatArray:
-        """Parameters m (p,) of filter coordinates z (p,); infinite where m overflows."""
-        ...
-
-    def derivative(self, z: FloatArray, /) -> FloatArray:
-        """dm/dz of each parameter, (p,)."""
-        ...
+from mvest.typing import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +64,7 @@ class Log:
         with np.errstate(over="ignore", under="ignore"):
             return np.exp(z, out=np.ones_like(z, dtype=np.float64), where=self._mask(z))
 
-    def _mask(self, m: FloatArray) -> "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]":
+    def _mask(self, m: FloatArray) -> BoolArray:
         if self.positive is None:
             return np.ones(m.shape, dtype=np.bool_)
         if len(self.positive) != m.size:
@@ -84,6 +72,9 @@ class Log:
                 f"Log(positive) names {len(self.positive)} parameters, but there are {m.size}"
             )
         return np.array(self.positive, dtype=np.bool_)
+
+
+Transform: TypeAlias = Identity | Log
 
 
 def to_filter(transform: Transform, physical: Gaussian) -> Gaussian:

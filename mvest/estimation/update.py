@@ -10,10 +10,9 @@ from mvest.estimation.noise import ObservationNoise
 from mvest.estimation.prediction import read_only
 from mvest.typing import FloatArray
 
-BLOCK_ROWS = 300
-"""Rows of a block of the whitened Jacobian: with 20 parameters it fits a second-level cache."""
-BLOCKS_AT_A_TIME = 30
-"""Blocks decomposed in one call, which copies them: so many stay in the cache as well."""
+BLOCK_ROWS, BLOCKS_AT_A_TIME = 300, 30
+"""Rows of a block of the whitened Jacobian, and blocks decomposed in one call, which copies them:
+with 20 parameters both fit the second-level cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,19 +64,17 @@ def kalman_update(
 
     at a cost of n p² and a memory of n p. U is not needed, so that s and V come from a triangular
     factor of A: that of W H times L. It is found block by block (Demmel, Grigori, Hoemmen and
-    Langou 2012, SIAM J. Sci. Comput. 34:A206). P⁺ is a product X Xᵀ, hence symmetric positive
-    semi-definite whatever the rounding, and Hᵀ R⁻¹ H, whose condition number is the square of
-    that of W H, is never formed. P may be singular.
+    Langou 2012, SIAM J. Sci. Comput. 34:A206). The product X Xᵀ is symmetric positive semi-definite
+    whatever the rounding, and Hᵀ R⁻¹ H, whose condition number is the square of that of W H, is
+    never formed. P may be singular.
 
     Parameters
     ----------
     prior : Gaussian
         N(m, P) of p parameters.
     innovation : (n,) in units of the observation
-        e = y − h(m).
     H : (n, p) in units of the observation per unit of parameter
     noise : ObservationNoise
-        R of the n observations.
 
     Raises
     ------
@@ -93,7 +90,7 @@ def kalman_update(
     m, L = prior.mean, prior.factor
     e = noise.whiten(innovation)
     WH = noise.whiten(H)
-    # All p right singular vectors are needed, also where fewer observations than parameters exist.
+    # All p right singular vectors are needed, also with fewer observations than parameters.
     _, values, Vt = np.linalg.svd(_triangular_factor(WH) @ L, full_matrices=True)
     s = np.zeros(p)
     s[: values.size] = values

@@ -1,4 +1,4 @@
-"""How leaflets are sampled in material coordinates: the same vertices in every frame and valve.
+"""Material coordinates of the leaflets' vertices, the same in every frame and valve.
 
 ``phi`` in degrees runs once around the valve, 0 and 180 on the lines between the leaflets, the
 first leaflet in between; ``s`` runs from the annulus (0) to the free edge (1). Vertex ``j * columns
@@ -25,8 +25,8 @@ class ValveLayout:
     Attributes
     ----------
     columns : int
-        Vertices around the valve, a multiple of 4, at least 8: so the lines between the leaflets
-        and the middles of both are columns.
+        Vertices around the valve, a multiple of 4, at least 8: the lines between the leaflets and
+        the middles of both are columns.
     rows : int
         Vertices from annulus to free edge, at least 3.
     """
@@ -94,18 +94,9 @@ class ValveLayout:
         return (row % self.rows) * self.columns + self.column(phi)
 
     def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        """The triangles that hold places, between whose corners phi and s are linear.
+        """Corners and weights ``(k, 3)`` of the triangles that hold points ``phi``, ``s (k,)``.
 
-        Parameters
-        ----------
-        phi : (k,) degrees
-        s : (k,)
-            From 0 to 1.
-
-        Returns
-        -------
-        corners : (k, 3)
-        weights : (k, 3)
+        phi (degrees) and s (0 to 1) are linear between the corners.
         """
         across, down = np.mod(phi, 360.0) / 360.0 * self.columns, s * (self.rows - 1)
         column = np.floor(across).astype(np.int64)

@@ -1,11 +1,9 @@
-"""Valves over time: as they are simulated, as the image step returns them, and their named points.
+"""Valves over time: simulated ones, detected ones, and their named points.
 
-A moving valve is what the TEE simulator images and what detectors learn from. All positions are mm
+A moving valve is imaged by the TEE simulator, and detectors learn from it. All its positions are mm
 in the valve's own axes: the annulus about the plane z = 0, z towards the atrium, y to the anterior
-side, x to the line between the leaflets at phi = 0.
-
-The image step returns one valve in every frame, with how sure it is. Named points of a valve in one
-frame are commissures, annulus, middles of the free edges and tips.
+side, x to the line between the leaflets at phi = 0. The image step returns one valve in every
+frame, with its confidence.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ class MovingValve:
     Attributes
     ----------
     name : str
-        Tells valves (not frames) apart when some are held out.
+        Identifies the valve (not a frame) when some are held out.
     layout : ValveLayout
     times : (T,) s
         Increasing.
@@ -48,9 +46,9 @@ class MovingValve:
         Papillary tips, the first that at phi = 0.
     thickness : (n,) mm
     chord_phi, chord_s : (c,)
-        Where chordae insert, degrees and 0 to 1.
+        Insertions of the chordae, degrees and 0 to 1.
     chord_tip : (c,)
-        From which tip.
+        Their tips.
     """
 
     name: str
@@ -70,11 +68,11 @@ class MovingValve:
 
 
 MIN_CONFIDENCE = 0.7
-"""Confidence from which on a frame shows a valve, wherever that is decided or drawn.
+"""Least confidence of a frame that shows a valve.
 
 A volume is accepted if its best frame reaches it; frames of a case are chosen among those that do.
-Set on simulated volumes of valves of their own: chamber walls alone reached 0.64, and of 25 valves
-that were detected rightly one stayed below 0.8.
+Set on separate simulated volumes: chamber walls alone reached 0.64, and one of 25 correctly
+detected valves stayed below 0.8.
 """
 
 
@@ -97,9 +95,9 @@ class ValveSequence:
     vertex_confidence : (T, n)
         0 (not seen) to 1.
     std_mm : (n,)
-        Standard deviation of each coordinate of each vertex; NaN where it was never measured.
+        Standard deviation of each coordinate of each vertex; NaN if it was never measured.
     correlation_length_mm : float
-        Over which errors of neighbouring vertices are alike along the leaflets.
+        Over which errors of neighbouring vertices are correlated along the leaflets.
     """
 
     layout: ValveLayout
@@ -149,21 +147,16 @@ TIPS: Final = ("tip_0", "tip_180")
 """Names of the papillary tips."""
 
 ANNULUS_LABELS: Final = "AnnulusLabelsMarkup"
-"""What SlicerHeart calls its list of labelled points."""
+"""SlicerHeart's name for its list of labelled points."""
 LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *TIPS)
 """Every name, in the order of `landmarks`: those on the leaflets, then the papillary tips."""
 
 
 def landmark_vertices(layout: ValveLayout) -> dict[str, int]:
-    """Vertex of every landmark that lies on the leaflets (all but the tips), in fixed order.
+    """Vertex of every landmark on the leaflets (all but the tips), in fixed order.
 
     ``commissure_0`` and ``commissure_180`` are where the lines between the leaflets meet the
-    annulus.
-
-    Raises
-    ------
-    InputError
-        The layout has no column at a multiple of 45 degrees.
+    annulus. InputError if the layout has no column at a multiple of 45 degrees.
     """
     return {name: layout.vertex(phi, row) for name, (phi, row) in _ON_LEAFLETS.items()}
 
@@ -171,16 +164,7 @@ def landmark_vertices(layout: ValveLayout) -> dict[str, int]:
 def landmarks(sequence: ValveSequence, frame: int) -> dict[str, FloatArray]:
     """Positions ``(3,)`` LPS mm of the landmarks named in `LANDMARKS`, in that order.
 
-    Parameters
-    ----------
-    sequence : ValveSequence
-    frame : int
-        From 0 on.
-
-    Raises
-    ------
-    InputError
-        There is no such frame, or the layout has no column at a multiple of 45 degrees.
+    InputError if there is no such frame, see also `landmark_vertices`.
     """
     if not 0 <= frame < len(sequence.times):
         raise InputError(f"landmarks: frame {frame}, expected 0 to {len(sequence.times) - 1}")
@@ -199,18 +183,9 @@ def slicerheart_labels(ring: FloatArray, end: int, down: FloatArray) -> dict[str
     middle (``ValveQuantificationLib/MeasurementPresetMitralValve.py`` there). From the atrium the
     antero-lateral commissure lies on the left of the anterior leaflet.
 
-    Parameters
-    ----------
-    ring
-        ``(k, 3)`` mm, the annulus, of which the points 0 to ``end`` bound the anterior leaflet.
-    end
-    down
-        ``(3,)`` from the atrium to the ventricle.
-
-    Raises
-    ------
-    GeometryError
-        The annulus is no loop round its middle.
+    The annulus is ``ring (k, 3)`` mm, whose points 0 to ``end`` bound the anterior leaflet, and
+    ``down (3,)`` leads from the atrium to the ventricle. GeometryError if it is no loop round its
+    middle.
     """
     middle = ring.mean(axis=0)
     anterior = _half_way(ring[: end + 1])

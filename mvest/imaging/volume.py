@@ -1,4 +1,4 @@
-"""A volume over time, as the image step wants it, whatever file it came from."""
+"""A volume over time, whatever file it came from."""
 
 from __future__ import annotations
 

@@ -37,6 +37,11 @@ class Linear:
     def plain(self, m):
         return Prediction.undifferentiated(self.H @ m)
 
+    def by(self, filter_, *, plain=False):
+        """The estimate of a filter, of the model with or without derivatives."""
+        model = self.plain if plain else self.differentiated
+        return filter_(model, self.prior, self.y, self.R)
+
 
 def square(m):
     """h(m) = m²."""

@@ -15,24 +15,36 @@ MODES = 0.8 * RNG.standard_normal((N, 40))
 """True errors of the innovation: many directions, more than samples."""
 
 
-def errors(count, rng):
+def errors(count, seed):
+    rng = np.random.default_rng(seed) if isinstance(seed, int) else seed
     return MODES @ rng.standard_normal((MODES.shape[1], count)) / np.sqrt(MODES.shape[1])
 
 
-def gain(noise, H=H):
-    W = noise.whiten(np.eye(noise.size))
-    R = np.linalg.inv(W.T @ W)
+def sampled(std, samples, *more):
+    return SampledErrors(observation_noise(std**2, N), samples, *more)
+
+
+def gain_of(R):
     return P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say_and_those_of_the_filter_do_not():
-    base = observation_noise(0.2**2, N)
+def covariance_of(noise):
+    W = noise.whiten(np.eye(N))
+    return np.linalg.inv(W.T @ W)
+
+
+def widened(count):
+    """Factor of Student's distribution on a variance."""
+    return (stats.t.ppf(0.975, count) / stats.norm.ppf(0.975)) ** 2
+
+
+def test_intervals_hold_the_truth_as_often_as_stated_and_those_of_the_filter_do_not():
     rng = np.random.default_rng(2)
     hits, filters, tries = np.zeros(3), np.zeros(3), 0
     for _ in range(60):
-        told = SampledErrors(base, errors(10, rng))
-        K = gain(told.noise)
-        std = np.sqrt(np.diag(told.posterior(H, P0).covariance))
+        known = sampled(0.2, errors(10, rng))
+        K = gain_of(covariance_of(known.noise))
+        std = np.sqrt(np.diag(known.posterior(H, P0).covariance))
         own = np.sqrt(np.diag(P0 - K @ H @ P0))
         for _ in range(20):
             m = np.sqrt(np.diag(P0)) * rng.standard_normal(3)
@@ -45,89 +57,70 @@ def test_intervals_hold_the_truth_as_often_as_they_say_and_those_of_the_filter_d
 
 
 def test_without_the_leave_one_out_the_formula_is_that_of_joseph():
-    # Where the base rules, leaving one out changes nothing.
-    base = observation_noise(20.0**2, N)
-    told = SampledErrors(base, errors(200, np.random.default_rng(3)))
-    K = gain(told.noise)
+    # Where the base dominates, leaving one out changes nothing.
+    known = sampled(20.0, errors(200, 3))
+    K = gain_of(covariance_of(known.noise))
     rest = np.eye(3) - K @ H
-    expected = rest @ P0 @ rest.T + K @ (told.samples @ told.samples.T / 200) @ K.T
-    expected += ((stats.t.ppf(0.975, 200) / 1.959964) ** 2 - 1) * (expected - rest @ P0 @ rest.T)
-    found = told.posterior(H, P0)
-    np.testing.assert_allclose(found.covariance, expected, rtol=0.02, atol=1e-6)
-    np.testing.assert_allclose(
-        found.covariance - found.from_samples, rest @ P0 @ rest.T, rtol=1e-8, atol=1e-12
-    )
+    left = rest @ P0 @ rest.T
+    part = widened(200) * K @ (known.samples @ known.samples.T / 200) @ K.T
+    found = known.posterior(H, P0)
+    np.testing.assert_allclose(found.covariance, left + part, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(found.covariance - found.from_samples, left, rtol=1e-8, atol=1e-12)
 
 
 def test_the_noise_is_that_of_the_base_and_the_mean_square_of_the_samples():
-    told = SampledErrors(observation_noise(0.3**2, N), errors(7, np.random.default_rng(5)))
-    W = told.noise.whiten(np.eye(N))
-    expected = 0.09 * np.eye(N) + told.samples @ told.samples.T / 7
-    np.testing.assert_allclose(np.linalg.inv(W.T @ W), expected, rtol=1e-6, atol=1e-9)
+    known = sampled(0.3, errors(7, 5))
+    expected = 0.09 * np.eye(N) + known.samples @ known.samples.T / 7
+    np.testing.assert_allclose(covariance_of(known.noise), expected, rtol=1e-6, atol=1e-9)
 
 
-def test_tiny_samples_leave_the_filter_s_own_covariance_but_for_the_noise():
-    # Samples that vanish: no error reaches the estimate, only the prior is left through the gain.
-    base = observation_noise(0.3**2, N)
-    told = SampledErrors(base, 1e-9 * errors(5, np.random.default_rng(6)))
-    own = kalman_update(Gaussian(np.zeros(3), P0), np.zeros(N), H, base)
-    assert np.all(np.diag(told.posterior(H, P0).covariance) < own.posterior.std**2)
+def test_tiny_samples_leave_only_the_prior_s_part():
+    own = kalman_update(Gaussian(np.zeros(3), P0), np.zeros(N), H, observation_noise(0.09, N))
+    covariance = sampled(0.3, 1e-9 * errors(5, 6)).posterior(H, P0).covariance
+    assert np.all(np.diag(covariance) < own.posterior.std**2)
 
 
 def test_few_samples_widen_by_student_s_distribution():
-    base = observation_noise(1e6, N)
-    samples = errors(4, np.random.default_rng(7))
     # So little weight that all gains are one: leaving one out changes nothing.
-    K = gain(base)
-    moved = K @ samples
-    expected = (stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)) ** 2 / 4 * moved @ moved.T
-    found = SampledErrors(base, samples).posterior(H, P0).from_samples
-    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    samples = errors(4, 7)
+    moved = gain_of(1e6 * np.eye(N)) @ samples
+    found = sampled(1e3, samples).posterior(H, P0).from_samples
+    np.testing.assert_allclose(found, widened(4) / 4 * moved @ moved.T, rtol=1e-3)
 
 
-def test_what_a_sample_was_made_from_is_left_out_with_it():
-    base, samples = observation_noise(0.2**2, N), errors(6, np.random.default_rng(8))
-    alone = SampledErrors(base, samples).posterior(H, P0)
-    # Twice the same tells nothing more: were the copies taken for independent, a gain that has seen
-    # one of them would be better than it is where neither was seen.
+def test_samples_of_one_source_are_left_out_together():
+    samples = errors(6, 8)
+    alone = sampled(0.2, samples).posterior(H, P0)
+    # Twice the same adds nothing: were the copies taken for independent, a gain that has seen one
+    # of them would be better than it is where neither was seen.
     twice = np.concatenate([samples, samples], axis=1)
-    together = SampledErrors(base, twice, np.tile(np.arange(6), 2)).posterior(H, P0)
+    together = sampled(0.2, twice, np.tile(np.arange(6), 2)).posterior(H, P0)
     np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-9)
-    apart = SampledErrors(base, twice).posterior(H, P0)
+    apart = sampled(0.2, twice).posterior(H, P0)
     assert np.all(np.diag(apart.from_samples) < 0.7 * np.diag(alone.from_samples))
     with pytest.raises(InputError, match="one for each of 12 samples"):
-        SampledErrors(base, twice, np.arange(6))
+        sampled(0.2, twice, np.arange(6))
 
 
-PLACES = np.linspace(0.0, 1.0, N)
-NEAR = np.exp(-0.5 * ((PLACES[:, None] - PLACES) / 0.12) ** 2)
-"""Correlation of errors at two places."""
-
-
-def smooth_errors(count, rng):
-    root = np.linalg.cholesky(NEAR + 1e-9 * np.eye(N))
-    return 0.8 * root @ rng.standard_normal((N, count))
-
-
-def test_the_posterior_is_that_of_a_gain_without_the_sample_and_what_it_was_made_from():
+def test_the_posterior_is_that_of_a_gain_without_the_source_of_each_sample():
     rng = np.random.default_rng(14)
-    samples, source = smooth_errors(6, rng), np.array([0, 0, 1, 1, 2, 2])
-    considered = 0.1 * rng.standard_normal((N, 2))
-    told = SampledErrors(observation_noise(0.3**2, N), samples, source, considered)
+    places = np.linspace(0.0, 1.0, N)
+    near = np.exp(-0.5 * ((places[:, None] - places) / 0.12) ** 2)
+    samples = 0.8 * np.linalg.cholesky(near + 1e-9 * np.eye(N)) @ rng.standard_normal((N, 6))
+    source, beside = np.array([0, 0, 1, 1, 2, 2]), 0.1 * rng.standard_normal((N, 2))
 
-    def gain_of(chosen):
+    def gain(chosen):
         C = samples[:, chosen]
-        R = 0.09 * np.eye(N) + C @ C.T / chosen.sum()
-        return P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
+        return gain_of(0.09 * np.eye(N) + C @ C.T / chosen.sum())
 
     moved = np.concatenate(
-        [gain_of(source != one) @ samples[:, source == one] for one in range(3)], axis=1
+        [gain(source != one) @ samples[:, source == one] for one in range(3)], axis=1
     )
-    K = gain_of(np.ones(6, dtype=bool))
+    K = gain(np.ones(6, dtype=bool))
     rest = np.eye(3) - K @ H
-    part = (stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975)) ** 2 / 6 * moved @ moved.T
-    expected = rest @ P0 @ rest.T + part + K @ considered @ considered.T @ K.T
-    found = told.posterior(H, P0)
+    part = widened(3) / 6 * moved @ moved.T
+    expected = rest @ P0 @ rest.T + part + K @ beside @ beside.T @ K.T
+    found = sampled(0.3, samples, source, beside).posterior(H, P0)
     np.testing.assert_allclose(found.from_samples, part, rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-4, atol=1e-9)
 
@@ -140,6 +133,6 @@ def test_the_posterior_is_that_of_a_gain_without_the_sample_and_what_it_was_made
         (np.full((N, 5), np.nan), "samples of errors"),
     ],
 )
-def test_samples_that_are_none_are_refused(samples, message):
+def test_bad_samples_are_refused(samples, message):
     with pytest.raises(InputError, match=message):
-        SampledErrors(observation_noise(1.0, N), samples)
+        sampled(1.0, samples)

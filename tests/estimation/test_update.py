@@ -1,6 +1,5 @@
 """The update against a dense textbook Kalman filter that shares no code with it."""
 
-import time
 import tracemalloc
 
 import numpy as np
@@ -40,57 +39,33 @@ def noise_of(kind, rng, n):
 
 @pytest.mark.parametrize("kind", ["scalar", "diagonal", "full"])
 @pytest.mark.parametrize(("n", "p"), [(12, 3), (4, 4), (5, 8), (30, 1)])
-def test_equals_the_textbook_filter_likelihood_included(kind, n, p):
+def test_equals_the_textbook_filter_in_both_forms(kind, n, p):
     rng = np.random.default_rng(7)
     P = random_spd(rng, p)
-    m, e, H = rng.standard_normal(p), rng.standard_normal(n), rng.standard_normal((n, p))
-    R, R_dense = noise_of(kind, rng, n)
-
-    update = kalman_update(Gaussian(m, P), e, H, observation_noise(R, n))
-
-    mean, covariance, log_likelihood, nis, _ = textbook_update(m, P, e, H, R_dense)
-    np.testing.assert_allclose(update.posterior.mean, mean, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(update.posterior.covariance, covariance, rtol=1e-12, atol=1e-12)
-    assert update.log_likelihood == pytest.approx(log_likelihood, rel=1e-12)
-    assert update.nis == pytest.approx(nis, rel=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["scalar", "diagonal", "full"])
-def test_information_form_equals_covariance_form(kind):
-    # P+ = (P^-1 + H' R^-1 H)^-1 and m+ = P+ (P^-1 m + H' R^-1 y): a second route to the numbers.
-    rng = np.random.default_rng(8)
-    n, p = 20, 3
-    P = random_spd(rng, p)
     m, y, H = rng.standard_normal(p), rng.standard_normal(n), rng.standard_normal((n, p))
-    R, R_dense = noise_of(kind, rng, n)
-    update = kalman_update(Gaussian(m, P), y - H @ m, H, observation_noise(R, n))
+    R, dense = noise_of(kind, rng, n)
+    noise, e = observation_noise(R, n), y - H @ m
+    found = kalman_update(Gaussian(m, P), e, H, noise)
 
-    R_inverse = np.linalg.inv(R_dense)
-    covariance = np.linalg.inv(np.linalg.inv(P) + H.T @ R_inverse @ H)
-    mean = covariance @ (np.linalg.inv(P) @ m + H.T @ R_inverse @ y)
-    np.testing.assert_allclose(update.posterior.covariance, covariance, rtol=1e-11, atol=1e-13)
-    np.testing.assert_allclose(update.posterior.mean, mean, rtol=1e-11, atol=1e-13)
-
-
-@pytest.mark.parametrize("kind", ["scalar", "diagonal", "full"])
-def test_standardised_innovation_is_the_whitened_one(kind):
+    mean, covariance, log_likelihood, nis, S = textbook_update(m, P, e, H, dense)
+    np.testing.assert_allclose(found.posterior.mean, mean, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(found.posterior.covariance, covariance, rtol=1e-12, atol=1e-12)
+    assert found.log_likelihood == pytest.approx(log_likelihood, rel=1e-12)
+    assert found.nis == pytest.approx(nis, rel=1e-11)
+    # Information form: P+ = (P^-1 + H' R^-1 H)^-1 and m+ = P+ (P^-1 m + H' R^-1 y).
+    covariance = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.solve(dense, H))
+    mean = covariance @ (np.linalg.solve(P, m) + H.T @ np.linalg.solve(dense, y))
+    np.testing.assert_allclose(found.posterior.covariance, covariance, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found.posterior.mean, mean, rtol=1e-10, atol=1e-12)
     # W is not unique, but W'W = R^-1 is: check it, then the definition (W S W')^(-1/2) W e.
-    rng = np.random.default_rng(9)
-    n, p = 9, 2
-    P, e, H = random_spd(rng, p), rng.standard_normal(n), rng.standard_normal((n, p))
-    R, R_dense = noise_of(kind, rng, n)
-    noise = observation_noise(R, n)
     W = noise.whiten(np.eye(n))
-    np.testing.assert_allclose(W.T @ W, np.linalg.inv(R_dense), rtol=1e-11, atol=1e-12)
-    np.testing.assert_allclose(noise.whiten(e), W @ e, rtol=1e-12)
+    np.testing.assert_allclose(W.T @ W, np.linalg.inv(dense), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(noise.whiten(e), W @ e, rtol=1e-12, atol=1e-14)
     # Row i belongs to observation i: rows left in the order of the factorisation miss it.
     assert np.all(np.diagonal(W) > 0.0)
-    assert noise.log_determinant == pytest.approx(np.linalg.slogdet(R_dense)[1], rel=1e-12)
-
-    update = kalman_update(Gaussian(np.zeros(p), P), e, H, noise)
-    *_, S = textbook_update(np.zeros(p), P, e, H, R_dense)
+    assert noise.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
     expected = np.linalg.inv(sqrtm(W @ S @ W.T).real) @ W @ e
-    np.testing.assert_allclose(update.standardised_innovation, expected, rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(found.standardised_innovation, expected, rtol=1e-9, atol=1e-11)
 
 
 def test_sequential_updates_equal_one_update():
@@ -101,29 +76,30 @@ def test_sequential_updates_equal_one_update():
     prior = Gaussian(rng.standard_normal(p), random_spd(rng, p))
     y, H = rng.standard_normal(n), rng.standard_normal((n, p))
     R = rng.uniform(0.1, 1.0, n)
-    whole = kalman_update(prior, y - H @ prior.mean, H, observation_noise(R, n))
 
-    first = kalman_update(prior, (y - H @ prior.mean)[:5], H[:5], observation_noise(R[:5], 5))
-    m = first.posterior.mean
-    second = kalman_update(first.posterior, (y - H @ m)[5:], H[5:], observation_noise(R[5:], n - 5))
+    def update(prior, part):
+        noise = observation_noise(R[part], len(R[part]))
+        return kalman_update(prior, (y - H @ prior.mean)[part], H[part], noise)
+
+    whole, first = update(prior, slice(None)), update(prior, slice(5))
+    second = update(first.posterior, slice(5, None))
     np.testing.assert_allclose(second.posterior.mean, whole.posterior.mean, rtol=1e-11)
     np.testing.assert_allclose(second.posterior.covariance, whole.posterior.covariance, rtol=1e-10)
-    assert first.log_likelihood + second.log_likelihood == pytest.approx(
-        whole.log_likelihood, rel=1e-12
-    )
+    total = first.log_likelihood + second.log_likelihood
+    assert total == pytest.approx(whole.log_likelihood, rel=1e-12)
 
 
 def test_a_fixed_parameter_stays_fixed():
     # Zero variance: P is singular, P^-1 does not exist, and the parameter must not move at all.
     rng = np.random.default_rng(11)
-    P = np.diag([1.0, 0.0, 4.0])
+    m, P = np.array([1.0, 2.0, 3.0]), np.diag([1.0, 0.0, 4.0])
     H, e = rng.standard_normal((6, 3)), rng.standard_normal(6)
-    update = kalman_update(Gaussian(np.array([1.0, 2.0, 3.0]), P), e, H, observation_noise(0.5, 6))
-    mean, covariance, *_ = textbook_update(np.array([1.0, 2.0, 3.0]), P, e, H, 0.5 * np.eye(6))
-    assert update.posterior.mean[1] == 2.0
-    assert not update.posterior.covariance[1].any()
-    np.testing.assert_allclose(update.posterior.mean, mean, rtol=1e-12)
-    np.testing.assert_allclose(update.posterior.covariance, covariance, rtol=1e-12, atol=1e-14)
+    found = kalman_update(Gaussian(m, P), e, H, observation_noise(0.5, 6)).posterior
+    mean, covariance, *_ = textbook_update(m, P, e, H, 0.5 * np.eye(6))
+    assert found.mean[1] == 2.0
+    assert not found.covariance[1].any()
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-12, atol=1e-14)
 
 
 def test_nearly_parallel_columns_keep_their_digits():
@@ -133,31 +109,24 @@ def test_nearly_parallel_columns_keep_their_digits():
     # the difference of d² between entries of 1e18, which H'R^-1 H has no digits for.
     d, r = 1e-9, 1e-18
     H = np.array([[1.0, 1.0], [0.0, d], [0.0, 0.0]])
-    update = kalman_update(
-        Gaussian(np.zeros(2), np.eye(2)), np.zeros(3), H, observation_noise(r, 3)
-    )
+    prior = Gaussian(np.zeros(2), np.eye(2))
+    found = kalman_update(prior, np.zeros(3), H, observation_noise(r, 3)).posterior
     determinant = 1.0 + 2.0 / r + d**2 / r + d**2 / r**2
     # P+[0, 0] is the other diagonal entry of the information over its determinant.
     expected = ((1.0 + d**2) / r + 1.0) / determinant
-    assert update.posterior.covariance[0, 0] == pytest.approx(expected, rel=1e-6)
+    assert found.covariance[0, 0] == pytest.approx(expected, rel=1e-6)
 
 
-def test_three_hundred_thousand_observations_take_little_time_and_memory():
+def test_three_hundred_thousand_observations_take_little_memory():
     # A dense n x n matrix would need 720 GB; what is needed are some arrays of n x p, 7 MB each.
     n, p = 300_000, 3
     rng = np.random.default_rng(12)
     H, e = rng.standard_normal((n, p)), rng.standard_normal(n)
     noise = observation_noise(rng.uniform(0.5, 1.0, n), n)
-    prior = Gaussian(np.zeros(p), np.eye(p))
-    start = time.perf_counter()
-    kalman_update(prior, e, H, noise)
-    seconds = time.perf_counter() - start
-
     tracemalloc.start()
-    kalman_update(prior, e, H, noise)
+    kalman_update(Gaussian(np.zeros(p), np.eye(p)), e, H, noise)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert seconds < 1.0
     assert peak < 60e6
 
 

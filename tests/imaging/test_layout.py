@@ -47,16 +47,11 @@ def test_regions_are_the_halves_around_the_middles():
     assert y[layout.vertex(90.0, 0)] > 0 > y[layout.vertex(270.0, 0)]
 
 
-def test_rims_are_the_first_and_the_last_row():
+def test_rims_and_vertices_are_found_by_angle_and_row():
     layout = ValveLayout(16, 7)
-    assert np.all(layout.s[layout.annulus] == 0)
-    assert np.all(layout.s[layout.free_edge] == 1)
-    np.testing.assert_allclose(layout.phi[layout.annulus], 22.5 * np.arange(16))
-    np.testing.assert_allclose(layout.phi[layout.free_edge], 22.5 * np.arange(16))
-
-
-def test_a_vertex_is_found_by_angle_and_row():
-    layout = ValveLayout(16, 7)
+    for rim, s in ((layout.annulus, 0), (layout.free_edge, 1)):
+        assert np.all(layout.s[rim] == s)
+        np.testing.assert_allclose(layout.phi[rim], 22.5 * np.arange(16))
     for phi, row in ((0.0, 0), (90.0, 3), (270.0, -1), (360.0, -1), (-90.0, 0)):
         vertex = layout.vertex(phi, row)
         assert layout.phi[vertex] == phi % 360

@@ -8,7 +8,6 @@ import pytest
 from experiments.common.cases.settings import ImagedInput
 from experiments.studies.imaging.detectors import ImagingSettings
 from mvest.imaging.detection.trained_model import STAGES
-from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import LANDMARKS
 from tests.places import ROOT
 
@@ -37,11 +36,6 @@ def test_all_stages_and_landmarks_are_named():
         assert re.search(rf"`{name}(_0)?`", text), name
     last = max(int(found[1]) for stage in STAGES if (found := re.match(r"landmark_(\d+)", stage)))
     assert f"`landmark_0` to `_{last}`" in text
-
-
-def test_the_layout_is_the_default_one():
-    layout = ValveLayout()
-    assert f"{layout.columns} x {layout.rows} by default" in OWN.read_text(encoding="utf-8")
 
 
 def test_local_links_lead_somewhere():

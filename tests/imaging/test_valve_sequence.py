@@ -20,23 +20,23 @@ LAYOUT = ValveLayout(8, 3)
 
 
 SIZE = LAYOUT.size
+BOTH = {
+    "layout": LAYOUT,
+    "times": np.array([0.0, 0.1]),
+    "vertices": np.random.default_rng(0).normal(size=(2, SIZE, 3)),
+    "tips": np.zeros((2, 2, 3)),
+}
 FIELDS = {
-    ValveSequence: {
-        "layout": LAYOUT,
-        "times": np.array([0.0, 0.1]),
-        "vertices": np.random.default_rng(0).normal(size=(2, SIZE, 3)),
-        "tips": np.zeros((2, 2, 3)),
+    ValveSequence: BOTH
+    | {
         "frame_confidence": np.ones(2),
         "vertex_confidence": np.ones((2, SIZE)),
         "std_mm": np.ones(SIZE),
         "correlation_length_mm": 5.0,
     },
-    MovingValve: {
+    MovingValve: BOTH
+    | {
         "name": "made up",
-        "layout": LAYOUT,
-        "times": np.array([0.0, 0.1]),
-        "vertices": np.zeros((2, SIZE, 3)),
-        "tips": np.zeros((2, 2, 3)),
         "thickness": np.ones(SIZE),
         "chord_phi": np.zeros(4),
         "chord_s": np.zeros(4),
@@ -78,53 +78,32 @@ def coordinates(layout: ValveLayout, frames: int = 2) -> ValveSequence:
         [np.stack([layout.phi, layout.s, np.full(layout.size, t)], axis=1) for t in range(frames)]
     )
     tips = np.array([[[-1.0, tip, t] for tip in (0.0, 180.0)] for t in range(frames)])
-    return ValveSequence(
-        layout,
-        np.arange(float(frames)),
-        vertices,
-        tips,
-        np.ones(frames),
-        np.ones((frames, layout.size)),
-        np.ones(layout.size),
-        5.0,
-    )
+    times, ones = np.arange(float(frames)), np.ones((frames, layout.size))
+    return ValveSequence(layout, times, vertices, tips, ones[:, 0], ones, ones[0], 5.0)
 
 
 def test_every_landmark_is_where_its_name_says() -> None:
-    found = landmarks(coordinates(ValveLayout(16, 4)), 1)
     expected = {
-        "commissure_0": (0, 0, 1),
-        "commissure_180": (180, 0, 1),
-        "annulus_anterior": (90, 0, 1),
-        "annulus_posterior": (270, 0, 1),
-        "free_edge_anterior": (90, 1, 1),
-        "free_edge_posterior": (270, 1, 1),
-        "annulus_45": (45, 0, 1),
-        "annulus_135": (135, 0, 1),
-        "annulus_225": (225, 0, 1),
-        "annulus_315": (315, 0, 1),
-        "tip_0": (-1, 0, 1),
-        "tip_180": (-1, 180, 1),
+        **{f"commissure_{phi}": (phi, 0) for phi in (0, 180)},
+        "annulus_anterior": (90, 0),
+        "annulus_posterior": (270, 0),
+        "free_edge_anterior": (90, 1),
+        "free_edge_posterior": (270, 1),
+        **{f"annulus_{phi}": (phi, 0) for phi in (45, 135, 225, 315)},
+        **{f"tip_{phi}": (-1, phi) for phi in (0, 180)},
     }
+    sequence = coordinates(ValveLayout(16, 4))
+    found = landmarks(sequence, 1)
     assert tuple(found) == LANDMARKS == tuple(expected)
     for name, position in expected.items():
-        np.testing.assert_allclose(found[name], position, err_msg=name)
+        np.testing.assert_allclose(found[name], (*position, 1), err_msg=name)
+        found[name][:] = 99.0  # a copy
+        np.testing.assert_allclose(landmarks(sequence, 1)[name], (*position, 1))
 
 
-def test_a_landmark_is_a_copy() -> None:
-    sequence = coordinates(ValveLayout(16, 4))
-    landmarks(sequence, 0)["tip_0"][:] = 99.0
-    landmarks(sequence, 0)["commissure_0"][:] = 99.0
-    np.testing.assert_allclose(landmarks(sequence, 0)["tip_0"], (-1, 0, 0))
-    np.testing.assert_allclose(landmarks(sequence, 0)["commissure_0"], (0, 0, 0))
-
-
-@pytest.mark.parametrize("frame", [-1, 2])
-def test_no_frame_outside_the_sequence(frame: int) -> None:
-    with pytest.raises(InputError, match=rf"frame {frame}, expected 0 to 1"):
-        landmarks(coordinates(ValveLayout(16, 4)), frame)
-
-
-def test_a_layout_without_a_column_at_45_degrees_is_refused() -> None:
+def test_frames_and_layouts_without_landmarks_are_refused() -> None:
+    for frame in (-1, 2):
+        with pytest.raises(InputError, match=rf"frame {frame}, expected 0 to 1"):
+            landmarks(coordinates(ValveLayout(16, 4)), frame)
     with pytest.raises(InputError, match="no column of 12 lies at 45 degrees"):
         landmark_vertices(ValveLayout(12, 3))

@@ -602,7 +602,7 @@ def test_learned_errors_and_error_samples_widen_together(monkeypatch):
     wanted = settings(*right_nuisances(), errors=ErrorBeliefs())
     plain = personalise(case, wanted)
     told = personalise(seen_in_error(case, std=1.2), wanted)
-    assert told.result.filtered.learned.names[-1] == "error samples"
+    assert told.result.filtered.learned.quantities[-1].name == "error samples"
     assert np.all(told.result.std > 1.5 * plain.result.std)
     rough = [r.result.filtered.learned.quantities[2].learned.median for r in (plain, told)]
     np.testing.assert_allclose(rough, np.hypot(0.3, 0.3), rtol=0.1)

@@ -1,4 +1,4 @@
-"""Ensemble Kalman filter and smoother: the covariances of the update are those of many runs."""
+"""Ensemble Kalman filter and smoother: covariances of many runs of the model."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class EnsembleFilter(Filter):
 
     One step with α = 1 is the ensemble Kalman filter. k steps with α = k each are the ensemble
     smoother with multiple data assimilation (Emerick and Reynolds 2013, Comput. Geosci. 55:3): each
-    step takes a k-th of the observation's information, Σ 1/α = 1, so that it is counted once, and
-    a non-linear model is linearised anew where the ensemble has come to.
+    step takes a k-th of the observation's information, Σ 1/α = 1, and linearises a non-linear model
+    at the ensemble so far.
 
     Members are drawn with exactly the prior's mean and covariance (second-order exact sampling,
-    Pham 2001, Mon. Weather Rev. 129:1194). For a linear model the square root is then the Kalman
-    filter exactly, in any number of steps, if N > p; the perturbed form has its mean in one step,
+    Pham 2001, Mon. Weather Rev. 129:1194). For a linear model and N > p the square root is then
+    exactly the Kalman filter, in any number of steps; the perturbed form has its mean in one step,
     and its covariance up to the error of N draws. Members whose model fails are left out.
 
     The covariance of an iterate is that of the ensemble.
@@ -105,10 +105,7 @@ class EnsembleFilter(Filter):
 def _conditioned(
     X: FloatArray, D: FloatArray, alpha: float, noise: FloatArray | None
 ) -> FloatArray:
-    """Members (N, p) after one step from members ``X`` and their innovations ``D (n, N)``.
-
-    Observations are perturbed by ``noise (n, N)`` where it is given.
-    """
+    """Members (N, p) after a step from ``X``, with innovations ``D`` and ``noise`` (n, N)."""
     root = np.sqrt(len(X) - 1.0)
     x, d = X.mean(axis=0), D.mean(axis=1)
     A, S = (X - x).T / root, (d[:, None] - D) / root
@@ -164,10 +161,9 @@ def _slope(run: FilterRun, X: FloatArray, predicted: FloatArray) -> FloatArray:
 def _halves(
     run: FilterRun, X: FloatArray, predicted: FloatArray, posterior: Gaussian
 ) -> list[ApproximationCheck]:
-    """What either half of the members makes of the prior, against each other.
+    """Compare the updates of the prior by either half of the members.
 
-    A linear model has one slope, whichever members tell it; that of a non-linear one is known to
-    what the members leave to chance.
+    A linear model has one slope, whichever members give it; that of a non-linear one varies.
     """
     half = len(X) // 2
     if half < X.shape[1] + 2:
@@ -178,7 +174,7 @@ def _halves(
         e = run.y - predicted[part].mean(axis=0) + H @ run.L @ X[part].mean(axis=0)
         means.append(kalman_update(run.prior, e, H, run.noise).posterior.mean)
     apart = np.linalg.lstsq(posterior.factor, means[1] - means[0], rcond=None)[0]
-    # The whole ensemble is off by about half of what its halves are apart.
+    # The error of the whole ensemble is about half the distance of its halves.
     return [
         ApproximationCheck(
             "estimates by the two halves of the ensemble, half their distance in standard "

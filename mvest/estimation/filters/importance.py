@@ -1,4 +1,4 @@
-"""Draws from the posterior itself, weighted by runs of the model: nothing is assumed of it."""
+"""Weighted draws from the posterior itself, whatever its form."""
 
 from __future__ import annotations
 
@@ -17,52 +17,52 @@ from mvest.estimation.run import Filter, FilterRun, by_filter
 from mvest.typing import FloatArray, IntArray
 
 K_HAT_LIMIT = 0.7
-"""Shape of the weights' tail above which their mean is not to be trusted (Vehtari et al. 2024)."""
+"""Shape of the weights' tail above which their mean cannot be trusted (Vehtari et al. 2024)."""
 
 PRIOR_SHARE = 0.1
-"""Of each round's draws, from the prior: no place that the prior allows is left out."""
+"""Share of each round's draws from the prior, so that no region of it is left out."""
 
 EXPLORING = 3
 """Rounds before kernels are chosen by weight."""
 
 KERNELS = 24
-"""Runs of the model at most about which the next are drawn."""
+"""Largest number of runs about which the next are drawn."""
 
 WIDTHS = (1.0, 0.5, 0.25, 0.1)
-"""Widths of these kernels to choose from, in parts of the posterior linearised at the run."""
+"""Candidate widths of these kernels, in parts of the posterior linearised at the run."""
 
 FEWEST = 25
-"""Weights to which the tail can be fitted."""
+"""Smallest number of weights to which the tail is fitted."""
 
 NOTHING = 50.0
-"""Logarithm by which a weight below the largest is none; the fit of the tail takes no zeros."""
+"""Weights that are smaller than the largest by this logarithm are zero and not fitted."""
 
 DRAWS = 4000
-"""Equally weighted draws that an estimate carries."""
+"""Equally weighted draws in an estimate."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportanceFilter(Filter):
-    """Weighted draws from the posterior, from proposals that learn from the model's derivatives.
+    """Weighted draws from the posterior; the proposals use the model's derivatives.
 
     In coordinates x in which the prior is N(0, I), with π(x) = exp(−J(x)):
 
     1. The posterior's mode and its Gaussian N(x₀, P₀) come from ``start``.
     2. A round draws points from a mixture q and runs the model there. The first mixture is of
-       N(x₀, P₀), wider, and the prior. Then it is also of kernels N(xᵢ, s² Pᵢ) about runs, chosen
-       by their weights, where Pᵢ = (I + Hᵢᵀ R⁻¹ Hᵢ)⁻¹ is the posterior linearised at xᵢ itself, so
-       that they follow a curved ridge (gradient adaptive population importance sampling, Elvira,
-       Martino, Luengo and Corander 2015, IEEE ICASSP 4075). s is what gives the weighted draws so
-       far the largest probability, each left out of its own kernel.
+       N(x₀, P₀), wider, and the prior. Later ones add kernels N(xᵢ, s² Pᵢ) about runs, chosen by
+       their weights, where Pᵢ = (I + Hᵢᵀ R⁻¹ Hᵢ)⁻¹ is the posterior linearised at xᵢ, so that they
+       follow a curved ridge (gradient adaptive population importance sampling, Elvira, Martino,
+       Luengo and Corander 2015, IEEE ICASSP 4075). s gives the weighted draws so far the largest
+       probability, each left out of its own kernel.
     3. All draws of all rounds are weighted by π over the mixture of all proposals (Cornuet, Marin,
        Mira and Robert 2012, Scand. J. Stat. 39:798), which the prior's share bounds.
 
     until there are enough effective draws, or runs. The weights are smoothed by a generalised
-    Pareto tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25:72), whose
-    shape k̂ says whether they can be trusted at all: not above 0.7.
+    Pareto tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25:72); above a
+    shape k̂ of 0.7 they cannot be trusted.
 
-    A model without derivatives is drawn from with P₀ in the place of every Pᵢ, and needs a
-    ``start`` that takes such a model, `UnscentedFilter` for example.
+    A model without derivatives has P₀ for every Pᵢ, and needs a ``start`` that takes such a model,
+    for example `UnscentedFilter`.
 
     Attributes
     ----------
@@ -133,13 +133,13 @@ class ImportanceFilter(Filter):
 
 
 class _Draws:
-    """Draws of all rounds, and the mixture that they come from.
+    """Draws of all rounds, with the mixtures that they come from.
 
     Attributes
     ----------
     points : (s, p)
     rounds : list of (int, list)
-        How many were drawn in each from which mixture: shares, means and covariances.
+        Number of draws, and their mixture: shares, means and covariances.
     slope : (n, p)
         dh/dx at the last run with derivatives; 0 without any.
     """
@@ -157,7 +157,7 @@ class _Draws:
         """Draw from the next mixture, and run the model there."""
         mixture, p = self._mixture(), self._laplace.size
         shares = np.array([share for share, _, _ in mixture])
-        # Stratified: each part as often as its share says, but for the rounding.
+        # Stratified: each part in proportion to its share, up to rounding.
         edges = (np.arange(count) + rng.random()) / count
         which = np.searchsorted(np.cumsum(shares / shares.sum()), edges)
         drawn = np.array(
@@ -172,7 +172,7 @@ class _Draws:
         self._log_target = np.append(self._log_target, values)
 
     def weights(self) -> tuple[FloatArray, float, float]:
-        """Smoothed weights (s,) that sum to 1, their k̂, and how many draws are effective."""
+        """Smoothed weights (s,) that sum to 1, their k̂, and the number of effective draws."""
         from arviz_stats.base import array_stats  # takes a second, for this function alone
 
         count = len(self.points)
@@ -233,7 +233,7 @@ class _Draws:
         return [*kernels, (0.1, self._laplace.mean, wide), prior]
 
     def _width(self, order: IntArray, shares: FloatArray, weights: FloatArray) -> float:
-        """Of the kernels, that under which the weighted draws so far are most probable."""
+        """Width of the kernels under which the weighted draws so far are most probable."""
         scores = []
         for width in WIDTHS:
             parts = np.array(

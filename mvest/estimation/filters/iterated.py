@@ -34,10 +34,9 @@ GOOD_DECREASE = 0.5
 """Part of the predicted decrease from which on the linearisation is trusted with less damping."""
 
 POOR_DECREASE = 0.4
-"""Part of the predicted decrease below which a step, though accepted, is followed by a more damped
-one (as in Nocedal and Wright's algorithm 4.1, there 1/4). Where the neglected second derivatives
-are nearly as large as those that are kept, full steps overshoot again and again, from one side of
-the minimum to the other, and lower the objective by a third or less of what is predicted."""
+"""Part of the predicted decrease below which a more damped step follows (as in Nocedal and Wright's
+algorithm 4.1, there 1/4): where the neglected second derivatives are large, full steps overshoot
+again and again, and lower the objective by a third or less of the prediction."""
 
 NEGLIGIBLE_DECREASE = 1e-3
 """Of J by a Newton step: 0.045 standard deviations away in any direction."""
@@ -61,8 +60,7 @@ class ExtendedFilter(Filter):
         e = y − h(m),  H = dh/dz at m
         m⁺, P⁺ = update of m, P with e, H, R      see `kalman_update`
 
-    It is the first step of `IteratedFilter`, kept to be compared with: what it lacks is what a
-    non-linear model needs.
+    It is the first step of `IteratedFilter`, for comparison.
     """
 
     def estimate(self, run: FilterRun) -> Estimate:
@@ -96,18 +94,17 @@ class IteratedFilter(Filter):
     The update always starts from the prior, never from the last posterior. The step is z* − zᵢ if
     that lowers J enough; otherwise Levenberg and Marquardt's
     step = (B + λ diag B)⁻¹ B (z* − zᵢ), where B is the Hessian of the linearised J in coordinates
-    in which the prior is N(0, I), with λ growing until J decreases, and after a step that lowers it
-    far less than predicted. A step at which the model gives no prediction is rejected in the same
-    way. The covariance is P* at the last iterate: the posterior's to the order of Gauss-Newton,
-    that is without the second derivatives of h.
+    in which the prior is N(0, I). λ grows until J decreases, and after a step that lowers it far
+    less than predicted. A step where the model fails is rejected in the same way. The covariance is
+    P* at the last iterate: that of Gauss-Newton, without the second derivatives of h.
 
-    Where R is a `NoiseFamily`, it is learned anew at each iterate from the model linearised there,
-    which costs no further run, so that estimate and noise are the most probable ones for each
-    other. Its doubt widens the covariance (see `mvest.estimation.evidence`). After
-    ``max_learned`` iterates the noise is kept, so that the filter can come to an end.
+    Where R is a `NoiseFamily`, it is learned at each iterate from the model linearised there,
+    without further runs: estimate and noise are the most probable ones for each other. The
+    uncertainty of the noise widens the covariance (see `mvest.estimation.evidence`). After
+    ``max_learned`` iterates the noise stays, so that the filter can converge.
 
-    The run ends where the model has been run: the reported prediction belongs to the estimate, and
-    the iterate is not changed any more once the next full step is below the tolerance.
+    The filter stops where the next full step is below the tolerance, without taking it: the
+    reported prediction is that of the estimate.
 
     Attributes
     ----------
@@ -115,18 +112,17 @@ class IteratedFilter(Filter):
         Stop when the next full step changes no parameter by more than this, relative to its size
         (or to its standard deviation if that is larger).
     objective_tolerance : float
-        Stop when the next full step would lower J by less than this. J is a negative logarithm of a
-        probability, so that its absolute value has a meaning. What rounding hides counts as less.
+        Stop when the next full step would lower J, the negative logarithm of a probability, by less
+        than this, or by less than its rounding error.
     max_iterations : int
         Largest number of accepted steps.
     start : (p,) parameters or None
         First iterate; None starts at the prior's mean.
     max_learned : int
-        Iterates at which a noise that is not quite known is learned.
+        Iterates at which the noise of a `NoiseFamily` is learned.
     second_order : bool
-        Where Gauss-Newton does not come to its end, or its posterior is not that of the model's
-        runs, find the second derivatives that it neglects from 2p further runs, and with them the
-        mode and its covariance; see `_with_second_derivatives`.
+        Where Gauss-Newton does not converge, or the check of its posterior fails, find the mode and
+        its covariance with second derivatives from 2p further runs.
     """
 
     tolerance: float = 1e-4
@@ -229,9 +225,9 @@ class IteratedFilter(Filter):
 def _search(
     run: FilterRun, point: "_Point", B: FloatArray, step: FloatArray, damping: float
 ) -> "tuple[_Point | None, float, str | None]":
-    """The next iterate and its damping, or None and the model's words if it failed to the end.
+    """The next iterate, which lowers the objective, and its damping.
 
-    Accepts a step only if it lowers the objective.
+    None if there is no such step; then with the model's reason if it failed at the last one.
     """
     failure: str | None = None
     scale = np.diag(np.diagonal(B))
@@ -260,6 +256,7 @@ def _with_second_derivatives(
 ) -> "tuple[_Point, FloatArray] | None":
     """The minimum of J and the covariance that its own curvature gives, in coordinates x.
 
+<<<<<<< HEAD
     Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``, which of thousands of
     observations may amount to as much as what is kept, though the model is all but linear over a
     standard deviation. Here the Hessian is that of differences of J's exact gradients over ± one
@@ -268,8 +265,16 @@ def _with_second_derivatives(
     columns of Cholesky's factor: the last ones change the last parameters alone. Newton steps with
     it lead to the minimum; where that is more than a standard deviation away, the Hessian is found
     anew there.
+=======
+    Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``. With thousands of observations
+    this may be as large as the rest, though the model is nearly linear over a standard deviation.
+    Here the Hessian comes from differences of J's exact gradients over ± one standard deviation
+    along the principal axes of a Gaussian, first of Gauss-Newton's (Nocedal and Wright 2006,
+    section 8.1); its inverse is the covariance (Laplace). Newton steps with it lead to the minimum.
+    If that is more than a standard deviation away, the Hessian is found again there.
+>>>>>>> w-imaging
 
-    Returns None where a run fails, J is no valley, or its minimum is not come to.
+    Returns None where a run fails, J is not convex, or its minimum is not reached.
     """
     covariance = gaussian.covariance
     for _ in range(MAX_HESSIANS):
@@ -305,7 +310,7 @@ def _with_second_derivatives(
 
 
 def _left_out(run: FilterRun, point: "_Point", covariance: FloatArray) -> FloatArray:
-    """What Gauss-Newton leaves out of the Hessian, in filter coordinates (p, p)."""
+    """The part of the Hessian that Gauss-Newton leaves out, in filter coordinates (p, p)."""
     A, back = run.noise.whiten(point.H), np.linalg.pinv(run.L)
     left = np.linalg.inv(covariance) - np.eye(len(point.x)) - A.T @ A
     return np.asarray(back.T @ left @ back)
@@ -330,10 +335,10 @@ def _more(damping: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """An iterate at which the model gave a prediction.
+    """An iterate with its prediction.
 
-    `x` (p,) are the coordinates in which the prior is N(0, I), `z` (p,) the filter's, `H` (n, p) is
-    dh/dx, and `objective` is J.
+    The prior of `x` (p,) is N(0, I); `z` (p,) are filter coordinates, `H` (n, p) is dh/dx, and
+    `objective` is J.
     """
 
     x: FloatArray

@@ -19,18 +19,17 @@ class PaperFilter(Filter):
     """Extended Kalman filter that cycles the same frames as new observations.
 
     Estimation of patient-specific material properties of the mitral valve using 4D transesophageal
-    echocardiography (ISBI 2013): the parameters are a random walk, and in each round all frames
+    echocardiography (ISBI 2013). The parameters are a random walk, and in each round all frames
     together are one observation::
 
         m⁻ = m,  P⁻ = P + Q                      process
         e  = y − h(m⁻),  H = dh/dm at m⁻         model
         m, P = update of m⁻, P⁻ with e, H, R     see `kalman_update`
 
-    until two consecutive rounds agree. The observation is counted again in each round, so `P` is
-    the filter's covariance but not that of a posterior: with Q = 0 it shrinks like 1/rounds, with
-    Q > 0 it settles at a value set by Q and R. For a posterior use `IteratedFilter`.
-
-    No step is shortened: if the model fails at an iterate, the run ends there and says so.
+    until two consecutive rounds agree. Each round counts the observation again, so that P is not
+    the covariance of a posterior: with Q = 0 it shrinks like 1/rounds, with Q > 0 it settles at a
+    value set by Q and R. For a posterior use `IteratedFilter`. No step is shortened: the run ends
+    where the model fails.
 
     Attributes
     ----------
@@ -67,8 +66,7 @@ class PaperFilter(Filter):
             update = kalman_update(Gaussian(m, P + Q), innovation, H, run.noise)
             run.record(m, P, run.misfit(prediction), update.log_likelihood)
 
-            # The run of the model at the last iterate is one more than the rounds: it is what makes
-            # the reported prediction that of the estimate, and not of the iterate before.
+            # One run more than rounds, so that the reported prediction is that of the estimate.
             if converged or rounds == self.max_iterations:
                 reason = Reason.CONVERGED if converged else Reason.MAX_ITERATIONS
                 detail = f"{rounds} rounds, tolerance {self.tolerance:g}"
@@ -83,7 +81,7 @@ class PaperFilter(Filter):
 
 
 def _with_way_out(run: FilterRun, z: FloatArray, failed: Prediction) -> Prediction:
-    """The failed prediction at z; where a step has left the positive, with what would not."""
+    """The failed prediction at z, with advice where a step made a parameter negative."""
     m, start = run.transform.inverse(z), run.transform.inverse(run.prior.mean)
     left = [f"{run.names[i]} = {m[i]:.3g}" for i in np.flatnonzero((m <= 0.0) & (start > 0.0))]
     if not left:

@@ -1,4 +1,4 @@
-"""The reduced-order unscented Kalman filter: p + 1 runs of the model in the place of a Jacobian."""
+"""The reduced-order unscented Kalman filter: p + 1 runs of the model instead of a Jacobian."""
 
 from __future__ import annotations
 
@@ -34,16 +34,15 @@ class UnscentedFilter(Filter):
 
     The first round, about the prior, is the reduced-order unscented Kalman filter of Moireau and
     Chapelle (2011), ESAIM: Control, Optimisation and Calculus of Variations 17:380-405, for
-    parameters that do not move (there L = dθ/dx, U = I + Gᵀ R⁻¹ G, θ⁺ = θ + L U⁻¹ Gᵀ R⁻¹ (y − ȳ)).
-    Further rounds place the points about the posterior found so far, N(x⁺, P⁺), and update the
-    prior anew, so that each observation is counted once (García-Fernández, Svensson, Morelande and
-    Särkkä 2015, IEEE Trans. Signal Process. 63:5561). The fixed point is that posterior which the
-    mean slope over itself gives. With p + 1 points the predictions lie on a plane, so that no
-    covariance of the linearisation's error is left to be added to R.
+    constant parameters (there L = dθ/dx, U = I + Gᵀ R⁻¹ G, θ⁺ = θ + L U⁻¹ Gᵀ R⁻¹ (y − ȳ)).
+    Further rounds place the points about the posterior so far, N(x⁺, P⁺), and update the prior
+    again, so that each observation is counted once (García-Fernández, Svensson, Morelande and
+    Särkkä 2015, IEEE Trans. Signal Process. 63:5561). At the fixed point H is the mean slope over
+    the posterior. The predictions of p + 1 points lie on a plane, so that the linearisation leaves
+    no error to be added to R.
 
-    Where a point has no prediction the points are drawn together, and towards the mean before, by
-    half; as they close up the slope becomes a Jacobian by differences. A round that changes the
-    mean by no less than the round before did is taken by half only.
+    Where a point has no prediction, its round is repeated with the points at half the distance, and
+    half way to the mean before. A round that moves the mean no less than the last one is halved.
 
     Attributes
     ----------
@@ -99,7 +98,7 @@ class UnscentedFilter(Filter):
     def _linearise(
         self, run: FilterRun, at: Gaussian, before: FloatArray
     ) -> tuple[Gaussian, FloatArray, FloatArray] | Prediction:
-        """Where the points could be placed, their mean prediction and the slope dh/dx (n, p)."""
+        """Where all points have predictions, with their mean and the slope dh/dx (n, p)."""
         C, x, spread = at.factor, at.mean, self.spread
         for _ in range(MAX_REJECTIONS + 1):
             points = simplex_points(at.mean.size)

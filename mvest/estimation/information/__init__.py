@@ -1,1 +1,1 @@
-"""What data can tell: identifiability, designs, profiles, consistency, errors of the model."""
+"""Identifiability, designs of observations, and consistency of estimates."""

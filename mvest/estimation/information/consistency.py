@@ -1,4 +1,4 @@
-"""Is a filter's uncertainty honest? Consistency of errors and innovations with their covariances.
+"""Consistency of errors and innovations with their covariances.
 
 The tests follow Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
 Navigation (2001), section 5.4. Each takes plain arrays.
@@ -19,10 +19,7 @@ from mvest.typing import FloatArray
 def chi_square_band(degrees_of_freedom: float, level: float = 0.95) -> tuple[float, float]:
     """Central band that holds a chi-square number with probability `level`.
 
-    Raises
-    ------
-    InputError
-        If there is no degree of freedom, or the level is not between 0 and 1.
+    InputError without a degree of freedom, or if the level is not between 0 and 1.
     """
     if not degrees_of_freedom > 0 or not 0.0 < level < 1.0:
         raise InputError(
@@ -37,17 +34,10 @@ def chi_square_band(degrees_of_freedom: float, level: float = 0.95) -> tuple[flo
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> float:
-    """Normalised estimation error squared (m − truth)ᵀ P⁻¹ (m − truth).
+    """Normalised estimation error squared eᵀ P⁻¹ e of the error e (p,) of an estimate.
 
-    Parameters
-    ----------
-    error : (p,) in units of each parameter
-    covariance : (p, p), positive definite
-
-    Returns
-    -------
-    float
-        Chi-square with p degrees of freedom if the estimate is unbiased and P is its covariance.
+    Chi-square with p degrees of freedom if the estimate is unbiased and P (p, p), positive
+    definite, is its covariance.
     """
     of = Gaussian(error, covariance)
     try:
@@ -61,13 +51,7 @@ def nees(error: FloatArray, covariance: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ZTest:
-    """A statistic against its expectation and standard deviation under the null hypothesis.
-
-    Attributes
-    ----------
-    statistic, expected, std : float
-        The measured value; its mean and standard deviation if the hypothesis holds.
-    """
+    """A measured statistic, with its mean and standard deviation if the null hypothesis holds."""
 
     statistic: float
     expected: float
@@ -87,29 +71,20 @@ class ZTest:
 def zero_mean(innovation: FloatArray) -> ZTest:
     """Test that uncorrelated innovations (n,) of equal variance have the mean zero.
 
-    The variance is estimated from the data and the mean's normality follows from the central limit
-    theorem, so that the innovations need not be normal; needs some thirty of them.
+    The variance is estimated from the data. The innovations need not be normal if there are some
+    thirty of them, by the central limit theorem.
     """
     w = _series(innovation)
     return ZTest(float(w.mean()), 0.0, float(w.std(ddof=1) / np.sqrt(w.size)))
 
 
 def moran(innovation: FloatArray, neighbours: "scipy.sparse.sparray[Any, Any]") -> ZTest:
-    """Moran's I: test that innovations at neighbouring points are uncorrelated.
+    """Moran's I: test that innovations (n,) at neighbouring points are uncorrelated.
 
-    Parameters
-    ----------
-    innovation : (n,)
-        Standardised innovations, one for each point.
-    neighbours : sparse (n, n)
-        Weight of each pair of points, non-negative with a zero diagonal (for example a mesh's
-        adjacency).
-
-    Returns
-    -------
-    ZTest
-        I, its expectation −1/(n − 1) and standard deviation for independent normal numbers (Cliff
-        and Ord, Spatial Processes, 1981, eq. 2.28).
+    ``neighbours``, sparse (n, n), has the weight of each pair of points, non-negative with a zero
+    diagonal (for example a mesh's adjacency). The expectation of I is −1/(n − 1); its standard
+    deviation is that of independent normal numbers (Cliff and Ord, Spatial Processes, 1981,
+    eq. 2.28).
     """
     w = _series(innovation)
     n = w.size

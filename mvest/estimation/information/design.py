@@ -1,8 +1,8 @@
-"""Which observation would make a parameter known, from the Jacobians of one run of the model.
+"""Which observation would determine a parameter, from the Jacobians of one run of the model.
 
 Information adds up over independent observations and grows with the inverse square of the noise, so
-that designs of any size are compared without running the model again: each is kept as a p × p
-triangle T with Tᵀ T = (W H D)ᵀ (W H D) for noise of unit standard deviation, D = diag(values)
+that designs of any size are compared without running the model again. Each is a p × p triangle T
+with Tᵀ T = (W H D)ᵀ (W H D) for noise of unit standard deviation, D = diag(values)
 (Kay, Fundamentals of Statistical Signal Processing I, 1993, sections 3.7 and 3.8). All standard
 deviations are relative: those of the logarithm of a positive parameter, to first order.
 """
@@ -27,7 +27,7 @@ NOISE_RANGE = (1e-6, 1e6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """What an observation says about p parameters, for noise of unit standard deviation.
+    """Information of an observation about p parameters, for noise of unit standard deviation.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Design:
     values : (p,) in the units of the parameters
         Positive; where the Jacobian was computed.
     triangle : (p, p)
-        T of the module's text.
+        T.
     """
 
     names: tuple[str, ...]
@@ -46,13 +46,7 @@ class Design:
     def of(
         cls, H: FloatArray, R: NoiseCovariance, values: FloatArray, names: Sequence[str]
     ) -> Design:
-        """The design with Jacobian H (n, p) and noise of covariance R at unit standard deviation.
-
-        Raises
-        ------
-        InputError
-            If a value is not positive.
-        """
+        """The design of Jacobian H (n, p) and noise covariance R at unit standard deviation."""
         require_positive(values, "a value of a design")
         return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))
 
@@ -64,13 +58,13 @@ class Design:
         noise : float
             In units of the observation.
         knowledge : mapping, optional
-            Relative standard deviation of parameters beforehand: 0 of those that are known, which
-            are then left out. Of a parameter that is not named nothing is known.
+            Prior relative standard deviations: 0 of known parameters, which are left out, and
+            infinite of those not named.
 
         Raises
         ------
         InputError
-            If the noise or what is known is not admissible.
+            If the noise or the knowledge is not admissible.
         """
         knowledge = dict(knowledge or {})
         strange = sorted(set(knowledge) - set(self.names))
@@ -80,36 +74,36 @@ class Design:
             raise InputError(f"noise = {noise}, expected > 0")
         free = [k for k, name in enumerate(self.names) if knowledge.get(name) != 0.0]
         if not free:
-            raise InputError("nothing is left to be known: every parameter is")
+            raise InputError("every parameter is known; expected an unknown one")
         before = [1.0 / knowledge.get(self.names[k], np.inf) for k in free]
         rows = np.concatenate([self.triangle[:, free] / noise, np.diag(before)])
         names = tuple(self.names[k] for k in free)
-        # In parts of the values: rows are already scaled by them.
+        # The rows are already scaled by the values.
         return identifiability(rows, 1.0, np.ones(len(free)), names=names)
 
     def std(self, name: str, noise: float, knowledge: Mapping[str, float] | None = None) -> float:
         """Relative standard deviation of one parameter; infinite if it is not determined."""
         bound = self.at(noise, knowledge)
         if name not in bound.names:
-            raise InputError(f"{name!r} is not to be found out; expected one of {bound.names}")
+            raise InputError(f"{name!r} is not unknown; expected one of {bound.names}")
         return float(bound.std[bound.names.index(name)])
 
     def needed_noise(
         self, name: str, target: float, knowledge: Mapping[str, float] | None = None
     ) -> float:
-        """Noise with which a parameter is known to a relative standard deviation `target`.
+        """Noise with which a parameter has the relative standard deviation `target`.
 
-        Zero if it would not be even without noise, infinite if it is so without any data. The mean
-        of N independent observations has their noise / √N.
+        Zero if no noise is small enough, infinite if no data are needed. The mean of N independent
+        observations has their noise / √N.
         """
         return needed(lambda noise: self.std(name, noise, knowledge) / target, NOISE_RANGE)
 
 
 def needed(relative: Callable[[float], float], within: tuple[float, float]) -> float:
-    """Where an increasing function is 1; 0 if it is more all over the range, infinite if less."""
+    """Where an increasing function is 1; 0 if it is above 1 on the range, infinite if below."""
 
     def excess(log: float) -> float:
-        # The logarithm, which goes in straight lines; infinite values stay comparable.
+        # The logarithm is nearly linear; infinite values stay comparable.
         return min(float(np.log(relative(float(np.exp(log))))), 1e3)
 
     low, high = np.log(within)
@@ -121,13 +115,7 @@ def needed(relative: Callable[[float], float], within: tuple[float, float]) -> f
 
 
 def together(*designs: Design) -> Design:
-    """All of several observations of the same parameters, whose errors are independent.
-
-    Raises
-    ------
-    InputError
-        If there are none, or they are not of the same parameters at the same values.
-    """
+    """Several observations with independent errors; InputError if names or values differ."""
     if len({(design.names, tuple(design.values)) for design in designs}) != 1:
         raise InputError("designs put together must be of the same parameters and values")
     stacked = np.concatenate([design.triangle for design in designs])

@@ -1,4 +1,4 @@
-"""What the data can tell apart, from the Jacobian alone, and what a known model error does."""
+"""Which parameters the data distinguish, from the Jacobian alone; the effect of a model error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,28 +18,28 @@ from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 STEP = 0.1
-"""Change that shows how parameters make up for each other, in parts of a scale."""
+"""Change of the first parameter of a trade-off, in parts of its scale."""
 RELEVANT_SHARE = 0.1
-"""Smallest share of a parameter in a combination that is worth naming."""
+"""Smallest share of a parameter in a combination that is named."""
 UNDETERMINED = ("not determined at all", "known to no better than its own size")
 """Words for combinations without a standard deviation, and with one as large as their scales."""
 
 
 @dataclass(frozen=True, slots=True)
 class TradeOff:
-    """Parameters that make up for each other in the data.
+    """Parameters that compensate each other in the data.
 
     Attributes
     ----------
     parameters : tuple of str, (q,)
-        The first is the one that the others follow best.
+        The first is most correlated with the others.
     changes : tuple of float, (q,)
         Changes in their units that hardly show together: the first changes by `STEP` of its scale,
         the others by cov(i, first) / var(first) of that.
     relative : tuple of float, (q,)
         The same in parts of their scales.
     correlation : float
-        Smallest size of the correlation of the first with one of the others, at the bound.
+        Smallest absolute correlation of the first with one of the others, at the bound.
     """
 
     parameters: tuple[str, ...]
@@ -56,13 +56,13 @@ class Identifiability:
     ----------
     names : tuple of str, (p,)
     scale : (p,) in units of each parameter
-        What counts as a large change of each parameter; eigenvectors depend on it.
+        A large change of each parameter; eigenvectors depend on it.
     information : (p, p)
         Scaled Fisher information D Hᵀ R⁻¹ H D, D = diag(scale), plus D P⁻¹ D of a prior if given.
     eigenvalues : (p,), ascending
         A combination with eigenvalue λ has the standard deviation 1/√λ, in parts of the scales.
     eigenvectors : (p, p)
-        Column i belongs to eigenvalue i; the first is the combination that is known worst.
+        Column i belongs to eigenvalue i; the first is the least known combination.
     covariance : (p, p) in products of the parameters' units
         Cramér-Rao bound: no unbiased estimator has a smaller covariance. Infinite (and NaN off the
         diagonal) for parameters that the data leave undetermined.
@@ -111,12 +111,11 @@ class Identifiability:
         )
 
     def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[TradeOff, ...]:
-        """Groups of parameters that the data hardly tell apart, the largest group first.
+        """Groups of parameters that the data hardly distinguish, the largest group first.
 
-        Two belong to one group if the size of their correlation at the bound is at least `limit`,
-        and both are known to no better than `width` parts of their scales: what is known well is
-        distinguished, however correlated it is. What is not determined at all has no correlation;
-        `flat` tells of it.
+        Two belong to one group if their absolute correlation at the bound is at least `limit` and
+        both are known no better than to `width` parts of their scales. Undetermined parameters have
+        no correlation; see `flat`.
         """
         uncertain = self.std / self.scale >= width
         size = np.where(np.outer(uncertain, uncertain), np.abs(self.correlation), 0.0)
@@ -161,11 +160,11 @@ def identifiability(
     Parameters
     ----------
     H : (n, p) in units of the observation per unit of each parameter
-    R : scalar, (n,) or sparse (n, n), in squared units of the observation
+    R : NoiseCovariance, in squared units of the observation
     scale : (p,) in units of each parameter
-        Positive; the parameters' own size makes every statement relative.
+        Positive; with the parameters' own size every statement is relative.
     prior : Gaussian, optional
-        Must be positive definite.
+        Positive definite.
     names : p names, optional
 
     Raises
@@ -220,7 +219,7 @@ def _bound(D: FloatArray, s: FloatArray, V: FloatArray) -> FloatArray:
     known = s > 0.0
     X = D[:, None] * V[:, known] / s[known]
     covariance = X @ X.T
-    # A parameter with any share in an undetermined combination is itself undetermined.
+    # A parameter with a share in an undetermined combination is itself undetermined.
     lost = np.any(np.abs(V[:, ~known]) > np.sqrt(np.finfo(np.float64).eps), axis=1)
     covariance[lost, :] = np.nan
     covariance[:, lost] = np.nan
@@ -237,28 +236,15 @@ def _combination(names: Sequence[str], vector: FloatArray) -> str:
 
 
 def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray) -> FloatArray:
-    """By how much an estimate is off because its model is, to first order.
+    """Shift (p,) of an estimate by an error of its model, to first order, in filter coordinates.
 
-    Observations that lie ``offset`` beside what the model predicts at the truth move the posterior
-    mode by::
+    If the observations differ by ``offset (n,)`` from the model's prediction at the truth, the
+    posterior mode moves by::
 
         b = (Hᵀ R⁻¹ H + P⁻¹)⁻¹ Hᵀ R⁻¹ offset
 
-    the update of Gauss-Newton with the offset for an innovation, with the prior's P and the
-    Jacobian H at the estimate in the filter's coordinates. The offset of a mesh is the prediction
-    of a finer one less its own, at the estimate.
-
-    Parameters
-    ----------
-    found : Estimate
-        With a prediction.
-    R : noise covariance
-        Of n observations.
-    offset : (n,) in units of the observation
-
-    Returns
-    -------
-    (p,) in the filter's coordinates
+    the update of Gauss-Newton with the offset as innovation, with the prior's P and the Jacobian H
+    at the estimate. The offset of a mesh is the prediction of a finer one less its own.
     """
     assert found.prediction is not None
     noise, prior = observation_noise(R, len(offset)), to_filter(found.transform, found.prior)
@@ -267,11 +253,10 @@ def shift_by_model_error(found: Estimate, R: NoiseCovariance, offset: FloatArray
 
 
 def with_shift(found: Estimate, shift: FloatArray) -> Estimate:
-    """The estimate with a shift of each parameter, by its model's error, as one more error of it.
+    """The estimate with diag(b²) added to its covariance, for a shift b (p,) by a model error.
 
-    The size of a shift ``b (p,)`` is some measure of what another mesh does, its direction is not:
-    b bᵀ added to the covariance would leave the estimate as sure as before across b; diag(b²)
-    takes each part of b for an error of its own.
+    The size of b measures the model error; its direction does not: with b bᵀ the covariance across
+    b would stay as it is.
     """
     covariances = found.transformed_iterate_covariances.copy()
     covariances[-1] += np.diag(shift**2)

@@ -1,4 +1,4 @@
-"""The valve in one frame: position, pose, landmarks, rims, leaflets."""
+"""The valve in one frame: its pose, then landmarks, rims and leaflets."""
 
 from __future__ import annotations
 
@@ -17,51 +17,46 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import LANDMARKS, ValveSequence, landmark_vertices
 from mvest.typing import FloatArray, IntArray
 
-LANDMARK_STD_MM = 1.2
-RIM_STD_MM = 0.8
+LANDMARK_STD_MM, RIM_STD_MM = 1.2, 0.8
 """mm, least standard deviation of a landmark's and a rim's pull; the spread of votes adds to it."""
 
 HAND_STD_MM = (0.2, 0.03)
-"""mm, standard deviation of landmarks placed by hand: while the shape is fitted, and in the free
+"""mm, standard deviation of landmarks placed by hand, in the fit of the shape and in the free
 displacement at the end."""
 
 ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
-"""Modes of the shape model in each round of the fit, as far as the model has them, and how far
-along normals (mm) the leaflets are looked for."""
+"""Largest number of modes in each round of the fit, and the distance (mm) along normals within
+which leaflets are looked for."""
 
-ALIKE = 8.0
-"""Errors of neighbouring vertices are correlated: the boundary counts as if there were this many
-times fewer vertices."""
+CORRELATED = 8.0
+"""Divides the number of vertices in the fit, as errors of neighbouring vertices are correlated."""
 
 STIFFNESS, HOLD = 4.0, 0.3
 """Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`."""
 
 CANDIDATES = 40
-"""Poses that a search returns, many of them alike."""
+"""Poses that a search returns, many of them similar."""
 
-SURE = 0.6
-"""Rating above which the best pose is taken without trying others."""
-
-TRIED = 14
-"""Poses that are tried otherwise. Among fewer the right one is often missing."""
+SURE, TRIED = 0.6, 14
+"""If the best rating is lower, so many poses are tried. Fewer often miss the right one."""
 
 RATING_SHARE = 0.3
-"""Weight of a pose's rating beside what is seen of the leaflets, in the confidence. Of simulated
-volumes unlike those of training, the rating alone prefers a wrong pose in every third."""
+"""Weight of a pose's rating in the confidence. In simulated volumes unlike those of training, the
+rating alone prefers a wrong pose in every third."""
 
 STRANGE_SHARE = 0.15
-"""Confidence that a shape loses for each unit by which its squared distance from the mean shape
-(over the deviations, mean over the modes) exceeds 1, which is that of the valves of training.
-Fitted to chamber walls, or front to back, a shape is strained to a distance of 1.5 to 4."""
+"""Confidence lost for each unit by which the squared distance of a shape from the mean (over the
+deviations, mean over the modes) exceeds 1, that of the training valves. Fitted to chamber walls, or
+front to back, a shape has a distance of 1.5 to 4."""
 
 
 class NoValveError(InputError):
-    """A volume shows no valve that the detectors believe in.
+    """A volume shows no valve of sufficient confidence.
 
     Attributes
     ----------
     candidate : ValveSequence or None
-        The best there is, which was not accepted; None where there is not even a place to look at.
+        The best one, which was not accepted; None without a field of view.
     """
 
     def __init__(self, message: str, candidate: ValveSequence | None = None) -> None:
@@ -95,13 +90,7 @@ class FrameValve:
 
 
 def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
-    """Search one frame and fit the valve in it.
-
-    Raises
-    ------
-    NoValveError
-        If there is no place to look at.
-    """
+    """Search one frame and fit the valve in it; NoValveError without a field of view."""
     poses, rating = search_poses(frame, model.boosters, CANDIDATES)
     if not len(poses):
         raise NoValveError("no place to look for a valve at: no field of view")
@@ -115,8 +104,8 @@ def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
 def merits(frame: StandardFrame, model: DetectionModel, poses: Poses) -> FloatArray:
     """Confidence ``(P,)`` in valves at some poses, fitted roughly to every second row and column.
 
-    Where images are unlike those of training, a wrong pose may be rated best; its leaflets then are
-    not where the boundary is seen, or are of a shape that valves do not have.
+    In images unlike those of training a wrong pose may be rated best. Its leaflets then lie off the
+    detected boundary, or have an unusual shape.
     """
     return np.array([_merit(frame, model, poses[k : k + 1]) for k in range(len(poses))])
 
@@ -129,7 +118,7 @@ def _merit(frame: StandardFrame, model: DetectionModel, pose: Poses) -> float:
     b = np.zeros(min(ROUNDS[0][0], len(shape.std)))
     b[:MODES] = start[0]
     seen = np.zeros(0)
-    wide = np.sqrt(max(1.0, ALIKE * coarse.size / layout.size))
+    wide = np.sqrt(max(1.0, CORRELATED * coarse.size / layout.size))
     for _, reach in (ROUNDS[0], ROUNDS[-1]):
         vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
         normals, offset, std, seen = find_boundary(frame, model.boosters, vertices, coarse, reach)
@@ -140,10 +129,10 @@ def _merit(frame: StandardFrame, model: DetectionModel, pose: Poses) -> float:
 def _confidence(
     frame: StandardFrame, model: DetectionModel, pose: Poses, b: FloatArray, seen: FloatArray
 ) -> float:
-    """How sure it is that there is a valve, 0 to 1: its leaflets are seen, its pose and its shape.
+    """Confidence that there is a valve, 0 to 1, by its leaflets, pose and shape.
 
-    In volumes with walls and no valve, leaflets may be seen (on a wall) where no pose is believed
-    in, or the other way round, and mostly in a shape that no valve has.
+    In volumes with walls and no valve, leaflets (on a wall) may look right where the pose does not,
+    or the other way round, and the shape is mostly unusual.
     """
     rating = float(np.clip(refined(frame, model.boosters, pose)[1][0], 0.0, 1.0))
     strange = max(0.0, float(((b / model.shape.std[: len(b)]) ** 2).mean()) - 1.0)
@@ -163,10 +152,8 @@ def fit_frame(
 
     Parameters
     ----------
-    coefficients : (K,), optional
-        Where to start from; otherwise read off at the pose.
-    tips : (2, 3) mm, optional
-        Where papillary tips are looked for.
+    coefficients, tips : (K,), (2, 3) mm, optional
+        To start from; otherwise regressed at the pose.
     fixed : (L, 3) mm, optional
         World positions of landmarks placed by hand, which stay; NaN where none was.
     """
@@ -193,9 +180,9 @@ def fit_frame(
     hand = at[manual], on_leaflets[manual]
     for modes, reach in ROUNDS:
         b = np.concatenate([b, np.zeros(max(0, min(modes, len(shape.std)) - len(b)))])
-        _, pulls, _ = _seen(frame, model, pose, b, reach, *hand, HAND_STD_MM[0])
+        _, pulls, _ = _seen(frame, model, pose, b, reach, hand, HAND_STD_MM[0])
         pose, b = fit_shape(shape, pose, b, pulls)
-    vertices, pulls, confidence = _seen(frame, model, pose, b, reach, *hand, HAND_STD_MM[1])
+    vertices, pulls, confidence = _seen(frame, model, pose, b, reach, hand, HAND_STD_MM[1])
     vertices = relax(vertices, layout, pulls, STIFFNESS, HOLD)
     sure = _confidence(frame, model, pose, b, confidence)
     return FrameValve(pose, b, vertices, tips, sure, confidence)
@@ -207,25 +194,24 @@ def _seen(
     pose: Poses,
     b: FloatArray,
     reach: float,
-    hand: IntArray,
-    points: FloatArray,
+    by_hand: tuple[IntArray, FloatArray],
     hand_std: float,
 ) -> tuple[FloatArray, Pulls, FloatArray]:
-    """A shape ``(n, 3)`` mm, what pulls on it, and each vertex' confidence ``(n,)``.
+    """A shape ``(n, 3)`` mm, the pulls on it, and each vertex' confidence ``(n,)``.
 
-    Leaflets and rims pull, and vertices placed by hand: their numbers ``hand``, where they were
-    placed (``points``), and the standard deviation of that.
+    Leaflets and rims pull, and vertices placed ``by_hand``: their numbers and positions, with the
+    standard deviation ``hand_std``.
     """
-    layout, boosters = model.shape.layout, model.boosters
+    layout, boosters, (hand, points) = model.shape.layout, model.boosters, by_hand
     vertices = pose.world(model.shape.shape(b[None]))[0]
     normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
-    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(ALIKE) * std)]
+    parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(CORRELATED) * std)]
     for rim, at in (("annulus", layout.annulus), ("free_edge", layout.free_edge)):
         axes, off, spread = find_rim(
             frame, boosters, rim, vertices, layout, float(pose.log_scale[0])
         )
-        # Columns are alike too, over about as many as rows are.
-        wide = np.sqrt(np.sqrt(ALIKE)) * np.hypot(RIM_STD_MM, spread)
+        # Errors of neighbouring columns are correlated as those of rows are.
+        wide = np.sqrt(np.sqrt(CORRELATED)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
     parts.append(Pulls.to_points(hand, vertices[hand], points, np.full(len(hand), hand_std)))
     return vertices, Pulls.joined(parts), confidence

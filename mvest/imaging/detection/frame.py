@@ -1,9 +1,8 @@
 """One frame of a volume as detectors see it: ranks instead of grey values, at several scales.
 
-Features are ranks at places that turn and scale with a hypothesis, and their differences. Sampling
-at places that follow a hypothesised position, orientation and scale instead of rotating the volume
-is what Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008) call steerable features; means over
-cubes and their differences are those of Haar.
+Features are ranks at points that turn and scale with a hypothesis, and their differences: the
+steerable features of Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008), with means over cubes
+and their differences as those of Haar.
 """
 
 from __future__ import annotations
@@ -21,32 +20,29 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray, IntArray
 
 VOXEL_MM = 0.8
-"""mm, spacing to which volumes are resampled whose own differs from it by more than a fifth."""
+"""mm, spacing to which a volume is resampled if its own differs by more than a fifth."""
 
 LEVELS = 4
 """Scales: cubes of 1, 2, 4 and 8 voxels."""
 
 SPARSE = 25
-"""Of 255: share of voxels with an echo below which a cell of 4 x 4 x 4 voxels counts as without."""
+"""Of 255: least share of voxels with an echo in a cell of 4 x 4 x 4 voxels that has an echo."""
 
-MIN_CELLS = 20
-"""Such cells with an echo, below which there is no image."""
+MIN_CELLS, MIN_GREY_VALUES = 20, 8
+"""Least number of cells with an echo, and of different grey values, in an image."""
 
 MAX_LEVELS = 65536
-"""Range of whole grey values up to which each is counted."""
+"""Largest range of whole grey values of which each is counted."""
 
 MAX_COMPARED = 200_000
-"""Voxels of a frame in floating-point numbers that ranks are taken among."""
-
-MIN_GREY_VALUES = 8
-"""Different values below which a frame holds no image."""
+"""Largest number of voxels among which floating-point grey values are ranked."""
 
 
 class StandardFrame(NamedTuple):
     """Means over cubes of 1, 2, 4, ... voxels of the ranks of one frame's grey values.
 
-    A rank is the share of voxels within the field of view that are darker, so that gain, dynamic
-    range and any other monotone map of grey values make no difference.
+    A rank is the share of darker voxels within the field of view, which no gain, dynamic range or
+    other monotone map of grey values changes.
 
     Attributes
     ----------
@@ -85,13 +81,7 @@ class StandardFrame(NamedTuple):
 
 
 def standard_frame(volume: VolumeSequence, frame: int) -> StandardFrame:
-    """Prepare one frame of a volume.
-
-    Raises
-    ------
-    InputError
-        If the frame holds no image: hardly any different values.
-    """
+    """Prepare one frame of a volume; InputError if it has hardly any different values."""
     ranks = _ranks(np.asarray(volume.frames[frame]), volume.source, frame)
     spacing = np.asarray(volume.spacing, dtype=np.float64)
     origin = np.asarray(volume.origin, dtype=np.float64)
@@ -116,7 +106,7 @@ def standard_frame(volume: VolumeSequence, frame: int) -> StandardFrame:
 def _resampled(
     ranks: NDArray[np.uint8], spacing: FloatArray
 ) -> tuple[NDArray[np.uint8], FloatArray]:
-    """At about ``VOXEL_MM``, and how many new voxels there are for each old one ``(3,)``."""
+    """Ranks at about ``VOXEL_MM``, and the number of new voxels for each old one ``(3,)``."""
     shape = np.maximum(1, np.rint(np.array(ranks.shape) * spacing / VOXEL_MM)).astype(int)
     zoom = shape / np.array(ranks.shape)
     smooth = ndimage.gaussian_filter(ranks.astype(np.float32), np.where(zoom < 1, 0.5 / zoom, 0.0))
@@ -151,11 +141,7 @@ def _ranks(grey: NDArray[Any], source: str, frame: int) -> NDArray[np.uint8]:
 
 
 def _field_of_view(echo: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    """The convex hull of all voxels with an echo: a pyramid, or the whole volume.
-
-    Blood that is as dark as what lies outside (low gain) is thereby inside. None if there is hardly
-    any echo.
-    """
+    """The convex hull of all voxels with an echo, black blood included; None without an echo."""
     coarse = _halved(_halved(np.where(echo, np.uint8(255), np.uint8(0)))) > SPARSE
     points = np.argwhere(coarse).astype(np.float64)
     if len(points) < MIN_CELLS:
@@ -175,7 +161,7 @@ def _field_of_view(echo: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
 
 
 def _halved(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Means over 2 x 2 x 2 voxels; what is odd is filled up with its last layer."""
+    """Means over 2 x 2 x 2 voxels; the last layer of an odd side is repeated."""
     padded = np.pad(level, [(0, k % 2) for k in level.shape], mode="edge").astype(np.uint16)
     total = padded[0::2] + padded[1::2]
     total = total[:, 0::2] + total[:, 1::2]
@@ -184,7 +170,7 @@ def _halved(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class SamplePattern(NamedTuple):
-    """Where and at which scale ranks are sampled about a hypothesis.
+    """Points and scales at which ranks are sampled about a hypothesis.
 
     Attributes
     ----------
@@ -193,7 +179,7 @@ class SamplePattern(NamedTuple):
     levels : (F,)
         Scale of each sample.
     pairs : (D, 2)
-        Samples whose difference is a feature too.
+        Samples whose difference is a feature.
     """
 
     offsets: FloatArray
@@ -204,7 +190,7 @@ class SamplePattern(NamedTuple):
     def paired(
         cls, offsets: FloatArray, levels: IntArray, differences: int, seed: int
     ) -> SamplePattern:
-        """Samples with differences of pairs drawn at random, near ones more often."""
+        """Samples with differences of random pairs, more often of near ones."""
         rng = np.random.default_rng(seed)
         n = len(offsets)
         first = rng.integers(n, size=differences)
@@ -229,19 +215,12 @@ def directions(count: int) -> FloatArray:
 
 
 def features(
-    frame: StandardFrame,
-    pattern: SamplePattern,
-    points: FloatArray,
-    axes: FloatArray,
+    frame: StandardFrame, pattern: SamplePattern, points: FloatArray, axes: FloatArray
 ) -> NDArray[np.float32]:
     """Features ``(P, size)`` of hypotheses, ranks from 0 to 255.
 
-    Parameters
-    ----------
-    points : (P, 3) mm
-        World positions.
-    axes : (P, 3, 3)
-        Columns are the axes of each hypothesis in world coordinates, scale included.
+    Hypotheses lie at ``points (P, 3)`` mm in the world; the columns of ``axes (P, 3, 3)`` are their
+    axes there, scale included.
     """
     values = np.empty((len(points), len(pattern.offsets)), dtype=np.float32)
     points, axes = (np.ascontiguousarray(x, dtype=np.float64) for x in (points, axes))
@@ -277,7 +256,7 @@ def _sample(
             y = (y + 0.5) * scale - 0.5
             z = (z + 0.5) * scale - 0.5
             nx, ny, nz = shapes[level, 0], shapes[level, 1], shapes[level, 2]
-            # Asked so that a place that is no number is outside.
+            # In this form NaN is outside.
             if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5 and -0.5 <= z <= nz - 0.5):
                 out[p, f] = 0.0
                 continue
@@ -286,7 +265,7 @@ def _sample(
             z = min(max(z, 0.0), nz - 1.0)
             i, j, k = int(x), int(y), int(z)
             u, v, w = x - i, y - j, z - k
-            # From each last voxel there is no step to a neighbour.
+            # The last voxel along an axis has no neighbour.
             di = ny * nz if i + 1 < nx else 0
             dj = nz if j + 1 < ny else 0
             dk = 1 if k + 1 < nz else 0

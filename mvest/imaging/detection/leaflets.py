@@ -1,9 +1,8 @@
-"""Landmarks, rims and leaflets: each is found from a shape that is near.
+"""Detectors of landmarks, rims and leaflets, which start from a shape nearby.
 
-Candidates about a guess vote for landmarks and rims: each says where the point lies from it, and
-most are right. A rim lies where a leaflet ends: along the leaflet as well as across it there is
-something to see, so candidates lie in the plane perpendicular to the rim. Of the leaflets, the
-probability of the midsurface is read off place by place along their normals.
+Candidates about a guess vote for a landmark or a rim: trees predict where it lies from each. The
+candidates of a rim lie in the plane perpendicular to it. Leaflets are found by the probability of
+the midsurface along their normals.
 """
 
 from __future__ import annotations
@@ -13,14 +12,7 @@ from numpy.typing import NDArray
 
 from mvest.imaging.detection.frame import SamplePattern, StandardFrame, features
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.shape_model import (
-    Examples,
-    LabelledFrame,
-    Misses,
-    TrueValve,
-    missed_poses,
-    missed_shapes,
-)
+from mvest.imaging.detection.shape_model import Examples, LabelledFrame, Misses
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Trees
 from mvest.imaging.valve_sequence import landmark_vertices
@@ -30,20 +22,10 @@ ROUNDS = 4
 
 
 def consensus(votes: FloatArray, width_mm: float = 1.5) -> tuple[FloatArray, FloatArray]:
-    """Where votes agree.
+    """Points ``(P, d)`` mm on which votes ``(P, V, d)`` agree, and their spread ``(P,)`` mm.
 
-    Parameters
-    ----------
-    votes : (P, V, d) mm
-        V votes for each of P points.
-    width_mm : float
-        Votes farther than this from the consensus count little (Cauchy weights).
-
-    Returns
-    -------
-    points : (P, d) mm
-    spread : (P,) mm
-        Weighted root mean square distance of the votes: how much they disagree.
+    Votes farther than ``width_mm`` from the consensus have little weight (Cauchy). The spread is
+    the weighted root mean square distance of the votes.
     """
     centre = np.median(votes, axis=1)
     for _ in range(ROUNDS):
@@ -72,7 +54,7 @@ def _candidates(step: float, dimensions: int) -> FloatArray:
 def _with_place(
     values: NDArray[np.float32], phi: FloatArray, third: FloatArray | float
 ) -> NDArray[np.float32]:
-    """Features with where around the valve they are from (``phi`` in degrees), and one more."""
+    """Features with the position around the valve (``phi``, degrees) and a third value."""
     phi = np.deg2rad(phi)
     place = np.stack([np.abs(np.cos(phi)), np.sin(phi), np.broadcast_to(third, phi.shape)], axis=1)
     return np.concatenate([values, place.astype(np.float32)], axis=1)
@@ -81,44 +63,35 @@ def _with_place(
 # -- landmarks ------------------------------------------------------------------------------------
 LANDMARK_MISSES = Misses(0.0, 4.0, 0.03)
 LANDMARK_START_MM = 4.0
-"""mm, standard deviation of each coordinate of candidates about a point, in training."""
+"""mm, standard deviation of each coordinate of training candidates about a point."""
 
 LANDMARK_STEPS_MM = (2.6, 1.3)
-"""mm between candidates in the first and second round."""
+"""mm between candidates in both rounds."""
 
 LANDMARK_PATTERN = _cloud(4, (3.0, 7.0, 12.0), [50, 50, 30], 70)
 
 
-def landmark_points(true: TrueValve, layout: ValveLayout) -> FloatArray:
-    """``(L, 3)`` mm, in the order of :data:`mvest.imaging.layout.LANDMARKS`."""
-    return np.concatenate([true.vertices[list(landmark_vertices(layout).values())], true.tips])
+def landmark_points(vertices: FloatArray, tips: FloatArray, layout: ValveLayout) -> FloatArray:
+    """``(L, 3)`` mm, in the order of :data:`mvest.imaging.valve_sequence.LANDMARKS`."""
+    return np.concatenate([vertices[list(landmark_vertices(layout).values())], tips])
 
 
 def landmark_samples(seen: LabelledFrame, which: int, count: int) -> Examples:
     """Candidates about one landmark, and where it lies from them ``(P, 3)`` in their axes."""
-    frame, true, model, rng = seen
-    poses = missed_poses(true.pose, LANDMARK_MISSES, count, rng)
-    point = landmark_points(true, model.layout)[which]
-    candidates = point + rng.standard_normal((count, 3)) * LANDMARK_START_MM
+    poses = seen.missed_poses(LANDMARK_MISSES, count)
+    point = landmark_points(seen.vertices, seen.tips, seen.model.layout)[which]
+    candidates = point + seen.rng.standard_normal((count, 3)) * LANDMARK_START_MM
     gap = np.einsum("pij,pi->pj", poses.rotation, point - candidates)
-    return features(frame, LANDMARK_PATTERN, candidates, poses.axes), gap
+    return features(seen.frame, LANDMARK_PATTERN, candidates, poses.axes), gap
 
 
 def find_landmarks(
     frame: StandardFrame, boosters: Trees, pose: Poses, points: FloatArray, which: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Landmarks ``(L, 3)`` mm, and how much votes for each disagree ``(L,)`` mm.
+    """Landmarks ``(L, 3)`` mm of numbers ``which (L,)``, and the spread of their votes ``(L,)`` mm.
 
-    Parameters
-    ----------
-    boosters : mapping
-        Three outputs for each landmark: where it lies from a candidate, mm in the valve's axes.
-    pose : Poses
-        One.
-    points : (L, 3) mm
-        Guesses.
-    which : (L,)
-        Their numbers.
+    They are looked for about guesses ``points (L, 3)``. The three outputs of the trees say where a
+    landmark lies from a candidate, mm in the axes of the ``pose`` (one).
     """
     refined, spread = np.array(points), np.zeros(len(points))
     for step in LANDMARK_STEPS_MM:
@@ -139,11 +112,11 @@ RIMS = {"annulus": 0, "free_edge": -1}
 """Row of each rim."""
 
 GUESSES = 6
-"""Missed shapes that training candidates of one frame are taken from."""
+"""Shapes about which training candidates of one frame are taken."""
 
 RIM_MISSES = Misses(1.5, 4.0, 0.04, 0.5)
 RIM_STEPS_MM = (1.6, 0.9)
-"""mm between candidates in the first and second round."""
+"""mm between candidates in both rounds."""
 
 RIM_PATTERN = _cloud(5, (2.2, 5.0, 10.0), [50, 45, 25], 80)
 
@@ -162,21 +135,20 @@ def rim_axes(vertices: FloatArray, layout: ValveLayout, row: int) -> FloatArray:
 
 def rim_samples(seen: LabelledFrame, which: str, count: int) -> Examples:
     """Candidates about one of `RIMS`, and where it lies from them ``(P, 2)`` mm."""
-    frame, true, model, rng = seen
-    layout = model.layout
+    layout, rng = seen.model.layout, seen.rng
     row = RIMS[which] % layout.rows
-    target = true.vertices.reshape(layout.rows, layout.columns, 3)[row]
+    target = seen.vertices.reshape(layout.rows, layout.columns, 3)[row]
     xs, ys = [], []
-    for guess in missed_shapes(seen, RIM_MISSES, GUESSES):
+    for guess in seen.missed_shapes(RIM_MISSES, GUESSES):
         columns = rng.integers(layout.columns, size=count // GUESSES)
         axes = rim_axes(guess, layout, row)[columns]
         about = guess.reshape(layout.rows, layout.columns, 3)[row][columns]
         off = rng.standard_normal((len(columns), 3)) * [0.0, 2.0, 2.0]
         points = about + np.einsum("pij,pj->pi", axes, off)
         gap = np.einsum("pij,pi->pj", axes, target[columns] - points)[:, 1:]
-        values = features(frame, RIM_PATTERN, points, axes)
+        values = features(seen.frame, RIM_PATTERN, points, axes)
         phi = 360.0 * columns / layout.columns
-        xs.append(_with_place(values, phi, float(true.pose.log_scale[0])))
+        xs.append(_with_place(values, phi, float(seen.pose.log_scale[0])))
         ys.append(np.clip(gap, -8.0, 8.0))
     return np.concatenate(xs), np.concatenate(ys)
 
@@ -189,21 +161,19 @@ def find_rim(
     layout: ValveLayout,
     log_scale: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """One of `RIMS` as seen from a shape ``(n, 3)`` mm.
+    """Detect one of `RIMS` about that of a shape ``(n, 3)`` mm.
 
-    Parameters
-    ----------
-    boosters : mapping
-        Two outputs: how far away from the leaflet, and across it, the rim lies from a candidate.
+    The two outputs of the trees say how far away from the leaflet, and across it, the rim lies from
+    a candidate.
 
     Returns
     -------
     axes : (columns, 3, 3)
         See :func:`rim_axes`.
     offset : (columns, 2) mm
-        Where the rim lies from the shape's, away from the leaflet and across it.
+        Of the rim from the shape's, away from the leaflet and across it.
     spread : (columns,) mm
-        How much the votes disagree.
+        Of the votes.
     """
     row = RIMS[which] % layout.rows
     axes = rim_axes(vertices, layout, row)
@@ -230,7 +200,7 @@ BOUNDARY_WIDTH_MM = 0.6
 """mm, standard deviation of the label about the midsurface: exp(-d^2 / (2 WIDTH^2))."""
 
 REACH = (3, 2)
-"""Columns and rows about a vertex among which its nearest true counterpart is looked for."""
+"""Columns and rows about a vertex in which the nearest true vertex is looked for."""
 
 
 def _boundary_pattern() -> SamplePattern:
@@ -248,7 +218,7 @@ BOUNDARY_PATTERN = _boundary_pattern()
 
 
 def leaflet_axes(vertices: FloatArray, layout: ValveLayout) -> FloatArray:
-    """``(n, 3, 3)``: at every vertex around the valve, along the leaflet, and its normal."""
+    """``(n, 3, 3)``: at every vertex around the valve, along the leaflet, and normal to it."""
     grid = vertices.reshape(layout.rows, layout.columns, 3)
     around = np.roll(grid, -1, 1) - np.roll(grid, 1, 1)
     along: FloatArray = np.asarray(np.gradient(grid, axis=0))
@@ -260,12 +230,12 @@ def leaflet_axes(vertices: FloatArray, layout: ValveLayout) -> FloatArray:
 
 
 def _gap(
-    points: FloatArray, normals: FloatArray, which: IntArray, true: TrueValve, layout: ValveLayout
+    points: FloatArray, normals: FloatArray, which: IntArray, true: FloatArray, layout: ValveLayout
 ) -> FloatArray:
-    """``(P,)`` mm along the normals from points to the true leaflet near their vertices."""
+    """``(P,)`` mm along the normals from points to the leaflet ``true (n, 3)`` near vertices."""
     shape = (layout.rows, layout.columns, 3)
-    grid: FloatArray = true.vertices.reshape(shape)
-    true_normals = leaflet_axes(true.vertices, layout)[:, :, 2].reshape(shape)
+    grid: FloatArray = true.reshape(shape)
+    true_normals = leaflet_axes(true, layout)[:, :, 2].reshape(shape)
     row, column = which // layout.columns, which % layout.columns
     di, dj = np.meshgrid(
         np.arange(-REACH[0], REACH[0] + 1), np.arange(-REACH[1], REACH[1] + 1), indexing="ij"
@@ -283,22 +253,21 @@ def _gap(
 
 
 def boundary_samples(seen: LabelledFrame, count: int) -> Examples:
-    """Places along normals of missed shapes, with the label of each ``(P, 1)``."""
-    frame, true, model, rng = seen
-    layout = model.layout
+    """Points along normals of shapes about the true one, with the label of each ``(P, 1)``."""
+    layout, rng = seen.model.layout, seen.rng
     xs, ys = [], []
-    for guess in missed_shapes(seen, BOUNDARY_MISSES, GUESSES):
+    for guess in seen.missed_shapes(BOUNDARY_MISSES, GUESSES):
         which = rng.integers(layout.size, size=count // GUESSES)
         axes = leaflet_axes(guess, layout)[which]
         off = rng.uniform(-6.0, 6.0, len(which))
         normal = axes[:, :, 2]
-        gap = _gap(guess[which], normal, which, true, layout)
-        # Half of the places are near the leaflet, where there is something to tell.
+        gap = _gap(guess[which], normal, which, seen.vertices, layout)
+        # Half of the points are near the leaflet.
         close = rng.random(len(which)) < 0.5
         off = np.where(close, gap + rng.standard_normal(len(which)) * 1.2, off)
         points = guess[which] + off[:, None] * normal
-        gap = _gap(points, normal, which, true, layout)
-        values = features(frame, BOUNDARY_PATTERN, points, axes)
+        gap = _gap(points, normal, which, seen.vertices, layout)
+        values = features(seen.frame, BOUNDARY_PATTERN, points, axes)
         xs.append(_with_place(values, layout.phi[which], layout.s[which]))
         ys.append(np.exp(-0.5 * (gap / BOUNDARY_WIDTH_MM) ** 2))
     return np.concatenate(xs), np.concatenate(ys)[:, None]
@@ -311,25 +280,18 @@ def find_boundary(
     layout: ValveLayout,
     reach_mm: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The leaflets as seen from a shape ``(n, 3)`` mm.
+    """Detect the leaflets within ``reach_mm`` along the normals of a shape ``(n, 3)`` mm.
 
-    Parameters
-    ----------
-    boosters : mapping
-        One output: how likely a place is on the midsurface.
-    reach_mm : float
-        How far to both sides of the shape it is looked; places are believed less the farther
-        they are (normal, standard deviation half of this).
+    The output of the trees is the probability of a point on the midsurface; the prior of its
+    distance is normal, with a standard deviation of half the reach.
 
     Returns
     -------
     normals : (n, 3)
-    offset : (n,) mm
-        Expected place along the normal.
-    std : (n,) mm
-        Of this place.
+    offset, std : (n,) mm
+        Expected distance along the normal, and its standard deviation.
     confidence : (n,)
-        Probability at the best place, 0 to 1.
+        Probability at the best point, 0 to 1.
     """
     axes = leaflet_axes(vertices, layout)
     normals = axes[:, :, 2]

@@ -1,4 +1,4 @@
-"""Where a valve is, how it is turned and how large it is."""
+"""Position, orientation and size of a valve."""
 
 from __future__ import annotations
 
@@ -73,10 +73,7 @@ class Poses:
         )
 
     def apart(self, ratings: FloatArray, count: int) -> IntArray:
-        """Numbers of the best rated poses that are not about the same as a better one.
-
-        Poses are about the same within 4 mm and 15 degrees.
-        """
+        """The best rated poses, without those within 4 mm and 15 degrees of a better one."""
         kept: list[int] = []
         for k in np.argsort(-ratings, kind="stable"):
             turn = Rotation.from_matrix(np.swapaxes(self.rotation[kept], 1, 2) @ self.rotation[k])
@@ -97,21 +94,10 @@ class Poses:
 def pose_of(
     vertices: FloatArray, tips: FloatArray, layout: ValveLayout, size_mm: float = 1.0
 ) -> Poses:
-    """The pose of one valve.
+    """The pose of one valve, from its vertices ``(n, 3)`` and tips ``(2, 3)`` mm.
 
-    Parameters
-    ----------
-    vertices : (n, 3) mm
-    tips : (2, 3) mm
-    layout : ValveLayout
-    size_mm : float
-        Size of the mean valve: root mean square distance of the annulus from its centre.
-
-    Returns
-    -------
-    Poses
-        One: z along the annulus' normal away from the tips, x to phi = 0 as far as it is
-        perpendicular to z.
+    z is along the annulus' normal away from the tips, and x points to phi = 0, perpendicular to z.
+    ``size_mm`` is the mean valve's root mean square distance of the annulus from its centre.
     """
     annulus = vertices[layout.annulus]
     centre = annulus.mean(axis=0)
@@ -127,10 +113,7 @@ def pose_of(
 
 
 def rotation_grid(count: int) -> FloatArray:
-    """``(count, 3, 3)`` rotations over all orientations, spread more evenly than random ones.
-
-    Drawn one after another, each the farthest of some candidates from those before it.
-    """
+    """``(count, 3, 3)`` rotations, each the farthest of random candidates from those before."""
     candidates = Rotation.random(4 * count, rng=np.random.default_rng(0)).as_quat()
     nearness = np.abs(candidates @ candidates[0])
     chosen = [0]

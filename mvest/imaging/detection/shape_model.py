@@ -1,13 +1,12 @@
-"""How valves differ (a mean shape and its principal modes, pose taken off), and fitting a shape.
+"""A mean valve and its principal modes without pose, and the fit of a shape.
 
-Papillary tips have a mean only; they are found by themselves, since a shape fitted to the leaflets
-moves them for no reason of their own.
+Papillary tips have a mean only. They are detected by themselves, as a shape fitted to the leaflets
+says nothing of them.
 
-The fitted shape is the most probable one that agrees with what was seen, then takes up what the
-model cannot show. Everything seen is a pull: a vertex is to move by so much along a direction, give
-or take a standard deviation. Pose and coefficients follow from a linear least-squares problem with
-the shape model's prior (maximum a posteriori), repeated with weights that make little of what
-disagrees; a smooth displacement of the vertices then takes up the rest.
+Everything detected is a pull: a vertex is to move by a distance along a direction, with a standard
+deviation. Pose and coefficients follow from a linear least-squares problem with the shape model's
+prior (maximum a posteriori), repeated with small weights for outliers. A smooth displacement of the
+vertices then follows what the model cannot represent.
 """
 
 from __future__ import annotations
@@ -60,10 +59,6 @@ class ShapeModel:
         k = coefficients.shape[1]
         return np.asarray(self.mean + np.tensordot(coefficients, self.modes[:k], axes=(1, 0)))
 
-    def pose_of(self, vertices: FloatArray, tips: FloatArray) -> Poses:
-        """The pose of one valve ``(n, 3)`` with its tips ``(2, 3)``."""
-        return pose_of(vertices, tips, self.layout, self.size_mm)
-
     def coefficients(self, local: FloatArray) -> FloatArray:
         """``(P, K)`` of shapes ``(P, n, 3)`` without pose."""
         return np.asarray(np.tensordot(local - self.mean, self.modes, axes=([1, 2], [1, 2])))
@@ -72,10 +67,7 @@ class ShapeModel:
 def fit_shape_model(valves: Sequence[MovingValve], modes: int) -> ShapeModel:
     """Mean and principal modes over all frames of all valves.
 
-    Raises
-    ------
-    InputError
-        If there are fewer shapes than modes, or layouts differ.
+    InputError if there are too few shapes, or layouts differ.
     """
     layout = valves[0].layout
     if any(valve.layout != layout for valve in valves):
@@ -87,7 +79,7 @@ def fit_shape_model(valves: Sequence[MovingValve], modes: int) -> ShapeModel:
     ]
     if len(shapes) <= modes:
         raise InputError(f"shape model: {len(shapes)} shapes, expected more than {modes} modes")
-    # Every valve counts alike, however many frames it has.
+    # Every valve has the same weight, whatever its number of frames.
     weight = np.concatenate([np.full(len(v.vertices), 1 / len(v.vertices)) for v in valves])
     weight /= weight.sum()
     size = float(np.exp(weight @ [pose_of(v, t, layout).log_scale[0] for v, t in shapes]))
@@ -119,7 +111,7 @@ POSE_STD = np.array([4.0, 4.0, 4.0, 0.25, 0.25, 0.25, 0.12])
 
 
 class Pulls(NamedTuple):
-    """What was seen of some vertices.
+    """Displacements that were detected at some vertices.
 
     Attributes
     ----------
@@ -127,7 +119,7 @@ class Pulls(NamedTuple):
     direction : (m, 3)
         Unit vectors.
     offset : (m,) mm
-        Along the direction, from where the vertex is now.
+        Along the direction.
     std : (m,) mm
     """
 
@@ -157,13 +149,7 @@ class Pulls(NamedTuple):
 def fit_shape(
     model: ShapeModel, pose: Poses, coefficients: FloatArray, pulls: Pulls
 ) -> tuple[Poses, FloatArray]:
-    """Pose (one) and coefficients ``(K,)`` that agree best with pulls on the shape they give.
-
-    Parameters
-    ----------
-    pose : Poses
-        One; where pulls start from, together with ``coefficients (K,)``.
-    """
+    """Pose (one) and coefficients ``(K,)`` that agree best with pulls on their shape."""
     k = len(coefficients)
     local = model.shape(coefficients[None])[0][pulls.vertex] * np.exp(pose.log_scale[0])
     along = pulls.direction @ pose.rotation[0]
@@ -191,14 +177,10 @@ def fit_shape(
 def relax(
     vertices: FloatArray, layout: ValveLayout, pulls: Pulls, stiffness: float, hold: float
 ) -> FloatArray:
-    """Vertices ``(n, 3)`` mm moved smoothly as pulls ask.
+    """Vertices ``(n, 3)`` mm, displaced smoothly by pulls.
 
-    Parameters
-    ----------
-    stiffness : float
-        1/mm^2, on the square of the displacement's second differences between neighbours.
-    hold : float
-        1/mm^2, on the square of the displacement.
+    ``stiffness`` and ``hold`` (1/mm^2) weigh the squares of the displacement's second differences
+    between neighbours, and of the displacement itself.
     """
     n = layout.size
     bend = stiffness * _bending(layout) + hold * sparse.identity(n)
@@ -229,62 +211,50 @@ def _bending(layout: ValveLayout) -> sparse.csr_array:
     return sparse.csr_array(laplacian.T @ laplacian)
 
 
-# -- valves that detectors learn from, and guesses that miss them ---------------------------------
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueValve:
-    """One valve in world coordinates.
-
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-    tips : (2, 3) mm
-    pose : Poses
-        One.
-    """
-
-    vertices: FloatArray
-    tips: FloatArray
-    pose: Poses
-
-    @classmethod
-    def of(cls, vertices: FloatArray, tips: FloatArray, model: ShapeModel) -> TrueValve:
-        """With the pose that a shape model takes it to have."""
-        return cls(vertices, tips, model.pose_of(vertices, tips))
-
-
+# -- training examples ----------------------------------------------------------------------------
 class LabelledFrame(NamedTuple):
-    """A frame to learn from.
+    """A training frame, with the true valve in it.
 
     Attributes
     ----------
     frame : StandardFrame
-    true : TrueValve
-        The valve in it.
+    vertices : (n, 3) mm
+        In the world.
+    tips : (2, 3) mm
+    pose : Poses
+        One.
     model : ShapeModel
     rng : numpy Generator
-        Draws the samples.
+        Draws the examples.
     """
 
     frame: StandardFrame
-    true: TrueValve
+    vertices: FloatArray
+    tips: FloatArray
+    pose: Poses
     model: ShapeModel
     rng: np.random.Generator
 
+    def missed_poses(self, misses: Misses, count: int) -> Poses:
+        """``count`` poses about the true one."""
+        return missed_poses(self.pose, misses, count, self.rng)
+
+    def missed_shapes(self, misses: Misses, count: int) -> FloatArray:
+        """``count`` shapes ``(count, n, 3)`` mm about the true one."""
+        poses, std = self.missed_poses(misses, count), self.model.std
+        exact = self.model.coefficients(self.pose.local(self.vertices[None]))
+        by = self.rng.standard_normal((count, len(std))) * (misses.shape * std)
+        return poses.world(self.model.shape(exact + by))
+
 
 Examples: TypeAlias = tuple[NDArray[np.float32], FloatArray]
-"""Features ``(P, F)`` and what they mean ``(P, outputs)``."""
+"""Features ``(P, F)`` and the outputs to learn ``(P, outputs)``."""
 
 
-@dataclass(frozen=True, slots=True)
-class Misses:
-    """By how much guesses miss a pose or a shape: standard deviations.
+class Misses(NamedTuple):
+    """Standard deviations of guesses from a true pose (shift, turn, size) and shape.
 
-    Attributes
-    ----------
-    shift_mm, turn_degrees, log_scale : float
-        Of the pose.
-    shape : float
-        Of each coefficient, over its standard deviation among valves.
+    That of the shape is of each coefficient, over its standard deviation among valves.
     """
 
     shift_mm: float
@@ -297,12 +267,3 @@ def missed_poses(true: Poses, misses: Misses, count: int, rng: np.random.Generat
     """``count`` guesses of one pose."""
     std = [misses.shift_mm] * 3 + [np.deg2rad(misses.turn_degrees)] * 3 + [misses.log_scale]
     return true.repeated(count).moved(rng.standard_normal((count, 7)) * std)
-
-
-def missed_shapes(seen: LabelledFrame, misses: Misses, count: int) -> FloatArray:
-    """``(count, n, 3)`` mm: guesses of one valve in world coordinates."""
-    _, true, model, rng = seen
-    poses = missed_poses(true.pose, misses, count, rng)
-    exact = model.coefficients(true.pose.local(true.vertices[None]))
-    by = rng.standard_normal((count, len(model.std))) * (misses.shape * model.std)
-    return poses.world(model.shape(exact + by))

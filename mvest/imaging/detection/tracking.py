@@ -1,9 +1,9 @@
 """The valve in all frames of a volume: one trajectory through the hypotheses of every frame.
 
-Each frame has several hypotheses; the trajectory that is likely in every frame and moves no faster
-than a valve does is found by dynamic programming. What was fitted then is smoothed in time as far
-as each vertex was unsure, with a penalty on acceleration; a truncated Fourier series would flatten
-the closure itself.
+Each frame has several hypotheses of the pose. Dynamic programming finds the trajectory that is
+likely in every frame and no faster than a valve. The fitted valves are then smoothed in time where
+vertices are uncertain, with a penalty on acceleration; a truncated Fourier series would flatten the
+closure itself.
 """
 
 from __future__ import annotations
@@ -39,19 +39,11 @@ from mvest.typing import BoolArray, FloatArray
 def smooth_in_time(
     times: FloatArray, points: FloatArray, weight: FloatArray, length_s: FloatArray
 ) -> FloatArray:
-    """Positions ``(T, m, 3)`` mm with little acceleration where they were not sure.
+    """Positions ``(T, m, 3)`` mm, smoothed at times ``(T,)`` s.
 
     Minimises sum w (z - y)^2 dt + length^4 int z''^2 dt on second divided differences (Whittaker,
-    Proc. Edinburgh Math. Soc. 41:63, 1923), so what varies over much less than ``length`` goes.
-
-    Parameters
-    ----------
-    times : (T,) s
-    points : (T, m, 3) mm
-    weight : (T, m)
-        How much each counts, relative to the same point in other frames.
-    length_s : (m,)
-        Over which each is smoothed; where all are 0, nothing is.
+    Proc. Edinburgh Math. Soc. 41:63, 1923), so that variation over much less than ``length_s (m,)``
+    is removed. ``weight (T, m)`` is relative to the same point in other frames.
     """
     count = len(times)
     if count < 3 or not np.any(length_s > 0):
@@ -82,15 +74,14 @@ HYPOTHESES, SHARED = 3, 3
 """Poses from each frame's own search, and best poses of all frames, which every frame tries."""
 
 SPEED_MM_S, STILL_MM = 60.0, 2.0
-"""Standard deviations of the speed at which a hypothesis moves (its annulus), and of its change
-between frames however short their interval: errors."""
+"""Standard deviations of the speed of the annulus, and of its error in each frame."""
 
 SMOOTHING_S = (0.06, 0.015, 0.06)
 """s over which annulus, free edge and papillary tips are smoothed; 0: not at all."""
 
 LOST_BY = 0.2
-"""A frame is searched again, from its neighbours, if its confidence is this much below the best
-frame's."""
+"""A frame is searched again, starting from its neighbours, if its confidence is this much below the
+best frame's."""
 
 
 def detect_valve(
@@ -108,18 +99,18 @@ def detect_valve(
     volume : VolumeSequence
     model : DetectionModel
     min_confidence : float
-        Of the best frame: below it there is no valve.
+        Of the best frame; below it there is no valve.
     landmarks : mapping, optional
-        Placed by hand where the automatic ones failed; they stay where they are.
+        Placed by hand where the detectors fail; they stay where they are.
     progress : callable, optional
-        Called with the number of frames done and of all.
+        Called with the numbers of frames done and of all frames.
 
     Raises
     ------
     NoValveError
-        If no frame shows a valve with some confidence; it holds the best candidate.
+        If no frame shows a valve with this confidence; it holds the best candidate.
     InputError
-        If a frame holds no image, or landmarks name no frame or point that there is.
+        If a frame holds no image, or a landmark's frame or name does not exist.
     """
     by_hand = _checked(landmarks or {}, len(volume.times))
     frames = [standard_frame(volume, k) for k in range(len(volume.times))]
@@ -173,10 +164,9 @@ def _found_again(
     model: DetectionModel,
     by_hand: FloatArray,
 ) -> list[FrameValve]:
-    """The valves, those of lost frames sought again from the frames beside them, surest first.
+    """Search lost frames again, see `LOST_BY`, beside the most confident ones first.
 
-    A frame is lost where another one is surer by `LOST_BY`. What is found again is kept if it is
-    surer than what was there.
+    A new valve replaces the old one if its confidence is higher.
     """
     again = list(valves)
     best = max(valve.confidence for valve in valves)
@@ -199,19 +189,16 @@ def _found_again(
 
 
 def _beside(k: int, valves: list[FrameValve], lost: set[int]) -> list[tuple[float, int]]:
-    """Confidence and number of the frames beside one, those that are not lost."""
+    """Confidence and number of the frames beside one that are not lost."""
     return [
         (valves[j].confidence, j) for j in (k - 1, k + 1) if 0 <= j < len(valves) and j not in lost
     ]
 
 
 def _held(
-    vertices: FloatArray,
-    tips: FloatArray,
-    points: FloatArray,
-    model: DetectionModel,
+    vertices: FloatArray, tips: FloatArray, points: FloatArray, model: DetectionModel
 ) -> tuple[FloatArray, FloatArray]:
-    """One frame with its landmarks where they were placed; the leaflets about them come along."""
+    """One frame with its landmarks where they were placed; leaflets nearby follow."""
     placed = np.isfinite(points[:, 0])
     tips = np.where(placed[-2:, None], points[-2:], tips)
     on = np.flatnonzero(placed[:-2])
@@ -257,48 +244,51 @@ def _with_hands(placed: FloatArray) -> list[int]:
     return [k for k, points in enumerate(placed) if np.isfinite(points).any()]
 
 
+Rated = tuple[Poses, FloatArray]
+"""Hypotheses of a frame, with their ratings."""
+
+
 def _trajectory(
-    frames: list[StandardFrame],
-    times: FloatArray,
-    model: DetectionModel,
-    by_hand: FloatArray,
+    frames: list[StandardFrame], times: FloatArray, model: DetectionModel, by_hand: FloatArray
 ) -> Poses:
     """One pose for every frame."""
-    own: list[tuple[Poses, FloatArray]] = []
-    for k, frame in enumerate(frames):
-        placed = _pose_by_hand(by_hand[k], model)
-        if placed is None:
+    placed = [_pose_by_hand(points, model) for points in by_hand]
+    own: list[Rated] = []
+    for frame, pose in zip(frames, placed, strict=True):
+        if pose is None:
             poses, rating = search_poses(frame, model.boosters, CANDIDATES)
             few = poses.apart(rating, HYPOTHESES)
             own.append((poses[few], rating[few]))
         else:
-            own.append((placed, np.ones(1)))
-    ratings = np.concatenate([rating for _, rating in own])
-    pool = Poses.joined([poses for poses, _ in own])
+            own.append((pose, np.ones(1)))
+    pool, ratings = _joined(own)
     if not len(pool):
-        raise NoValveError("no valve found; there is no place in any frame to look for one at")
+        raise NoValveError("no valve found; no frame has a field of view")
     best = pool[pool.apart(ratings, SHARED)]
-    if (
-        np.isnan(by_hand).all()
-        and np.median([rating[0] for _, rating in own if len(rating)]) < SURE
-    ):
+    first = [rating[0] for _, rating in own if len(rating)]
+    if np.isnan(by_hand).all() and np.median(first) < SURE:
         tried = pool[pool.apart(ratings, TRIED)]
         likeliest = _likeliest_in_all(frames, model, tried)
         best = tried[likeliest : likeliest + 1]
         own = [(poses[_like(poses, best)], rating[_like(poses, best)]) for poses, rating in own]
-    candidates = []
-    for k, frame in enumerate(frames):
-        if _pose_by_hand(by_hand[k], model) is not None:
-            candidates.append(own[k])
-            continue
-        again, rated = refined(frame, model.boosters, best)
-        candidates.append((Poses.joined([own[k][0], again]), np.concatenate([own[k][1], rated])))
+    candidates = [
+        rated if pose is not None else _joined([rated, refined(frame, model.boosters, best)])
+        for frame, pose, rated in zip(frames, placed, own, strict=True)
+    ]
     path = _best_path(candidates, times, model)
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
 
 
+def _joined(parts: list[Rated]) -> Rated:
+    """All hypotheses of several lists."""
+    return (
+        Poses.joined([poses for poses, _ in parts]),
+        np.concatenate([rating for _, rating in parts]),
+    )
+
+
 def _likeliest_in_all(frames: list[StandardFrame], model: DetectionModel, tried: Poses) -> int:
-    """At which of some poses the valve is seen best in a few frames."""
+    """The pose at which the valve has the highest confidence in a few frames."""
     seen = np.zeros(len(tried))
     for k in sorted({0, len(frames) // 2, len(frames) - 1}):
         poses, _ = refined(frames[k], model.boosters, tried)
@@ -307,16 +297,12 @@ def _likeliest_in_all(frames: list[StandardFrame], model: DetectionModel, tried:
 
 
 def _like(poses: Poses, best: Poses) -> BoolArray:
-    """Which poses ``(P,)`` face the way of one, within 60 degrees."""
+    """Which poses ``(P,)`` have the orientation of one within 60 degrees."""
     turn = Rotation.from_matrix(np.swapaxes(best.rotation[:1], 1, 2) @ poses.rotation)
     return np.asarray(turn.magnitude() < np.deg2rad(60.0))
 
 
-def _best_path(
-    candidates: list[tuple[Poses, FloatArray]],
-    times: FloatArray,
-    model: DetectionModel,
-) -> list[int]:
+def _best_path(candidates: list[Rated], times: FloatArray, model: DetectionModel) -> list[int]:
     """The hypothesis of each frame on the likeliest trajectory (Viterbi)."""
     points = np.concatenate([model.shape.mean[model.shape.layout.annulus[::4]], model.shape.tips])
     where = [poses.world(points) for poses, _ in candidates]
@@ -326,7 +312,7 @@ def _best_path(
         gap = where[k][:, None] - where[k - 1][None]
         moved = np.linalg.norm(gap, axis=3).mean(axis=2)
         std = np.hypot(STILL_MM, SPEED_MM_S * (times[k] - times[k - 1]))
-        # Bounded, so that one frame gone wrong does not drag the others along.
+        # Bounded, so that one wrong frame does not move the others.
         step = np.minimum(0.5 * (moved / std) ** 2, 8.0) + total[None]
         back.append(np.argmin(step, axis=1))
         total = cost[k] + step.min(axis=1)
@@ -337,7 +323,7 @@ def _best_path(
 
 
 def _pose_by_hand(points: FloatArray, model: DetectionModel) -> Poses | None:
-    """The pose that lays the mean valve on landmarks ``(L, 3)``, if there are four or more."""
+    """The pose that fits the mean valve to landmarks ``(L, 3)``, if there are four or more."""
     placed = np.isfinite(points[:, 0])
     if placed.sum() < POSE_LANDMARKS:
         return None

@@ -1,4 +1,4 @@
-"""All detectors together with the shapes they know, as one file."""
+"""A trained model: all detectors with their shape model, as one file."""
 
 from __future__ import annotations
 
@@ -39,17 +39,16 @@ OUTPUTS: Final = {
     "free_edge": 2,
     "boundary": 1,
 }
-"""How many outputs each set of trees has."""
+"""Number of outputs of each set of trees."""
 
 STAGES: Final = tuple(OUTPUTS)
 """Names of all sets of trees."""
 
 MAX_FILE_SIZE = 2**28
-"""Bytes; the model that comes with the package has a few millions."""
+"""Bytes; the model of the package has some 10 million."""
 
 MAX_REASON = 120
 """Characters of another library's message that an error quotes."""
-
 
 UNLIKE_SHARE = 0.02
 """Share of volumes drawn as in training that are expected to count as unlike them."""
@@ -57,7 +56,7 @@ UNLIKE_SHARE = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionAccuracy:
-    """Errors of the detectors on simulated volumes that they have not seen.
+    """Errors of the detectors on held-out simulated volumes.
 
     Attributes
     ----------
@@ -69,13 +68,11 @@ class DetectionAccuracy:
     tip_samples : (S, F, 2, 3)
     widening : (float, float)
         Factor on the errors of a volume of confidence 1, and the exponent by which it grows for
-        each unit of confidence that is lacking.
+        each unit less.
     like_from : float
-        Confidence below which a volume is unlike those of training: of these, `UNLIKE_SHARE` are
-        expected there.
+        Confidence below which a volume is unlike those of training, see `UNLIKE_SHARE`.
     shapes : (S, F, n, 3) mm or None
-        Where the valves of these sequences were found, each frame in its own axes (`pose_of`).
-        None in a model that was saved without them.
+        Detected valves of these sequences, each frame in its own axes (`pose_of`).
     tip_shapes : (S, F, 2, 3) mm or None
     """
 
@@ -89,7 +86,7 @@ class DetectionAccuracy:
     tip_shapes: FloatArray | None = None
 
     def at(self, confidence: float) -> DetectionAccuracy:
-        """Errors in a volume of some confidence: wider about their mean the less it is."""
+        """Errors in a volume of some confidence: wider about their mean the lower it is."""
         factor = self.factor(confidence)
         mean, tip_mean = self.samples.mean(axis=0), self.tip_samples.mean(axis=0)
         return replace(
@@ -129,7 +126,7 @@ HALVED: Final = ("n", "S")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionModel:
-    """Everything that was learned.
+    """Trained detectors and their shape model.
 
     Attributes
     ----------
@@ -137,9 +134,9 @@ class DetectionModel:
     boosters : mapping
         One for each of :data:`STAGES`.
     trained_on : mapping
-        Plain values: what made it (configuration, seeds, numbers of valves and volumes, versions).
+        Provenance: configuration, seeds, numbers of valves and volumes, versions.
     accuracy : DetectionAccuracy, optional
-        Measured on held-out data; None for a model that was never tested.
+        None for a model that was never tested.
     sha256 : str
         Of the file it was read from.
     """
@@ -152,13 +149,7 @@ class DetectionModel:
 
 
 def save_model(path: Path | str, model: DetectionModel) -> None:
-    """Write a model as one ``.npz``: arrays, trees as LightGBM's text, provenance as JSON.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
+    """Write a model as one ``.npz``: arrays, trees as LightGBM's text, provenance as JSON."""
     shape = model.shape
     about = {
         "format": FORMAT,
@@ -185,10 +176,7 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
 def load_model(path: Path | str) -> DetectionModel:
     """Read a model; nothing in the file is executed or unpickled.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, is no such model, is of another version, or is incomplete.
+    InputError if the file is missing, incomplete, or no model of this version.
     """
     source = Path(path)
     raw = read_bytes(source, MAX_FILE_SIZE)
@@ -204,13 +192,7 @@ def load_model(path: Path | str) -> DetectionModel:
 
 
 def default_model() -> DetectionModel:
-    """The model that comes with the package, trained on simulated transoesophageal echo.
-
-    Raises
-    ------
-    InputError
-        If the package holds none, or it cannot be read.
-    """
+    """The model of the package, trained on simulated transoesophageal echo."""
     if not MODEL_FILE.is_file():
         raise InputError(
             f"{MODEL_FILE}: no trained detectors come with this installation; expected the tee.npz "

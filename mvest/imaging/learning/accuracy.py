@@ -1,4 +1,4 @@
-"""How far detectors are off in held-out volumes, and over what distance alike."""
+"""Errors of the detectors in held-out volumes, and over which distance they are correlated."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ BIN_MM = 1.0
 """mm, width of the bins of distances."""
 
 FARTHEST_MM = 30.0
-"""mm, pairs farther apart say nothing about the length over which neighbours are alike."""
+"""mm, largest distance of pairs from which the correlation length is fitted."""
 
 LENGTHS_MM = (0.5, 60.0)
-"""mm, between which the length is looked for."""
+"""mm, range of the correlation length."""
 
 NORMAL_95 = 1.959963984540054
 """Standard deviations on either side that hold 95 % of a normal distribution."""
 
 
 def matern(distance: FloatArray, length: float) -> FloatArray:
-    """Matérn correlation of smoothness 3/2, which estimators take errors to have.
+    """Matérn correlation of smoothness 3/2, which the estimation assumes.
 
     ``(1 + sqrt(3) d / l) exp(-sqrt(3) d / l)`` (Rasmussen and Williams, Gaussian Processes for
     Machine Learning, 2006, eq. 4.17).
@@ -36,21 +36,9 @@ def matern(distance: FloatArray, length: float) -> FloatArray:
 
 
 def correlogram(errors: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How alike errors are at two vertices, by the vertices' straight distance.
+    """Mean distance (mm) and correlation ``(B,)`` of the errors of pairs of vertices, in bins.
 
-    Parameters
-    ----------
-    errors : (m, n)
-        Of m independent fields, each about zero.
-    points : (n, 3) mm
-        Where the vertices are at rest.
-
-    Returns
-    -------
-    distance : (B,) mm
-        Mean distance of the pairs of each bin, up to 30 mm.
-    correlation : (B,)
-        Mean over these pairs, errors over their standard deviations.
+    ``errors (m, n)`` are m independent fields, each about zero, at ``points (n, 3)`` mm at rest.
     """
     size = np.sqrt((errors**2).mean(axis=0))
     if not (np.isfinite(size).all() and (size > 0).all()):
@@ -68,7 +56,7 @@ def correlogram(errors: FloatArray, points: FloatArray) -> tuple[FloatArray, Flo
 
 
 def fitted_length(distance: FloatArray, correlation: FloatArray) -> float:
-    """The length (mm) of the Matérn correlation that is nearest to a correlogram, bin by bin."""
+    """The length (mm) of the Matérn correlation nearest to a correlogram (least squares)."""
 
     def miss(log_length: float) -> float:
         return float(((matern(distance, np.exp(log_length)) - correlation) ** 2).sum())
@@ -81,7 +69,11 @@ def fitted_length(distance: FloatArray, correlation: FloatArray) -> float:
 def measure_accuracy(
     samples: FloatArray, tip_samples: FloatArray, rest: FloatArray
 ) -> DetectionAccuracy:
-    """What held-out sequences say of the detectors' errors.
+    """Errors of the detectors from held-out sequences.
+
+    The standard deviation of a vertex is the root mean square over sequences, frames and
+    coordinates of its errors about their mean over the sequences (in each frame and coordinate, so
+    that S - 1 of S are free). InputError if it is zero or not finite.
 
     Parameters
     ----------
@@ -90,18 +82,6 @@ def measure_accuracy(
     tip_samples : (S, F, 2, 3) mm
     rest : (n, 3) mm
         The mean valve at rest.
-
-    Returns
-    -------
-    DetectionAccuracy
-        The standard deviation of a vertex is the root mean square over sequences, frames and
-        coordinates of its errors about their mean over the sequences (in each frame and coordinate,
-        so that S - 1 of S are free).
-
-    Raises
-    ------
-    InputError
-        If there are no errors at some vertex, or one is not finite.
     """
     count, frames, n = samples.shape[:3]
     about = samples - samples.mean(axis=0)
@@ -116,25 +96,24 @@ def widened(
     wide: FloatArray,
     wide_confidence: FloatArray,
 ) -> DetectionAccuracy:
-    """What is stated of a volume by its own confidence, so that 95 % of coordinates lie within.
+    """The errors with `DetectionAccuracy.widening` and `like_from`, by the confidence of volumes.
 
-    The factor on errors is exponential in the confidence that is lacking. Its growth is that of the
-    errors' size (least squares over volumes); its start is such that of all coordinates of all
-    volumes 95 % lie within 1.96 of what is stated. A volume is unlike those of the sequences where
-    its confidence is below the k-th smallest of theirs: one more of S is there in k of S + 1 cases,
-    however confidence is distributed (David and Nagaraja, Order Statistics, 2003, sec. 7.3), and
-    that is at most `UNLIKE_SHARE`, if S allows (`unlike_share`).
+    The factor on errors is exponential in the missing confidence. Its exponent is fitted to the
+    size of the errors (least squares over volumes); with its start 95 % of all coordinates of all
+    volumes lie within 1.96 standard deviations. A volume is unlike the sequences if its confidence
+    is below the k-th smallest of theirs: one more of S is there in k of S + 1 cases, whatever the
+    distribution (David and Nagaraja, Order Statistics, 2003, sec. 7.3), which is at most
+    `UNLIKE_SHARE`, if S allows (`unlike_share`).
 
     Parameters
     ----------
     accuracy : DetectionAccuracy
-        Measured; each of its S sequences is compared with the others, as one that is none of them.
+        Each of its S sequences is compared with the others.
     confidence : (S,)
         Of these sequences.
     wide : (W, F, n, 3) mm
         Errors of further sequences, of other valves and over wider acquisitions.
     wide_confidence : (W,)
-
     """
     samples, std = accuracy.samples, accuracy.std_mm
     count, frames = samples.shape[:2]
@@ -162,16 +141,10 @@ def widened(
 
 
 def unlike_share(count: int) -> float:
-    """Share of volumes like ``count`` sequences that counts as unlike them: see `widened`."""
+    """Share of volumes like ``count`` sequences that count as unlike them, see `widened`."""
     return max(1, int(UNLIKE_SHARE * (count + 1))) / (count + 1)
 
 
 def share_within(errors: FloatArray, std_mm: FloatArray) -> float:
-    """Share of coordinates of held-out errors that lie within 1.96 standard deviations.
-
-    Parameters
-    ----------
-    errors : (S, F, n, 3) mm
-    std_mm : (n,)
-    """
+    """Share of errors ``(S, F, n, 3)`` mm within 1.96 standard deviations ``(n,)``."""
     return float((np.abs(errors) <= NORMAL_95 * std_mm[:, None]).mean())

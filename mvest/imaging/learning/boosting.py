@@ -1,9 +1,8 @@
-"""Gradient-boosted trees (LightGBM), several outputs side by side, kept as plain text.
+"""Gradient-boosted trees (LightGBM) for several outputs, stored as plain text.
 
-LightGBM grows trees and writes them (``Booster.model_to_string``, "version=v4"). It does not read
-them again, because it trusts the text: a child or a feature that does not exist is read from memory
-that is not the trees' own, and a number that is none ends the process. Trees are plain arrays here,
-checked once, and their answers are the same to the last bit.
+LightGBM grows trees and writes them (``Booster.model_to_string``, "version=v4"). Its own reader
+trusts the text: an index out of range reads foreign memory, and a malformed number ends the
+process. Here the text becomes plain arrays, checked once, whose outputs are the same bit for bit.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ class BoostSettings:
     ----------
     trees, leaves : int
     rate : float
-        Share of each tree's answer that is taken.
+        Learning rate.
     min_leaf_samples : int
-        Samples that a leaf holds at least.
+        Least samples of a leaf.
     share_features : float
-        Of what there is, drawn anew for every tree.
+        Of the features, drawn for every tree.
     """
 
     trees: Count = 80
@@ -47,23 +46,23 @@ class BoostSettings:
 
 
 SHARE_ROWS = 0.7
-"""Of the samples, drawn anew for every tree."""
+"""Of the samples, drawn for every tree."""
 
 END: Final = "end of trees\n"
 WRITTEN: Final = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1"}
-"""What the head of every text says."""
+"""Required entries of the head."""
 
 OF_NODES: Final = ("split_feature", "threshold", "left_child", "right_child", "decision_type")
-"""What a tree has one of for each node."""
+"""Fields with one value for each node of a tree."""
 
 FIELDS: Final = {
     **dict.fromkeys((*OF_NODES, "num_leaves", "num_cat", "is_linear"), np.int64),
     **dict.fromkeys(("threshold", "leaf_value"), np.float64),
 }
-"""What is read of every tree, and its type."""
+"""Fields of every tree, and their types."""
 
 IS_PROBABILITY: Final = {"regression": False, "cross_entropy": True}
-"""Whether answers are the logistic function of the sums of trees, by the objective."""
+"""Objective -> whether outputs are the logistic function of the sums of trees."""
 
 
 class _Trees(NamedTuple):
@@ -76,8 +75,7 @@ class _Trees(NamedTuple):
     feature, threshold : (N,)
         Of each node.
     children : (N, 2)
-        Where it goes on if the feature is at most the threshold, and where otherwise: to a node, or
-        to leaf k if the number is -1 - k.
+        Next if the feature is at most the threshold, and otherwise: a node, or leaf k as -1 - k.
     values : (L,)
         Of all leaves.
     """
@@ -90,23 +88,14 @@ class _Trees(NamedTuple):
 
 
 class Boosters:
-    """Trees for each of several outputs of the same features.
+    """Trees for each of several outputs of the same features, from the texts of LightGBM.
 
-    Parameters
-    ----------
-    texts : tuple of str
-        As LightGBM writes trees, one for each output.
-    source : str
-        Named in errors.
-
-    Raises
-    ------
-    InputError
-        If there is no text, one is malformed, or they look at different features.
+    InputError, which names the ``source``, if there is no text, one is malformed, or their numbers
+    of features differ.
     """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
-        # Up to the last tree: what follows tells of the training.
+        # Without the lines after the last tree, which describe the training.
         self.texts, self._source = tuple(text.partition(END)[0] + END for text in texts), source
         try:
             read = [_read(text) for text in texts]
@@ -159,10 +148,8 @@ def _sums(x: NDArray[np.float32], trees: _Trees) -> FloatArray:  # pragma: no co
 def _read(text: str) -> tuple[int, bool, _Trees]:
     """Number of features, whether outputs are probabilities, and the trees in a text.
 
-    Raises
-    ------
-    ValueError, LookupError
-        If something is missing, or a node leads to anything but later nodes and leaves of its tree.
+    ValueError or LookupError if something is missing, or a node leads to anything but later nodes
+    and leaves of its tree.
     """
     whole, end, _ = text.partition(END)
     head, _, body = whole.partition("\nTree=")
@@ -216,12 +203,10 @@ def train_boosters(
 ) -> Boosters:
     """Grow trees for every column of ``y (P, outputs)``.
 
-    Parameters
-    ----------
-    objective : str
-        ``regression`` (least squares), or ``cross_entropy`` (probability; labels from 0 to 1).
+    The objective is ``regression`` (least squares), or ``cross_entropy`` (probability; labels from
+    0 to 1).
     """
-    import lightgbm  # here, as it takes a second that what only uses trees need not wait
+    import lightgbm  # here, as it takes a second, which detection does not need
 
     parameters = {
         "objective": objective,

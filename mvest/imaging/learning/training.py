@@ -1,11 +1,11 @@
-"""Learning the detectors from simulated volumes whose valves are known.
+"""Training of the detectors on simulated volumes with known valves.
 
-Every volume is simulated, sampled for all stages at once and forgotten: guesses of every stage are
-missed by set amounts (each stage says which), so that no stage waits for the one before it.
+Every volume is simulated, sampled for all stages at once and discarded. Each stage makes its own
+hypotheses with errors of given size, so that no stage waits for the one before it.
 
-Half of the volumes are made worse at random, so that detectors do not count on one scanner's image:
-by blur, noise that grows with the distance from one side, and a threshold, none of which a setting
-of the simulator does. What is done, and how much, is a choice.
+Half of the volumes are degraded at random, so that detectors do not depend on one scanner's image:
+by blur, noise that grows with the distance from one side, and a threshold, none of which is a
+setting of the simulator. Kinds and amounts are a choice.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.leaflets import RIMS, boundary_samples, landmark_samples, rim_samples
+from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.pose_search import (
     MODES,
     REFINED,
@@ -31,7 +32,7 @@ from mvest.imaging.detection.pose_search import (
     search_poses,
     shape_start_samples,
 )
-from mvest.imaging.detection.shape_model import Examples, LabelledFrame, ShapeModel, TrueValve
+from mvest.imaging.detection.shape_model import Examples, LabelledFrame, ShapeModel
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, Trees, train_boosters
 from mvest.imaging.simulator.acquisition import Acquisition, Setting, draw_acquisition, draw_probe
@@ -43,13 +44,8 @@ from mvest.quantities import Count, within
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
 
-SEARCH_STAGES = (
-    "position",
-    "pose_coarse",
-    "pose_fine",
-    *(f"pose_refine_{k}" for k in range(len(REFINEMENTS))),
-)
-"""Stages of the search for poses, of which a draft is made from the first volumes."""
+SEARCH_STAGES = tuple(name for name in STAGES if name.startswith(("position", "pose_")))
+"""Stages of the search for poses, of which a draft is trained on the first volumes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,15 +73,14 @@ class TrainingSettings:
     samples : SampleCounts
     boosting : BoostSettings
     many_trees : int
-        For the stages on which most depends, or that have most samples: the ratings of poses and
-        the boundary.
+        For the most important stages: the ratings of poses and the boundary.
     volumes : int
         Simulated: one frame each, of the valves in turn.
     draft_volumes : int
-        So many of them, the first ones, make a draft of the search for poses; from the others what
-        it mistakes for a valve is learned too.
+        The first volumes, which train a draft of the search for poses. The others also give samples
+        of the draft's mistakes.
     acquisition : Acquisition
-        About which the renderings vary.
+        About which acquisitions are drawn.
     """
 
     modes: Annotated[int, within(MODES, 1000, "", "as many as are read off, or more")] = 40
@@ -102,8 +97,8 @@ def draw_samples(
 ) -> Mapping[str, Examples]:
     """Samples of all stages from one frame, by the stage's name.
 
-    The final rating also learns from what a draft's search takes for valves: half of these poses
-    are those rated best, the others some of the rest.
+    The final rating also gets poses that a draft's search finds: half of them the best rated, half
+    drawn from the others.
     """
     mistaken = None
     if draft is not None:
@@ -137,8 +132,7 @@ def render_frame(
 ) -> tuple[VolumeSequence, ValveSequence]:
     """A simulated volume of one frame of a valve, and the valve in it.
 
-    Probe and rendering are drawn at random. With ``degraded`` the volume is made worse besides, see
-    :mod:`mvest.imaging.learning.training`.
+    Acquisition and probe are drawn at random; the volume may be ``degraded``, see `degrade`.
     """
     rng = np.random.default_rng(seed)
     acquisition = draw_acquisition(rng, base, spread)
@@ -157,32 +151,19 @@ def volume_samples(
 ) -> dict[str, NDArray[np.float32]]:
     """Simulate one training volume and sample it for all stages.
 
-    Parameters
-    ----------
-    valve : MovingValve
-        Of N valves the one with the number ``number % N``.
-    number : int
-        Of the volume, from 0 on. It does not depend on how many others there are.
-    shape : ShapeModel
-    settings : TrainingSettings
-    seed : int
-        Of the training.
-    draft : mapping, optional
-        Of `SEARCH_STAGES`, for all but the first volumes.
-
-    Returns
-    -------
-    dict
-        ``STAGE.x`` and ``STAGE.y``, see `mvest.imaging.detection.shape_model.Examples`.
+    ``number`` of the volume and ``seed`` of the training determine it, whatever the number of
+    volumes. A ``draft`` of `SEARCH_STAGES` is given for all but the first volumes. Returns
+    ``STAGE.x`` and ``STAGE.y``, see `mvest.imaging.detection.shape_model.Examples`.
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
     volume, seen = render_frame(
         valve, which, settings.acquisition, "training", render, degraded=True
     )
-    true = TrueValve.of(seen.vertices[0], seen.tips[0], shape)
+    true = seen.vertices[0], seen.tips[0]
+    pose = pose_of(*true, shape.layout, shape.size_mm)
     rng = np.random.default_rng(sample.spawn(1)[0])
-    labelled = LabelledFrame(standard_frame(volume, 0), true, shape, rng)
+    labelled = LabelledFrame(standard_frame(volume, 0), *true, pose, shape, rng)
     samples = draw_samples(labelled, settings.samples, draft)
     found: dict[str, NDArray[np.float32]] = {}
     for name, (x, y) in samples.items():
@@ -197,18 +178,7 @@ def train_stage(
     settings: TrainingSettings,
     seed: int,
 ) -> Boosters:
-    """Trees of one stage from its samples.
-
-    Parameters
-    ----------
-    name : str
-        One of :data:`mvest.imaging.detection.trained_model.STAGES`.
-    x, y : (P, F), (P, outputs)
-        Samples of all volumes.
-    settings : TrainingSettings
-    seed : int
-        Of the training.
-    """
+    """Trees of a stage from samples ``x (P, F)`` and ``y (P, outputs)`` of all volumes."""
     boosting, seed = settings.boosting, seed + 1000 * STAGES.index(name)
     if name in MANY_TREES:
         boosting = replace(boosting, trees=settings.many_trees)
@@ -217,18 +187,14 @@ def train_stage(
 
 
 SHARE = 0.5
-"""Of the volumes that are changed at all, and of each change among those."""
+"""Of the volumes that are degraded, and of each kind of degradation among those."""
 
-MAX_BLUR_VOXELS = 1.3
-MAX_NOISE = 45.0
-"""Grey values of 255, standard deviation where noise is largest."""
-
-MAX_CUT = 70.0
-"""Grey values below which an image is cut off, at most."""
+MAX_BLUR_VOXELS, MAX_NOISE, MAX_CUT = 1.3, 45.0, 70.0
+"""Largest blur, and in grey values of 255 the largest standard deviation and threshold."""
 
 
 def degrade(volume: VolumeSequence, rng: np.random.Generator) -> VolumeSequence:
-    """A volume of grey values from 0 to 255 (uint8), changed at random; 0 stays 0."""
+    """A volume of grey values from 0 to 255 (uint8), degraded at random; 0 stays 0."""
     if rng.random() >= SHARE:
         return volume
     blurs, noises, cuts = rng.random(3) < SHARE

@@ -1,10 +1,7 @@
-"""How a simulated echo volume is acquired: every setting with its unit and range, and the probe.
+"""Settings of the simulated scanner, the pose of the probe, and how both are drawn.
 
 Levels in dB are of amplitude, relative to the root mean square of fully developed speckle of an
 echo strength of 0 dB, seen face on and without attenuation.
-
-Acquisitions are drawn from the ranges that detectors are trained in, or from ranges outside of
-them.
 """
 
 from __future__ import annotations
@@ -33,7 +30,7 @@ SPEED_OF_SOUND = 1540.0
 """m/s, mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
 
 LARGEST = 1000.0
-"""Size of any setting, in its unit."""
+"""Largest size of any setting, in its unit."""
 
 BOUNDS = {
     **dict.fromkeys(
@@ -71,15 +68,14 @@ class Acquisition:
         One way, of tissue (0.5) and blood (0.15 to 0.2) (Duck, Physical Properties of Tissue,
         1990).
     compensation_db_per_cm_mhz : float
-        One way, what the time gain compensation makes good; it also amplifies electronic noise.
+        One way, of the time gain compensation, which also amplifies electronic noise.
     shadow_db_per_cm : float
-        One way, added in dense tissue (parts of the annulus), so that it casts shadows.
+        One way, added in dense tissue (parts of the annulus), which casts shadows.
     angle_exponent, angle_floor_db : float
         Walls and leaflets send the share ``floor + (1 - floor) |n . beam|^exponent`` of their echo.
-    dropout : float
-        Share of the leaflets in patches that send hardly any echo, 0 to 0.6.
-    dropout_db : float
-        Echo within such patches, under the leaflets' own.
+    dropout, dropout_db : float
+        Share of the leaflets in patches with hardly any echo, 0 to 0.6, and level of that echo
+        under the leaflets' own.
     blood_db, electronics_db, haze_db : float
         Noise: of blood (blurred as tissue is), of the electronics (at the nearest depth), and of
         reverberations close to the probe.
@@ -92,7 +88,7 @@ class Acquisition:
     beats : int
         Sub-sectors in azimuth, one per heart beat, from which the volume is stitched.
     beat_shift_mm, beat_turn_deg : float
-        Standard deviation of each component by which the scene is displaced and turned in a beat.
+        Standard deviation of each component of the scene's displacement and turn in a beat.
     scatterers_per_cell : float
         In a resolution cell at the depth of the valve; at least 10 give fully developed speckle
         (Wagner et al., IEEE Trans. Sonics Ultrason. 30, 1983).
@@ -104,7 +100,7 @@ class Acquisition:
     Raises
     ------
     InputError
-        If a setting is not finite or has no meaning.
+        If a setting is not finite or out of range.
     """
 
     frequency_mhz: Frequency = 5.0
@@ -173,7 +169,7 @@ class Acquisition:
 
 
 Setting: TypeAlias = Literal["training", "wide", "shifted"]
-"""From which ranges an acquisition is drawn."""
+"""Ranges from which an acquisition is drawn, see `RANGES`."""
 
 Interval: TypeAlias = tuple[float, float]
 
@@ -204,34 +200,21 @@ RANGES: dict[str, tuple[Literal["times", "plus"], Interval, tuple[Interval, ...]
     "beat_shift_mm": ("times", (0.0, 1.5), ((1.6, 2.5),)),
     "beat_turn_deg": ("times", (0.0, 1.5), ((1.6, 2.5),)),
 }
-"""How each setting varies about that of the base: whether what is drawn multiplies it or is added
-to it, within which interval in training, and within which shifted ones.
+"""Variation of each setting about the base: whether the draw multiplies it or is added to it, its
+interval in training, and the shifted ones.
 
-Shifted acquisitions are what detectors never saw: apart from echo strengths and compensation, every
+Shifted acquisitions are new to the detectors: apart from echo strengths and compensation, every
 range is disjoint from that of training, and mostly on the worse side. The widths are a choice.
 """
 
 
 def draw_acquisition(
-    rng: np.random.Generator,
-    base: Acquisition | None = None,
-    spread: str = "training",
+    rng: np.random.Generator, base: Acquisition | None = None, spread: str = "training"
 ) -> Acquisition:
-    """An acquisition drawn about a base, each setting by itself; the result records every value.
+    """An acquisition drawn about a base (default: the default one), each setting by itself.
 
-    Parameters
-    ----------
-    rng : numpy Generator
-    base : Acquisition, optional
-        The default one if none is given.
-    spread : "training", "wide" or "shifted"
-        In `RANGES`: within the ranges of training, outside of them, or wide: each setting inside or
-        outside, half and half, or with chances of one to two where both sides lie outside.
-
-    Raises
-    ------
-    InputError
-        If no spread has that name, or a value drawn makes no sense as an acquisition's.
+    The ``spread`` is "training", "shifted", or "wide": each setting from one of all its `RANGES`.
+    InputError if it is none of these, or a drawn value is out of range.
     """
     base = base or Acquisition()
     if spread not in (known := get_args(Setting)):
@@ -248,7 +231,7 @@ def draw_acquisition(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Probe:
-    """Pose of the valve as seen from the probe, which scans from the world's origin along z.
+    """Pose of the valve relative to the probe, which scans from the world's origin along z.
 
     The axes of the world (LPS, mm) are azimuth, in which beats are stitched, elevation and beam.
 
@@ -287,23 +270,18 @@ def draw_probe(
     """A probe behind the atrium.
 
     Distance and tilt are uniform within their ranges, the roll and the direction of the tilt over
-    the full circle; the valve's direction is uniform over those in which a ball around the valve
+    the full circle. The valve's direction is uniform over those in which a ball around the valve
     lies in the pyramid (straight ahead, if it fits nowhere). The ranges are a choice.
 
     Parameters
     ----------
     rng : numpy Generator
     acquisition : Acquisition, optional
-        Whose pyramid holds the valve; the default one if none is given.
+        Its pyramid holds the valve; the default one if none is given.
     distance_mm : (float, float)
-        From the apex to the valve's origin.
+        From the apex to the valve's origin, more than `RADIUS_MM`.
     tilt_deg : (float, float)
-        Between the valve's axis and the line of sight to the probe.
-
-    Raises
-    ------
-    InputError
-        If a range is not one, or a distance is less than `RADIUS_MM`.
+        Between the valve's axis and the line of sight to the probe, at most 90.
     """
     acquisition = acquisition or Acquisition()
     for name, (low, high) in (("distance_mm", distance_mm), ("tilt_deg", tilt_deg)):

@@ -26,7 +26,7 @@ DECIBEL = np.log(10.0) / 20.0
 
 
 class Losses(NamedTuple):
-    """What is lost on the way to a sample and back, on a coarse grid over the whole pyramid.
+    """Attenuation on a coarse grid over the whole pyramid.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ def _lost(losses: Losses, azimuth: float, elevation: float, distance: float) -> 
 def add_noise(
     signal: Float32Array, level: FloatArray, start: FloatArray, step: FloatArray, losses: Losses
 ) -> None:
-    """Scale noise to a level over distance, less what is lost on the way."""
+    """Scale noise to a level over distance, less the attenuation."""
     for a in range(signal.shape[0]):
         for e in range(signal.shape[1]):
             for d in range(signal.shape[3]):
@@ -120,10 +120,10 @@ def deposit(
     step: FloatArray,
     losses: Losses,
 ) -> None:
-    """Add every scatterer's echo to the eight samples around it, with the phase of its place.
+    """Add every scatterer's echo to the eight samples around it, with its phase.
 
-    The amplitude is divided by the root of the resolution cell's size there, so that tissue is as
-    bright at any depth, and changed by ``gain`` dB/mm times distance less the loss.
+    The amplitude is divided by the root of the resolution cell's size, so that tissue is equally
+    bright at any depth, and changed by ``gain`` dB/mm times distance less the attenuation.
     """
     n0, n1, n2 = signal.shape[0], signal.shape[1], signal.shape[3]
     for i in range(len(points)):
@@ -153,7 +153,7 @@ def deposit(
 def blur_across(
     signal: Float32Array, azimuth: Float32Array, elevation: Float32Array
 ) -> Float32Array:
-    """Convolve along both angles; what is not covered by the kernels falls away."""
+    """Convolve along both angles, without the margins of the kernels."""
     n0, n1 = signal.shape[0] - len(azimuth) + 1, signal.shape[1] - len(elevation) + 1
     n2 = signal.shape[3]
     out = np.zeros((n0, n1, 2, n2), dtype=np.float32)
@@ -204,10 +204,10 @@ class Axis:
     start, step : float
         First sample and spacing, mm or rad.
     count : int
-        Samples shown; the blur also needs ``margin`` more at either end.
+        Samples shown; the blur needs ``margin`` more at either end.
     kernel : (2 margin + 1,) float32
-        Blur of the samples, such that a point spread over its two neighbours by linear weights gets
-        the amplitude 1 and the full width at half maximum wanted.
+        Blur of the samples; with it a point spread over its two neighbours by linear weights has
+        the amplitude 1 and the right full width at half maximum.
     energy : float
         Integral of the squared amplitude of a point's image, mm or rad.
     """
@@ -272,7 +272,7 @@ class BeamGrid:
 
     @classmethod
     def of(cls, a: Acquisition) -> BeamGrid:
-        """The grid that samples an acquisition's point spread function well enough."""
+        """The grid that resolves an acquisition's point spread function."""
         half_a, half_e = math.radians(a.azimuth_deg) / 2, math.radians(a.elevation_span_deg) / 2
         lateral, elevation = math.radians(a.lateral_deg), math.radians(a.elevation_deg)
         return cls(
@@ -296,12 +296,7 @@ class BeamGrid:
 def losses_of(grid: BeamGrid, echoes: Echoes, contact: FloatArray) -> Losses:
     """Attenuation by the scatterers' tissue, summed along each beam.
 
-    Parameters
-    ----------
-    grid : BeamGrid
-    echoes : Echoes
-    contact : (p, q) dB
-        Gain over the pyramid, at directions evenly spaced from edge to edge.
+    ``contact (p, q)`` dB is a gain over the pyramid, at directions evenly spaced from edge to edge.
     """
     axes = (grid.azimuth, grid.elevation, grid.distance)
     wide = (2.2, 2.2, 3.0)
@@ -312,7 +307,7 @@ def losses_of(grid: BeamGrid, echoes: Echoes, contact: FloatArray) -> Losses:
     start[2] = max(start[2], 0.5 * step[2])
     loss = np.zeros(count, dtype=np.float32)
     add_losses(loss, echoes.points, echoes.loss, start, step)
-    # mm to cm, there and back; of the own cell half.
+    # mm to cm, there and back; half of the own cell.
     path = (0.2 * step[2]) * (np.cumsum(loss, axis=2) - 0.5 * loss)
     p, q = (np.linspace(0, n - 1, m) for n, m in zip(contact.shape, count[:2], strict=True))
     i, j = (np.minimum(v.astype(int), n - 2) for v, n in zip((p, q), contact.shape, strict=True))
@@ -331,36 +326,18 @@ def render_window(
 ) -> Float32Array:
     """Envelope of the signal in the azimuths of one beat ``(a, E, D)``, 1 being 0 dB.
 
-    Parameters
-    ----------
-    grid : BeamGrid
-    echoes : Echoes
-        As displaced in this beat.
-    losses : Losses
-    window : (int, int)
-        First and past the last azimuth.
-    rng : numpy Generator
-        Of the noise.
+    The ``window`` is the first azimuth and the one past the last, and ``rng`` draws the noise.
     """
     a = grid.acquisition
     az, el, along = grid.azimuth, grid.elevation, grid.distance
     first = window[0] - az.margin
-    shape = (
-        window[1] - window[0] + 2 * az.margin,
-        el.count + 2 * el.margin,
-        2,
-        along.count + 2 * along.margin,
-    )
-    start = np.array(
-        [
-            az.start + first * az.step,
-            el.start - el.margin * el.step,
-            along.start - along.margin * along.step,
-        ]
-    )
+    wide = window[1] - window[0] + 2 * az.margin
+    shape = (wide, el.count + 2 * el.margin, 2, along.count + 2 * along.margin)
+    corner = [x.start + n * x.step for x, n in ((az, first), (el, -el.margin))]
+    start = np.array([*corner, along.start - along.margin * along.step])
     step = np.array([az.step, el.step, along.step])
     distance = start[2] + step[2] * np.arange(shape[3])
-    # Complex Gaussian noise of mean power 1, times what blood and reverberations have of it.
+    # Complex Gaussian noise of mean power 1, scaled to blood and reverberations.
     signal = rng.standard_normal(shape, dtype=np.float32)
     signal *= np.float32(math.sqrt(0.5))
     gain_per_mm = (

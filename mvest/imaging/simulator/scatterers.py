@@ -1,6 +1,6 @@
-"""Tissue as sheets and cords that move, and the scatterers in it, fixed to the tissue.
+"""Moving tissue as sheets and cords, with scatterers fixed to it.
 
-A scatterer keeps its material coordinates in all frames, so that speckle moves as tissue does.
+A scatterer keeps its material coordinates in all frames, so that speckle moves with the tissue.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mvest.typing import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """What tissue does to sound.
+    """Acoustic properties of tissue.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class Material:
     specular : bool
         Whether the echo depends on the angle between surface and beam.
     fineness : float
-        How many times more scatterers a volume holds than in walls; for thin tissue.
+        Density of scatterers over that in walls, for thin tissue.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Material:
 
 
 Sowing: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Of scatterers, uniform over a part: material coordinates ``(n, 3)``, amplitudes relative to the
+"""Scatterers, uniform over a part: material coordinates ``(n, 3)``, amplitudes relative to the
 material's ``(n,)`` and shares of dense tissue ``(n,)``, 0 to 1."""
 
 
@@ -58,7 +58,7 @@ def _sum(vectors: FloatArray) -> FloatArray:
 def _in_cells(
     grid: FloatArray, seeds: FloatArray
 ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:
-    """Where seeds lie in cells of a grid, closed along columns, and the cells' corners.
+    """Coordinates of seeds in the cells of a grid, closed along columns, and the cells' corners.
 
     Rows and columns of ``grid (R, C, ...)`` are the first two coordinates of the seeds.
     """
@@ -86,7 +86,7 @@ class TissueSheet:
         In valve axes.
     thickness : (R, C) mm
     span : (float, float)
-        Where the layer lies along the normal (row direction x column direction), over thickness.
+        Of the layer along the normal (row direction x column direction), over thickness.
     relative : (R, C)
         Amplitude relative to the material's.
     fade : float
@@ -116,7 +116,7 @@ class TissueSheet:
         return float(self._cells.sum())
 
     def sow(self, rng: np.random.Generator, count: int) -> Sowing:
-        """Scatterers at rows, columns and places along the normal; none is of dense tissue."""
+        """Scatterers at rows, columns and distances along the normal; none is of dense tissue."""
         cells = self._cells
         each = rng.multinomial(count, cells.ravel() / cells.sum())
         seeds = rng.random((count, 3))
@@ -184,7 +184,7 @@ class Cord:
         return float(self._cells.sum())
 
     def sow(self, rng: np.random.Generator, count: int) -> Sowing:
-        """Scatterers at places along the line, and across it in the unit disk."""
+        """Scatterers at distances along the line, and across it in the unit disk."""
         cells = self._cells
         each = rng.multinomial(count, cells / cells.sum())
         seeds = rng.random((count, 3))

@@ -1,9 +1,9 @@
-"""Everything that sends echoes: the parts of the heart, and the scatterers sown into them.
+"""The parts of the heart, and the scatterers in them.
 
-The heart around a valve is made up: ventricle, atrium, aortic root, papillary muscles. Everything
-begins at the annulus and moves with it; shapes and sizes are drawn, and are a choice within what is
-usual in adults (ventricle 40 to 55 mm wide with walls of 8 to 11 mm, aortic root 22 to 28 mm).
-Positions are mm in the valve's own axes. Each part states what it does to sound.
+The heart around a valve is synthetic: ventricle, atrium, aortic root, papillary muscles. All start
+at the annulus and move with it. Shapes and sizes are drawn within the usual range of adults
+(ventricle 40 to 55 mm wide with walls of 8 to 11 mm, aortic root 22 to 28 mm); the details are a
+choice. Positions are mm in the valve's own axes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROWS = 33
 
 
 class Heart(NamedTuple):
-    """What lies around a valve, in motion: walls of the chambers and papillary muscles.
+    """Moving walls of the chambers and papillary muscles around a valve.
 
     Attributes
     ----------
@@ -55,14 +55,8 @@ def waves(
 ) -> FloatArray:
     """A smooth random field ``(rows, columns)`` of mean 0 and standard deviation 1, closed around.
 
-    Parameters
-    ----------
-    rng : numpy Generator
-    rows, columns : int
-    fineness : int
-        Waves around are up to 4 times, and along up to 3 times this.
-    fall : float
-        Power with which amplitudes fall off with the number of waves.
+    It has up to 4 ``fineness`` waves around and 3 ``fineness`` along, whose amplitudes ``fall``
+    with this power of their number.
     """
     phi = 2 * np.pi * np.arange(columns) / columns
     u = np.linspace(0, np.pi, rows)[:, None]
@@ -76,15 +70,7 @@ def waves(
 
 
 def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -> Heart:
-    """A heart around a valve.
-
-    Parameters
-    ----------
-    valve : MovingValve
-    apex : (3,) mm
-        Of the probe, which lies behind the wall of the atrium.
-    rng : numpy Generator
-    """
+    """A heart around a valve; the probe's ``apex (3,)`` mm lies behind the wall of the atrium."""
     annulus = valve.vertices[:, valve.layout.annulus]
     phi = valve.layout.phi[valve.layout.annulus]
     u = np.linspace(0, 1, ROWS)[:, None]
@@ -94,7 +80,7 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     outward = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
     anterior = ring[np.argmin(np.abs(phi - 90.0))]
 
-    # Aortic root: its back wall stands on the middle of the anterior annulus.
+    # Aortic root: its back wall is at the middle of the anterior annulus.
     lean = np.deg2rad(rng.uniform(30, 50))
     radius = 0.5 * rng.uniform(22, 28)
     up = np.array([0.0, np.sin(lean), np.cos(lean)])
@@ -153,13 +139,13 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
 
 
 def _rough(rng: np.random.Generator, columns: int) -> FloatArray:
-    """Offset ``(ROWS, columns)`` mm of the ventricle's inner surface: form, and trabeculae."""
+    """Offset ``(ROWS, columns)`` mm of the ventricle's inner surface: form and trabeculae."""
     fine = waves(rng, ROWS, columns, 4, 0.3)
     return np.asarray(1.2 * waves(rng, ROWS, columns) + rng.uniform(0.2, 0.6) * fine)
 
 
 def _shift(annulus: FloatArray) -> FloatArray:
-    """``(T, C, 3)``, how far the annulus is from where it was in the first frame."""
+    """``(T, C, 3)``, displacement of the annulus from the first frame."""
     return np.asarray(annulus - annulus[:1])
 
 
@@ -214,13 +200,13 @@ def _atrium(
 
 
 SURROUNDINGS_MM, FADE = 20.0, 2.0
-"""Thickness of what is shown outside the heart, and over how much of it it fades (a choice)."""
+"""Thickness of the tissue outside the heart, and how fast it fades (a choice)."""
 
 
 def make_parts(
     valve: MovingValve, heart: Heart, acquisition: Acquisition, rng: np.random.Generator
 ) -> list[TissuePart]:
-    """Leaflets, annulus, chordae, muscles, walls of the chambers and what surrounds them."""
+    """Leaflets, annulus, chordae, muscles, walls of the chambers and their surroundings."""
     return [
         *_valve_parts(valve, acquisition, rng),
         *_wall_parts(heart, acquisition, rng),
@@ -256,23 +242,21 @@ def _valve_parts(valve: MovingValve, a: Acquisition, rng: np.random.Generator) -
 
 def _wall_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[TissuePart]:
     wall, vessel = Material("wall", a.wall_db), Material("vessel", a.vessel_db)
-    muscle = Material("papillary", a.papillary_db, specular=False)
-    parts: list[TissuePart] = []
-    for material, (points, thickness), span in (
-        (wall, heart.ventricle, (0.0, 1.0)),
-        (vessel, heart.atrium, (-1.0, 0.0)),
-        (vessel, heart.aorta, (-0.5, 0.5)),
-    ):
-        parts.append(
-            TissueSheet(material, points, thickness, span, _mottled(thickness.shape, 2.0, rng))
+    muscle, radius = Material("papillary", a.papillary_db, specular=False), heart.muscle_radius
+    sheets = [
+        TissueSheet(material, points, thickness, span, _mottled(thickness.shape, 2.0, rng))
+        for material, (points, thickness), span in (
+            (wall, heart.ventricle, (0.0, 1.0)),
+            (vessel, heart.atrium, (-1.0, 0.0)),
+            (vessel, heart.aorta, (-0.5, 0.5)),
         )
-    radius = heart.muscle_radius
-    parts += [Cord(muscle, m, radius, False, np.zeros(len(radius))) for m in heart.muscles]
-    return parts
+    ]
+    cords = [Cord(muscle, m, radius, False, np.zeros(len(radius))) for m in heart.muscles]
+    return [*sheets, *cords]
 
 
 def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[TissuePart]:
-    """Pericardium, and tissue around ventricle and atrium, not towards aorta and right heart."""
+    """Pericardium, and tissue around ventricle and atrium away from aorta and right heart."""
     free = 1 - heart.outflow
     pericardium = Material("pericardium", a.vessel_db + 2.0)
     around = Material("surroundings", a.wall_db - 2.0, specular=False, fineness=0.5)
@@ -285,7 +269,7 @@ def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list
     ]
     points, thickness = heart.atrium
     atrium = points - thickness[..., None] * normals(points)
-    # Close to the annulus the atrium's wall turns outward, and its normal into the ventricle.
+    # Near the annulus the atrium's wall turns outward, and its normal into the ventricle.
     for points, side in ((outside, 1.0), (atrium[:, 4:], -1.0)):
         thickness = np.tile(0.02 + SURROUNDINGS_MM * free, (points.shape[1], 1))
         span = (0.0, 1.0) if side > 0 else (-1.0, 0.0)
@@ -322,7 +306,7 @@ def _dense(columns: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _dropouts(grid: tuple[int, int], a: Acquisition, rng: np.random.Generator) -> FloatArray:
-    """Amplitude factor ``grid`` of the leaflets, low in smooth patches of the share wanted."""
+    """Amplitude factor ``grid`` of the leaflets, low in smooth patches of the required share."""
     field = waves(rng, *grid, 2, 0.7)
     if a.dropout == 0:
         return np.ones(grid)
@@ -339,9 +323,9 @@ class Echoes:
     points : (n, 3) mm
         Along azimuth, elevation and beam from the apex.
     amplitude : (n,)
-        So that, but for the size of the resolution cell, dense tissue of 0 dB has mean power 1.
+        With it tissue of 0 dB has mean power 1, up to the size of the resolution cell.
     loss : (n,) dB mm^3 / cm
-        One way attenuation beyond that of blood, times the volume that a scatterer stands for.
+        One way attenuation beyond that of blood, times the volume per scatterer.
     """
 
     points: FloatArray
@@ -358,7 +342,7 @@ class Sown(NamedTuple):
     seeds : (n, 3)
         Material coordinates.
     strength : (n,)
-        Amplitude of each scatterer, but for the angle.
+        Amplitude of each scatterer without the factor of the angle.
     loss : (n,)
     """
 
@@ -377,10 +361,10 @@ def cell_volume(acquisition: Acquisition, distance_mm: float) -> float:
 def make_scene(
     valve: MovingValve, acquisition: Acquisition, probe: Probe, rng: np.random.Generator
 ) -> list[Sown]:
-    """The heart around a valve with scatterers.
+    """The heart around a valve with scatterers, at least 8 per part.
 
-    Their number gives each resolution cell at the valve as many as the acquisition says; the number
-    in thin tissue is a multiple, and all are at least 8 per part.
+    Walls have ``acquisition.scatterers_per_cell`` in a resolution cell at the valve; thin tissue
+    has more.
     """
     a = acquisition
     heart = make_heart(valve, probe.apex_in_valve, rng)
@@ -401,7 +385,7 @@ def make_scene(
 def scene_echoes(
     scene: Sequence[Sown], frame: int, acquisition: Acquisition, probe: Probe
 ) -> Echoes:
-    """The scatterers where they are in one frame."""
+    """The scatterers in one frame."""
     apex, floor = probe.apex_in_valve, 10 ** (acquisition.angle_floor_db / 20)
     points, amplitudes = [], []
     for part, seeds, strength, _ in scene:

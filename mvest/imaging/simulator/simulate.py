@@ -1,4 +1,4 @@
-"""A simulated transoesophageal echo volume over time, and the truth in it.
+"""A simulated transoesophageal echo volume over time, and the true valve in it.
 
 Envelopes along beams become grey levels in a Cartesian volume.
 """
@@ -17,13 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition, Probe
-from mvest.imaging.simulator.beams import BeamGrid, losses_of, render_window
+from mvest.imaging.simulator.beams import BeamGrid, Float32Array, losses_of, render_window
 from mvest.imaging.simulator.scene import make_scene, scene_echoes
 from mvest.imaging.valve_sequence import MovingValve, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
-
-Float32Array = NDArray[np.float32]
 
 
 def compress(envelope: Float32Array, acquisition: Acquisition) -> Float32Array:
@@ -36,24 +34,14 @@ def compress(envelope: Float32Array, acquisition: Acquisition) -> Float32Array:
 
 
 def volume_origin(acquisition: Acquisition) -> FloatArray:
-    """``(3,)`` mm: the volume is centred across the beam and begins at the nearest middle sample.
-
-    Its axes are those of the world: azimuth, elevation and beam.
-    """
+    """``(3,)`` mm: the volume is centred across the beam and starts at the nearest depth."""
     i, j, _ = acquisition.shape
     across = (-0.5 * (i - 1) * acquisition.voxel_mm, -0.5 * (j - 1) * acquisition.voxel_mm)
     return np.array([*across, acquisition.depth_mm[0]])
 
 
 def scan_convert(levels: Float32Array, grid: BeamGrid) -> NDArray[np.uint8]:
-    """Grey levels ``(I, J, K)``, by linear interpolation; 0 outside the pyramid.
-
-    Parameters
-    ----------
-    levels : (A, E, D) float32
-        0 to 255.
-    grid : BeamGrid
-    """
+    """Voxels ``(I, J, K)`` from levels ``(A, E, D)``, linear between them; 0 outside."""
     a = grid.acquisition
     i, j, k = a.shape
     x = (np.arange(i) - 0.5 * (i - 1)) * a.voxel_mm
@@ -110,17 +98,8 @@ def simulate_volume(
 ) -> VolumeSequence:
     """A simulated volume ``(T, I, J, K)`` uint8 of a valve and the heart around it.
 
-    The same seed gives the same volume, and each frame of it whichever others are asked for.
-
-    Parameters
-    ----------
-    valve : MovingValve
-    acquisition : Acquisition
-    probe : Probe
-    seed : int
-        Of the heart around the valve, the scatterers, the stitching and the noise.
-    frames : sequence of int, optional
-        Which frames of the valve, increasing; all if not given.
+    The seed determines the heart, the scatterers, the stitching and the noise of each frame,
+    whichever ``frames`` (increasing; default: all) are simulated.
 
     Raises
     ------
@@ -167,7 +146,7 @@ def simulate_volume(
 def true_sequence(
     valve: MovingValve, probe: Probe, frames: Sequence[int] | None = None
 ) -> ValveSequence:
-    """Where the valve is in the world, in frames as of :func:`simulate_volume`; nothing unsure."""
+    """The true valve in the world, in the frames of :func:`simulate_volume`, without errors."""
     chosen = _chosen(valve, frames)
     n = valve.layout.size
     return ValveSequence(

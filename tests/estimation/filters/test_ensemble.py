@@ -19,7 +19,7 @@ def test_the_drawn_ensemble_has_exactly_the_priors_mean_and_covariance() -> None
 def test_the_square_root_is_the_kalman_filter_exactly(members: int, steps: int) -> None:
     # In any number of steps: information 1/α of each adds up to one observation.
     problem = Linear()
-    found = EnsembleFilter(members, steps)(problem.plain, problem.prior, problem.y, problem.R)
+    found = problem.by(EnsembleFilter(members, steps), plain=True)
     np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-10)
     np.testing.assert_allclose(found.covariance, problem.covariance, rtol=1e-9, atol=1e-10)
     assert found.reason is Reason.COMPLETED
@@ -27,24 +27,30 @@ def test_the_square_root_is_the_kalman_filter_exactly(members: int, steps: int) 
     assert found.forward_solves == members * steps + 1
     assert found.iterations == steps
     np.testing.assert_allclose(found.prediction.jacobian, problem.H, atol=1e-10)
-    reference = IteratedFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    reference = problem.by(IteratedFilter())
     assert found.innovation.nis == pytest.approx(reference.innovation.nis, rel=1e-9)
 
 
 def test_after_k_of_n_steps_the_ensemble_has_seen_k_nths() -> None:
     problem = Linear()
-    found = EnsembleFilter(8, 4)(problem.plain, problem.prior, problem.y, problem.R)
+    found = problem.by(EnsembleFilter(8, 4), plain=True)
     information = problem.H.T @ np.diag(1 / problem.R) @ problem.H
     for k in range(5):
         P = np.linalg.inv(np.linalg.inv(problem.prior.covariance) + k / 4 * information)
         np.testing.assert_allclose(found.iterate_covariances[k], P, rtol=1e-9, atol=1e-10)
 
 
-def test_perturbed_observations_have_the_exact_mean() -> None:
+def perturbed(problem, members, seed=1):
+    return problem.by(EnsembleFilter(members, kind="perturbed", seed=seed), plain=True)
+
+
+def test_perturbed_observations_have_the_exact_mean_and_a_seed() -> None:
     # The perturbations are centred, so that the mean is moved by K d̄ whatever they are.
     problem = Linear()
-    found = EnsembleFilter(9, kind="perturbed")(problem.plain, problem.prior, problem.y, problem.R)
-    np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-10)
+    one, same, other = (perturbed(problem, 10, seed) for seed in (1, 1, 2))
+    np.testing.assert_allclose(one.mean, problem.mean, rtol=1e-10)
+    np.testing.assert_array_equal(one.covariance, same.covariance)
+    assert not np.allclose(one.covariance, other.covariance)
 
 
 def test_perturbed_observations_approach_the_covariance_like_one_over_root_n() -> None:
@@ -53,27 +59,10 @@ def test_perturbed_observations_approach_the_covariance_like_one_over_root_n() -
     # small by the factor (I − K H), and the error would not fall with N.
     problem = Linear(p=1)
     for members in (20, 320):
-        errors = [
-            EnsembleFilter(members, kind="perturbed", seed=seed)(
-                problem.plain, problem.prior, problem.y, problem.R
-            ).covariance[0, 0]
-            / problem.covariance[0, 0]
-            - 1.0
-            for seed in range(40)
-        ]
+        found = [perturbed(problem, members, seed).covariance[0, 0] for seed in range(40)]
+        errors = np.array(found) / problem.covariance[0, 0] - 1.0
         ratio = np.mean(np.square(errors)) / (2.0 / members)
         assert 0.1 < ratio < 1.9
-
-
-def test_seeds_are_explicit_and_repeatable() -> None:
-    problem = Linear()
-    settings = {"members": 10, "kind": "perturbed"}
-    one, same, other = (
-        EnsembleFilter(**settings, seed=seed)(problem.plain, problem.prior, problem.y, problem.R)
-        for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one.covariance, same.covariance)
-    assert not np.allclose(one.covariance, other.covariance)
 
 
 def test_more_steps_are_nearer_to_the_posterior_of_a_non_linear_model() -> None:
@@ -87,15 +76,19 @@ def test_more_steps_are_nearer_to_the_posterior_of_a_non_linear_model() -> None:
     assert abs(four.std[0] / reference.std[0] - 1) < abs(one.std[0] / reference.std[0] - 1)
 
 
-def test_members_that_fail_are_left_out_and_counted() -> None:
-    problem = Linear(p=1)
-    calls = []
+def with_failures(p, members, failing):
+    """An ensemble of whose runs some fail."""
+    problem, calls = Linear(p=p), []
 
-    def fails_twice(m):
+    def model(m):
         calls.append(m)
-        return Prediction.failed("leaks") if len(calls) in (2, 5) else problem.plain(m)
+        return Prediction.failed("leaks") if len(calls) in failing else problem.plain(m)
 
-    found = EnsembleFilter(10)(fails_twice, problem.prior, problem.y, problem.R)
+    return EnsembleFilter(members)(model, problem.prior, problem.y, problem.R)
+
+
+def test_members_that_fail_are_left_out_and_counted() -> None:
+    found = with_failures(1, 10, (2, 5))
     assert found.converged
     assert "8 of 10 members" in found.detail
     assert found.forward_solves == 11
@@ -103,26 +96,15 @@ def test_members_that_fail_are_left_out_and_counted() -> None:
 
 @pytest.mark.parametrize("survivors", [0, 2])
 def test_too_few_members_left_end_the_run(survivors: int) -> None:
-    problem = Linear(p=2)
-    calls = []
-
-    def few(m):
-        calls.append(m)
-        return problem.plain(m) if len(calls) <= survivors else Prediction.failed("leaks")
-
-    found = EnsembleFilter(6)(few, problem.prior, problem.y, problem.R)
+    found = with_failures(2, 6, range(survivors + 1, 10))
     assert found.reason is Reason.MODEL_FAILED
     assert "leaks" in found.detail
     assert found.forward_solves == 6
 
 
-@pytest.mark.parametrize("settings", [{"members": 2}, {"steps": 0}, {"kind": "both"}])
-def test_inadmissible_settings_are_refused(settings) -> None:
-    with pytest.raises(InputError):
-        EnsembleFilter(**settings)
-
-
-def test_an_ensemble_smaller_than_the_parameters_is_refused() -> None:
-    problem = Linear(p=3)
+def test_inadmissible_settings_are_refused() -> None:
+    for settings in ({"members": 2}, {"steps": 0}, {"kind": "both"}):
+        with pytest.raises(InputError):
+            EnsembleFilter(**settings)
     with pytest.raises(InputError, match="at least 5 members"):
-        EnsembleFilter(4)(problem.plain, problem.prior, problem.y, problem.R)
+        Linear(p=3).by(EnsembleFilter(4), plain=True)

@@ -34,20 +34,12 @@ def test_both_wings_are_seen(seed) -> None:
     assert high[0] > 1.0
 
 
-def test_a_model_without_derivatives_is_drawn_from_too() -> None:
-    problem = Linear(p=2)
-    sample = ImportanceFilter(start=UnscentedFilter())
-    found = sample(problem.plain, problem.prior, problem.y, problem.R)
-    assert found.reason is Reason.COMPLETED
-    std = np.sqrt(np.diagonal(problem.covariance))
-    assert np.all(np.abs(found.mean - problem.mean) < 4.0 * std / np.sqrt(60.0))
-    assert np.all(np.abs(np.log(found.std / std)) < 4.0 / np.sqrt(120.0))
-
-
-@pytest.mark.parametrize("p", [2, 5, 11])
+@pytest.mark.parametrize("p", [2, 5, 11, None])
 def test_on_a_linear_model_it_is_the_kalman_filter_within_its_error(p) -> None:
-    problem = Linear(n=30, p=p, seed=1)
-    found = ImportanceFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    # Also drawn from a model without derivatives.
+    problem = Linear(n=30, p=p, seed=1) if p else Linear(p=2)
+    start = {} if p else {"start": UnscentedFilter()}
+    found = problem.by(ImportanceFilter(**start), plain=not p)
     assert found.reason is Reason.COMPLETED
     std = np.sqrt(np.diagonal(problem.covariance))
     assert np.all(np.abs(found.mean - problem.mean) < 4.0 * std / np.sqrt(60.0))
@@ -55,10 +47,7 @@ def test_on_a_linear_model_it_is_the_kalman_filter_within_its_error(p) -> None:
 
 
 def test_too_few_runs_are_said_to_be_too_few() -> None:
-    problem = Linear(n=30, p=8, seed=1)
-    found = ImportanceFilter(runs=40, batch=20)(
-        problem.differentiated, problem.prior, problem.y, problem.R
-    )
+    found = Linear(n=30, p=8, seed=1).by(ImportanceFilter(runs=40, batch=20))
     assert found.reason is Reason.NOT_SAMPLED
     assert not found.trusted
     assert "effective" in found.why + found.detail

@@ -46,12 +46,15 @@ def by_integration(y):
     return mean, (points - mean).T * weights @ (points - mean)
 
 
+def filtered(y, **settings):
+    return IteratedFilter(**settings)(bent, PRIOR, y, 1.0)
+
+
 @pytest.mark.parametrize("residual", [-4.0, 4.0])
 def test_the_covariance_is_that_of_the_posterior(residual):
     y = observed(residual)
     mean, covariance = by_integration(y)
-    plain = IteratedFilter()(bent, PRIOR, y, 1.0)
-    better = IteratedFilter(second_order=True)(bent, PRIOR, y, 1.0)
+    plain, better = filtered(y), filtered(y, second_order=True)
     true = np.sqrt(np.diag(covariance))
     assert np.max(np.abs(plain.std / true - 1.0)) > 0.15
     assert better.std == pytest.approx(true, rel=0.05)
@@ -63,28 +66,25 @@ def test_the_covariance_is_that_of_the_posterior(residual):
 
 
 def test_what_is_well_linearised_costs_no_further_run():
-    y = observed(0.0)
-    plain = IteratedFilter()(bent, PRIOR, y, 1.0)
-    better = IteratedFilter(second_order=True)(bent, PRIOR, y, 1.0)
+    plain, better = filtered(observed(0.0)), filtered(observed(0.0), second_order=True)
     assert better.forward_solves == plain.forward_solves
     assert np.array_equal(better.std, plain.std)
 
 
 def test_iterations_that_do_not_end_are_ended_by_newton_steps():
     y = observed(-4.0)
-    begun = (-1.5, 1.5)
-    short = IteratedFilter(max_iterations=1, start=begun)(bent, PRIOR, y, 1.0)
-    better = IteratedFilter(max_iterations=1, start=begun, second_order=True)(bent, PRIOR, y, 1.0)
-    assert short.reason is Reason.MAX_ITERATIONS
+    begun = {"max_iterations": 1, "start": (-1.5, 1.5)}
+    better = filtered(y, **begun, second_order=True)
+    assert filtered(y, **begun).reason is Reason.MAX_ITERATIONS
     assert better.reason is Reason.CONVERGED
-    exact = IteratedFilter(tolerance=1e-8, max_iterations=200)(bent, PRIOR, y, 1.0)
+    exact = filtered(y, tolerance=1e-8, max_iterations=200)
     assert np.all(np.abs(better.mean - exact.mean) < 0.1 * exact.std)
 
 
 def test_what_is_left_out_is_the_residual_times_the_second_derivatives():
     y = observed(-4.0)
-    assert IteratedFilter()(bent, PRIOR, y, 1.0).curvature is None
-    better = IteratedFilter(second_order=True)(bent, PRIOR, y, 1.0)
+    assert filtered(y).curvature is None
+    better = filtered(y, second_order=True)
     residual = BENT @ (y - bent(better.mean).y)
     # Over a standard deviation to both sides the fourth power of the saddle counts, too.
     assert better.curvature == pytest.approx(-residual * BEND, abs=0.1)
@@ -92,13 +92,13 @@ def test_what_is_left_out_is_the_residual_times_the_second_derivatives():
 
 def test_errors_by_samples_reach_the_estimate_as_they_move_it():
     y = observed(-4.0)
-    better = IteratedFilter(second_order=True)(bent, PRIOR, y, 1.0)
+    better = filtered(y, second_order=True)
     # Far below the noise: no sample changes the gain.
     samples = 1e-3 * (SLOPES @ RNG.normal(size=(3, 4)))
-    exact = IteratedFilter(tolerance=1e-10, objective_tolerance=1e-16, max_iterations=400)
+    exact = {"tolerance": 1e-10, "objective_tolerance": 1e-16, "max_iterations": 400}
 
     def moved(d):
-        up, down = (exact(bent, PRIOR, y + sign * d, 1.0).mean for sign in (1.0, -1.0))
+        up, down = (filtered(y + sign * d, **exact).mean for sign in (1.0, -1.0))
         return 0.5 * (up - down)
 
     moves = np.stack([moved(d) for d in samples.T], axis=1)
@@ -110,13 +110,8 @@ def test_errors_by_samples_reach_the_estimate_as_they_move_it():
     assert found.from_samples == pytest.approx(expected, rel=0.1)
     linear = errors.posterior(H, PRIOR.covariance)
     assert np.max(np.abs(np.diag(linear.from_samples) / np.diag(expected) - 1.0)) > 0.3
-
-
-def test_what_is_left_of_the_prior_s_error_counts_the_second_derivatives():
-    y = observed(-4.0)
-    better = IteratedFilter(second_order=True)(bent, PRIOR, y, 1.0)
+    # What is left of the prior's error.
     errors = SampledErrors(observation_noise(1.0, N), 1e-9 * SLOPES)
-    H = bent(better.mean).jacobian
     left = np.linalg.inv(np.eye(2) + H.T @ H + better.curvature)
     found = errors.posterior(H, PRIOR.covariance, curvature=better.curvature).covariance
     assert found == pytest.approx(left @ left.T, rel=1e-6)

@@ -17,11 +17,9 @@ from mvest.estimation import (
     Log,
     PaperFilter,
     Prediction,
-    Reason,
     identifiability,
-    nees,
 )
-from tests.estimation.problems import bound, consistent
+from tests.estimation.problems import bound
 
 RADIUS = 10.0  # mm
 PRESSURES = np.array([0.001, 0.004, 0.016])  # MPa, the last about 120 mmHg
@@ -66,6 +64,7 @@ def test_the_plate_solves_its_equation():
     w = plate(TRUTH).y.reshape(3, 10)[:, 0]
     D = E * h**3 / (12 * 0.91)
     np.testing.assert_allclose(w * (1 + 0.488 * (w / h) ** 2), PRESSURES * RADIUS**4 / (64 * D))
+    assert not plate(-TRUTH).converged
     step = 1e-6
     for i, d in enumerate(step * np.eye(2)):
         difference = (plate(TRUTH + d).y - plate(TRUTH - d).y) / (2 * step)
@@ -86,35 +85,16 @@ def test_both_modes_recover_the_truth(method, transform):
     assert estimate.forward_solves <= 10
     residual = plate(TRUTH).y - estimate.prediction.y
     assert np.max(np.abs(residual)) < 1e-4
-
-
-def test_noise_is_carried_through_as_the_bound_says():
-    # 0.05 mm noise and the truth drawn from the prior: NEES in its band, and the reported
-    # covariance is the Cramér-Rao bound with the prior, at the estimate.
-    rng = np.random.default_rng(20)
-    R = 0.05**2
-    values = []
-    for _ in range(200):
-        truth = rng.multivariate_normal(PRIOR.mean, PRIOR.covariance / 4.0)
-        y = plate(truth).y + np.sqrt(R) * rng.standard_normal(30)
-        prior = Gaussian(PRIOR.mean, PRIOR.covariance / 4.0)
-        estimate = IteratedFilter()(plate, prior, y, R)
-        assert estimate.converged
-        values.append(nees(estimate.mean - truth, estimate.covariance))
-        least = bound(estimate.prediction.jacobian, R, prior)
-        np.testing.assert_allclose(estimate.covariance, least, rtol=1e-9)
-    assert consistent(values, 2)
-
-
-def test_bound_before_data():
-    # Without a prior, the bound is the inverse of H'R^-1 H at the truth.
-    H = plate(TRUTH).jacobian
-    np.testing.assert_allclose(bound(H, 0.01), 0.01 * np.linalg.inv(H.T @ H), rtol=1e-9)
-    # Twice the noise, four times the variance.
-    np.testing.assert_allclose(bound(H, 0.04), 4.0 * bound(H, 0.01))
+    if isinstance(method, IteratedFilter) and transform is None:
+        # The covariance is the Cramér-Rao bound with the prior, at the estimate.
+        least = bound(estimate.prediction.jacobian, 1e-6, PRIOR)
+        np.testing.assert_allclose(estimate.covariance, least, rtol=1e-7)
 
 
 def test_modulus_and_thickness_are_correlated():
+    # Without a prior, the bound is the inverse of H'R^-1 H at the truth.
+    H = plate(TRUTH).jacobian
+    np.testing.assert_allclose(bound(H, 0.01), 0.01 * np.linalg.inv(H.T @ H), rtol=1e-9)
     report = identifiability(plate(TRUTH).jacobian, 0.01**2, TRUTH, names=["E", "thickness"])
     # More thickness and less modulus deflect nearly alike.
     assert report.correlation[0, 1] < -0.9
@@ -155,19 +135,7 @@ def test_identifiability_by_hand():
     np.testing.assert_allclose(np.abs(report.eigenvectors[:, 0]), [0.0, 1.0], atol=1e-15)
     np.testing.assert_allclose(report.information, np.diag([1600.0, 4.0]), atol=1e-10)
     assert report.condition_number == pytest.approx(400.0)
-    # One observation of a sum: the difference is lost; a unit prior gives [[2, 1], [1, 2]]^-1.
-    H = np.array([[1.0, 1.0]])
-    assert np.all(np.isinf(identifiability(H, 1.0, np.ones(2)).std))
-    with_prior = bound(H, 1.0, Gaussian(np.zeros(2), np.eye(2)))
-    np.testing.assert_allclose(with_prior, np.array([[2.0, -1.0], [-1.0, 2.0]]) / 3.0)
     # A parameter that is seen stays known beside one that is not.
     blind = identifiability(np.array([[2.0, 0.0], [0.0, 0.0]]), 1.0, np.ones(2))
     assert blind.std[0] == pytest.approx(0.5)
     assert blind.std[1] == np.inf
-
-
-def test_a_start_without_answer_is_a_value():
-    prior = Gaussian(np.array([-1.0, 1.2]), np.eye(2))
-    estimate = IteratedFilter()(plate, prior, plate(TRUTH).y, 1e-4)
-    assert estimate.reason is Reason.MODEL_FAILED
-    assert "E = -1 MPa" in estimate.detail

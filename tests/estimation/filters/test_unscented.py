@@ -22,11 +22,10 @@ PRIOR, Y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 2.0
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_corners_of_the_simplex_have_mean_zero_and_unit_covariance(size: int) -> None:
     points = simplex_points(size)
-    assert points.shape == (size + 1, size)
     np.testing.assert_allclose(points.sum(axis=0), 0.0, atol=1e-14)
     np.testing.assert_allclose(points.T @ points / (size + 1), np.eye(size), atol=1e-14)
     # Regular: all corners are as far from the centre, √p.
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), np.sqrt(size))
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), [np.sqrt(size)] * (size + 1))
 
 
 @pytest.mark.parametrize(
@@ -40,15 +39,14 @@ def test_corners_of_the_simplex_have_mean_zero_and_unit_covariance(size: int) ->
 )
 def test_on_a_linear_model_it_is_the_kalman_filter(filter_, solves: int) -> None:
     problem = Linear()
-    model = problem.differentiated if isinstance(filter_, ExtendedFilter) else problem.plain
-    found = filter_(model, problem.prior, problem.y, problem.R)
+    found = problem.by(filter_, plain=not isinstance(filter_, ExtendedFilter))
     np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-11)
     np.testing.assert_allclose(found.covariance, problem.covariance, rtol=1e-10, atol=1e-11)
     assert found.converged
     assert found.forward_solves == solves
     assert found.prediction is not None
     np.testing.assert_allclose(found.prediction.jacobian, problem.H, atol=1e-11)
-    reference = IteratedFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    reference = problem.by(IteratedFilter())
     assert found.innovation.nis == pytest.approx(reference.innovation.nis, rel=1e-10)
     assert found.log_likelihood[-1] == pytest.approx(reference.log_likelihood[-1], rel=1e-10)
     assert found.objective[-1] == pytest.approx(reference.objective[-1], rel=1e-10)
@@ -81,12 +79,10 @@ def test_close_points_give_the_iterated_extended_filter() -> None:
 
 
 def test_observations_are_counted_once_however_many_rounds() -> None:
-    model = lambda m: Prediction.undifferentiated(m)  # noqa: E731
     prior = Gaussian(np.zeros(1), np.eye(1))
     for rounds in (1, 2, 7):
-        found = UnscentedFilter(max_iterations=rounds, tolerance=1e-300)(
-            model, prior, np.ones(1), 1.0
-        )
+        filter_ = UnscentedFilter(max_iterations=rounds, tolerance=1e-300)
+        found = filter_(Prediction.undifferentiated, prior, np.ones(1), 1.0)
         assert found.covariance[0, 0] == pytest.approx(0.5, rel=1e-14)
 
 
@@ -100,9 +96,7 @@ def test_points_draw_together_where_the_model_fails() -> None:
     assert found.converged
     assert found.mean[0] == pytest.approx(2.1, rel=1e-12)
     assert found.covariance[0, 0] == pytest.approx(0.5, rel=1e-12)
-
-
-def test_a_model_that_always_fails_ends_with_its_words() -> None:
+    # A model that always fails ends the run with its reason.
     found = UnscentedFilter()(lambda m: Prediction.failed("no valve"), PRIOR, Y, R)
     assert found.reason is Reason.MODEL_FAILED
     assert "no valve" in found.detail
@@ -131,16 +125,9 @@ def test_it_works_in_logarithms() -> None:
     assert found.prediction.jacobian[0, 0] == pytest.approx(1 / found.mean[0], rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}],
-)
-def test_inadmissible_settings_are_refused(settings) -> None:
-    with pytest.raises(InputError):
-        UnscentedFilter(**settings)
-
-
-def test_a_filter_that_needs_derivatives_says_so() -> None:
-    problem = Linear()
+def test_inadmissible_settings_and_models_are_refused() -> None:
+    for settings in ({"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}):
+        with pytest.raises(InputError):
+            UnscentedFilter(**settings)
     with pytest.raises(InputError, match="derivatives"):
-        IteratedFilter()(problem.plain, problem.prior, problem.y, problem.R)
+        Linear().by(IteratedFilter(), plain=True)

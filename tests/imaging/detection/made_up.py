@@ -6,27 +6,26 @@ An oracle stands in for trees. Features are replaced by the geometry they were t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.imaging.detection import leaflets, pose_search
+from mvest.imaging.detection.leaflets import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import MODES
-from mvest.imaging.detection.shape_model import LabelledFrame, TrueValve
+from mvest.imaging.detection.shape_model import LabelledFrame
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import MovingValve, landmark_vertices
+from mvest.imaging.valve_sequence import MovingValve
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.template import Template
 from tests import made_up_sequence
 
 LAYOUT = ValveLayout(16, 7)
-TIPS = np.array([Template().parameters.papillary.tip, Template().parameters.papillary.tip]) * [
-    [1, 1, 1],
-    [-1, 1, 1],
-]
+TIPS = np.array([[1, 1, 1], [-1, 1, 1]]) * Template().parameters.papillary.tip
 
 
 def moving_valve(number, frames=4, layout=LAYOUT):
@@ -41,17 +40,9 @@ def moving_valve(number, frames=4, layout=LAYOUT):
         [made_up_sequence.leaflets(layout, c) * stretch + waves @ bump for c in closures]
     )
     tips = TIPS * stretch + rng.standard_normal((frames, 2, 3))
-    return MovingValve(
-        f"made up {number}",
-        layout,
-        0.04 * np.arange(frames),
-        vertices,
-        tips,
-        np.full(layout.size, 1.2),
-        np.array([30.0, 210.0]),
-        np.array([0.9, 0.9]),
-        np.array([0, 1]),
-    )
+    chordae = np.array([30.0, 210.0]), np.array([0.9, 0.9]), np.array([0, 1])
+    times, thickness = 0.04 * np.arange(frames), np.full(layout.size, 1.2)
+    return MovingValve(f"made up {number}", layout, times, vertices, tips, thickness, *chordae)
 
 
 def poses(count, seed=0, far_mm=20.0):
@@ -64,10 +55,18 @@ def poses(count, seed=0, far_mm=20.0):
     )
 
 
+class Placed(NamedTuple):
+    """A valve in the world."""
+
+    vertices: np.ndarray
+    tips: np.ndarray
+    pose: Poses
+
+
 def placed(shape, pose, coefficients):
     """A true valve that a shape model can show exactly."""
     vertices = pose.world(shape.shape(coefficients[None]))[0]
-    return TrueValve(vertices, pose.world(shape.tips)[0], pose)
+    return Placed(vertices, pose.world(shape.tips)[0], pose)
 
 
 def ball_volume(spacing, direction, origin, shape, points, width_mm=2.0, background=40):
@@ -86,10 +85,7 @@ def ball_volume(spacing, direction, origin, shape, points, width_mm=2.0, backgro
     grey = rng.uniform(background / 2, background, len(world))
     for point in points:
         grey += 200 * np.exp(-0.5 * ((world - point) ** 2).sum(axis=1) / width_mm**2)
-    frames = np.clip(grey, 0, 255).reshape(1, *shape).astype(np.uint8)
-    return VolumeSequence(
-        frames, volume.spacing, volume.direction, volume.origin, volume.times, source="made up"
-    )
+    return replace(volume, frames=np.clip(grey, 0, 255).reshape(1, *shape).astype(np.uint8))
 
 
 # --- oracles ------------------------------------------------------------------------------------
@@ -104,7 +100,7 @@ class NumberedFrame:
 
 def labelled(true, shape, seed=0, frame=NumberedFrame()):
     """A frame to draw samples from."""
-    return LabelledFrame(frame, true, shape, np.random.default_rng(seed))
+    return LabelledFrame(frame, *true, shape, np.random.default_rng(seed))
 
 
 def geometry(frame, pattern, points, axes):
@@ -130,82 +126,83 @@ class Oracle:
         return self.answer(x) if len(x) else np.zeros((0, self.outputs))
 
 
+def knowing(truths, outputs, answer):
+    """An oracle; `answer` takes the true valve of the frame and the poses of all hypotheses."""
+
+    def of(x):
+        *hypotheses, frame = seen(x)
+        return answer(truths[frame], Poses(*hypotheses))
+
+    return Oracle(outputs, of)
+
+
+def gaps(here, to):
+    """Where points lie from hypotheses, in their axes."""
+    return np.einsum("pij,pi->pj", here.rotation, to - here.centre)
+
+
 def rim_oracle(truths, layout, row):
     """Away from the leaflet and across it to the true rim; candidates come column by column."""
 
-    def answer(x):
-        points, rotation, _, frame = seen(x)
-        columns = np.arange(len(x)) * layout.columns // len(x)
-        target = truths[frame].vertices.reshape(layout.rows, layout.columns, 3)[row]
-        return np.einsum("pij,pi->pj", rotation, target[columns] - points)[:, 1:]
+    def answer(true, here):
+        columns = np.arange(len(here)) * layout.columns // len(here)
+        return gaps(here, true.vertices.reshape(layout.rows, -1, 3)[row][columns])[:, 1:]
 
-    return Oracle(2, answer)
+    return knowing(truths, 2, answer)
 
 
 def boundary_oracle(truths, layout, width_mm=0.6, best=1.0):
     """How likely a place is on the true leaflet, at most `best`; they come vertex by vertex."""
 
-    def answer(x):
-        points, rotation, _, frame = seen(x)
-        which = np.arange(len(x)) * layout.size // len(x)
-        gap = ((truths[frame].vertices[which] - points) * rotation[:, :, 2]).sum(axis=1)
-        return best * np.exp(-0.5 * (gap / width_mm) ** 2)[:, None]
+    def answer(true, here):
+        gap = gaps(here, true.vertices[np.arange(len(here)) * layout.size // len(here)])[:, 2:]
+        return best * np.exp(-0.5 * (gap / width_mm) ** 2)
 
-    return Oracle(1, answer)
+    return knowing(truths, 1, answer)
 
 
 def landmark_oracle(truths, layout, number):
-    at = list(landmark_vertices(layout).values())
-
-    def answer(x):
-        points, rotation, _, frame = seen(x)
-        true = truths[frame]
-        target = np.concatenate([true.vertices[at], true.tips])[number]
-        return np.einsum("pij,pi->pj", rotation, target - points)
-
-    return Oracle(3, answer)
+    return knowing(
+        truths,
+        3,
+        lambda true, here: gaps(here, landmark_points(true.vertices, true.tips, layout)[number]),
+    )
 
 
 def rating_oracle(truths, shape, best=1.0):
     """Best at the true pose, and the less the farther the mean valve's annulus is from it."""
     points = shape.mean[shape.layout.annulus]
 
-    def answer(x):
-        centre, rotation, log_scale, frame = seen(x)
-        gap = Poses(centre, rotation, log_scale).world(points) - truths[frame].pose.world(points)
-        return best * np.exp(-np.linalg.norm(gap, axis=2).mean(axis=1) / 6.0)[:, None]
+    def answer(true, here):
+        gap = np.linalg.norm(here.world(points) - true.pose.world(points), axis=2)
+        return best * np.exp(-gap.mean(axis=1) / 6.0)[:, None]
 
-    return Oracle(1, answer)
+    return knowing(truths, 1, answer)
 
 
 def refinement_oracle(truths, share=0.8):
-    """Takes a share of the error back."""
-
-    def answer(x):
-        here = Poses(*seen(x)[:3])
-        return share * here.towards(truths[seen(x)[3]].pose.repeated(len(x)))
-
-    return Oracle(7, answer)
+    """Corrects a share of the error."""
+    return knowing(
+        truths, 7, lambda true, here: share * here.towards(true.pose.repeated(len(here)))
+    )
 
 
 def start_oracle(truths, shape, modes):
-    def answer(x):
-        here, true = Poses(*seen(x)[:3]), truths[seen(x)[3]]
-        local = here.local(np.broadcast_to(true.vertices, (len(x), *true.vertices.shape)))
-        tips = here.local(np.broadcast_to(true.tips, (len(x), 2, 3)))
-        told = shape.coefficients(local)[:, :modes] / shape.std[:modes]
-        return np.concatenate([told, (tips - shape.tips).reshape(-1, 6)], axis=1)
+    def answer(true, here):
+        local = here.local(np.broadcast_to(true.vertices, (len(here), *true.vertices.shape)))
+        tips = here.local(np.broadcast_to(true.tips, (len(here), 2, 3)))
+        b = shape.coefficients(local)[:, :modes] / shape.std[:modes]
+        return np.concatenate([b, (tips - shape.tips).reshape(-1, 6)], axis=1)
 
-    return Oracle(modes + 6, answer)
+    return knowing(truths, modes + 6, answer)
 
 
 def position_oracle(truths):
-    def answer(x):
-        points, _, _, frame = seen(x)
-        gap = np.linalg.norm(points - truths[frame].pose.centre, axis=1)
+    def answer(true, here):
+        gap = np.linalg.norm(here.centre - true.pose.centre, axis=1)
         return np.exp(-0.5 * (gap / 6.0) ** 2)[:, None]
 
-    return Oracle(1, answer)
+    return knowing(truths, 1, answer)
 
 
 def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
@@ -213,25 +210,22 @@ def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
 
     Poses are rated `best` at most, and the boundary `seen`.
     """
-    layout = shape.layout
-
-    def of(name):
-        if name == "position":
-            return position_oracle(truths)
-        if name in ("pose_coarse", "pose_fine"):
-            return rating_oracle(truths, shape, best)
+    layout, rating = shape.layout, rating_oracle(truths, shape, best)
+    known = {
+        "position": position_oracle(truths),
+        "pose_coarse": rating,
+        "pose_fine": rating,
+        "shape": start_oracle(truths, shape, MODES),
+        "annulus": rim_oracle(truths, layout, 0),
+        "free_edge": rim_oracle(truths, layout, -1),
+        "boundary": boundary_oracle(truths, layout, best=seen),
+    }
+    for name in STAGES:
         if name.startswith("pose_refine"):
-            return refinement_oracle(truths)
-        if name == "shape":
-            return start_oracle(truths, shape, MODES)
-        if name.startswith("landmark_"):
-            return landmark_oracle(truths, layout, int(name.removeprefix("landmark_")))
-        if name in ("annulus", "free_edge"):
-            return rim_oracle(truths, layout, 0 if name == "annulus" else -1)
-        assert name == "boundary"
-        return boundary_oracle(truths, layout, best=seen)
-
-    return DetectionModel(shape, {name: of(name) for name in STAGES}, {}, accuracy)
+            known[name] = refinement_oracle(truths)
+        elif name.startswith("landmark_"):
+            known[name] = landmark_oracle(truths, layout, int(name.removeprefix("landmark_")))
+    return DetectionModel(shape, known, {}, accuracy)
 
 
 def use_geometry(monkeypatch, truths):

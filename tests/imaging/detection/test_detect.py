@@ -6,13 +6,14 @@ import pytest
 from mvest.imaging.detection import detect
 from mvest.imaging.detection.detect import fit_frame
 from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
+from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.pose_search import search_poses
-from mvest.imaging.detection.shape_model import TrueValve
 from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (
     LAYOUT,
     NumberedFrame,
     Oracle,
+    Placed,
     moving_valve,
     oracle_model,
     placed,
@@ -50,16 +51,22 @@ def test_the_search_finds_the_pose(shape, true):
     assert np.linalg.norm(by[3:6]) < 0.1
 
 
+def fitted(shape, true, pose=None, **more):
+    return fit_frame(NumberedFrame(), oracle_model(shape, [true]), pose or true.pose, **more)
+
+
 def test_the_fit_arrives_at_the_true_valve(shape, true):
     # Pulls along wrong normals, or coefficients lost between rounds, stop short of it.
-    model = oracle_model(shape, [true])
-    found = fit_frame(NumberedFrame(), model, true.pose.moved(MISSED))
+    found = fitted(shape, true, true.pose.moved(MISSED))
     assert mean_gap(found.vertices, true.vertices) < 0.3
     np.testing.assert_allclose(found.tips, true.tips, atol=1e-3)
     # Of the modes of each round so many as the small model has.
     assert len(found.coefficients) == len(shape.std)
     assert found.confidence > 0.9
     assert np.all(found.vertex_confidence > 0.8)
+    # Vertices are those of pose and coefficients up to the free displacement.
+    shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
+    assert mean_gap(found.vertices, shown) < 0.3
 
 
 def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypatch):
@@ -67,28 +74,21 @@ def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypa
     # a stiff one leaves the fitted shape.
     valve = moving_valve(77)
     x, tips = true.pose.world(valve.vertices[1])[0], true.pose.world(valve.tips[1])[0]
-    other = TrueValve.of(x, tips, shape)
+    other = Placed(x, tips, pose_of(x, tips, LAYOUT, shape.size_mm))
     use_geometry(monkeypatch, [other])
 
     def errors(stiffness):
         monkeypatch.setattr(detect, "STIFFNESS", stiffness)
         monkeypatch.setattr(detect, "HOLD", 0.001)
-        model = oracle_model(shape, [other])
-        found = fit_frame(NumberedFrame(), model, other.pose.moved(MISSED))
+        found = fitted(shape, other, other.pose.moved(MISSED))
         off = leaflet_axes(x, LAYOUT)[:, :, 2]
-        fitted = found.pose.world(shape.shape(found.coefficients[None]))[0]
-        return [np.abs(((v - x) * off).sum(axis=1)).mean() for v in (fitted, found.vertices)]
+        shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
+        return [np.abs(((v - x) * off).sum(axis=1)).mean() for v in (shown, found.vertices)]
 
-    fitted, loose = errors(0.02)
-    assert fitted > 0.2
-    assert loose < 0.5 * fitted
-    assert errors(1e5)[1] > 0.8 * fitted
-
-
-def test_vertices_are_pose_and_coefficients_up_to_the_free_displacement(shape, true):
-    found = fit_frame(NumberedFrame(), oracle_model(shape, [true]), true.pose.moved(MISSED))
-    fitted = found.pose.world(shape.shape(found.coefficients[None]))[0]
-    assert mean_gap(found.vertices, fitted) < 0.3
+    shown, loose = errors(0.02)
+    assert shown > 0.2
+    assert loose < 0.5 * shown
+    assert errors(1e5)[1] > 0.8 * shown
 
 
 def test_a_given_start_is_begun_with(shape, true):
@@ -107,9 +107,7 @@ def test_a_landmark_placed_by_hand_stays_where_it_was_put(shape, true, name):
     number = LANDMARKS.index(name)
     vertex = landmark_vertices(LAYOUT)[name]
     by_hand = true.vertices[vertex] + 3.0 * true.pose.rotation[0][:, 2]
-    found = fit_frame(
-        NumberedFrame(), oracle_model(shape, [true]), true.pose, fixed=by_hand_at({number: by_hand})
-    )
+    found = fitted(shape, true, fixed=by_hand_at({number: by_hand}))
     assert np.linalg.norm(found.vertices[vertex] - by_hand) < 0.5
     far = np.linalg.norm(true.vertices - true.vertices[vertex], axis=1) > 15
     assert mean_gap(found.vertices[far], true.vertices[far]) < 1.0
@@ -117,24 +115,12 @@ def test_a_landmark_placed_by_hand_stays_where_it_was_put(shape, true, name):
 
 def test_a_tip_placed_by_hand_is_the_tip(shape, true):
     by_hand = true.tips[1] + np.array([2.0, -1.0, 0.5])
-    found = fit_frame(
-        NumberedFrame(),
-        oracle_model(shape, [true]),
-        true.pose,
-        fixed=by_hand_at({LANDMARKS.index("tip_180"): by_hand}),
-    )
+    found = fitted(shape, true, fixed=by_hand_at({LANDMARKS.index("tip_180"): by_hand}))
     np.testing.assert_array_equal(found.tips[1], by_hand)
     np.testing.assert_allclose(found.tips[0], true.tips[0], atol=1e-3)
-
-
-def test_with_all_landmarks_by_hand_none_is_looked_for(shape, true):
-    points = landmark_points(true, LAYOUT)
-    found = fit_frame(
-        NumberedFrame(),
-        oracle_model(shape, [true]),
-        true.pose.moved(MISSED),
-        fixed=points,
-    )
+    # With all landmarks by hand none is looked for.
+    points = landmark_points(true.vertices, true.tips, LAYOUT)
+    found = fitted(shape, true, true.pose.moved(MISSED), fixed=points)
     np.testing.assert_array_equal(found.tips, true.tips)
     assert mean_gap(found.vertices, true.vertices) < 0.3
 
@@ -160,6 +146,5 @@ def test_a_shape_that_no_valve_has_is_believed_less(shape, monkeypatch):
     for far in (0.0, 3.0):
         strained = placed(shape, poses(1, 2), far * shape.std[:8])
         use_geometry(monkeypatch, [strained])
-        model = oracle_model(shape, [strained])
-        believed.append(fit_frame(NumberedFrame(), model, strained.pose).confidence)
+        believed.append(fitted(shape, strained).confidence)
     assert believed[1] < believed[0] - 0.3

@@ -3,6 +3,8 @@
 Places rated whatever the orientation. Shape and tips read off at a pose.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -44,7 +46,12 @@ from tests.imaging.detection.made_up import (
 @pytest.fixture
 def true(shape, monkeypatch):
     monkeypatch.setattr(pose_search, "features", geometry)
-    return placed(shape, poses(1, 2), np.zeros(2))
+    b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
+    return placed(shape, poses(1, 2), b)
+
+
+def error(found, true, shape):
+    return pose_error(found, true.pose, shape)
 
 
 def search(shape, true, share=0.8):
@@ -54,12 +61,12 @@ def search(shape, true, share=0.8):
 
 
 def test_the_error_of_a_pose_is_how_far_it_lays_points_astray(shape, true):
-    assert pose_error(true.pose, true, shape)[0] == pytest.approx(0.0, abs=1e-9)
+    assert error(true.pose, true, shape)[0] == pytest.approx(0.0, abs=1e-9)
     shifted = true.pose.moved(np.array([[3.0, 4.0, 0, 0, 0, 0, 0]]))
-    assert pose_error(shifted, true, shape)[0] == pytest.approx(5.0)
+    assert error(shifted, true, shape)[0] == pytest.approx(5.0)
     # Turned half about z it is wrong by more than its size: such a pose must not look good.
     about = true.pose.moved(np.array([[0.0, 0, 0, 0, 0, np.pi, 0]]))
-    assert pose_error(about, true, shape)[0] > 20.0
+    assert error(about, true, shape)[0] > 20.0
 
 
 def searched(shape, true, places, count, monkeypatch, share=0.8):
@@ -74,18 +81,15 @@ def test_the_search_finds_the_pose_from_places_nearby(shape, true, monkeypatch):
     found, ratings = searched(shape, true, places, 4, monkeypatch)
     assert len(found) == 4
     assert np.all(np.diff(ratings) <= 0)
-    assert pose_error(found, true, shape)[0] < 1.0
-    order = rng.permutation(3)
-    again, _ = searched(shape, true, places[order], 1, monkeypatch)
-    assert pose_error(again, true, shape)[0] < 1.0
-
-
-def test_the_coarse_rating_alone_is_near_already(shape, true, monkeypatch):
+    assert error(found, true, shape)[0] < 1.0
+    again, _ = searched(shape, true, places[rng.permutation(3)], 1, monkeypatch)
+    assert error(again, true, shape)[0] < 1.0
     # Without refinement what the grid of orientations has: the best rated, not the worst.
-    places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0]])
-    found, _ = searched(shape, true, places, 10, monkeypatch, 0.0)
-    assert np.all(pose_error(found, true, shape) < 16.0)
-    assert pose_error(found, true, shape)[0] < 8.0
+    found, _ = searched(shape, true, places[:2], 10, monkeypatch, 0.0)
+    assert np.all(error(found, true, shape) < 16.0)
+    assert error(found, true, shape)[0] < 8.0
+    found, ratings = searched(shape, true, np.zeros((0, 3)), 3, monkeypatch)
+    assert len(found) == len(ratings) == 0
 
 
 def test_refinement_takes_back_a_share_at_every_step(shape, true):
@@ -105,16 +109,10 @@ def test_ratings_belong_to_the_poses_they_come_with(shape, true):
     np.testing.assert_allclose(ratings, np.exp(-np.array([9.0, 1.0, 4.0]) / 6.0))
 
 
-def test_no_places_give_no_poses(shape, true, monkeypatch):
-    found, ratings = searched(shape, true, np.zeros((0, 3)), 3, monkeypatch)
-    assert len(found) == len(ratings) == 0
-
-
 @pytest.mark.parametrize("step", range(len(REFINEMENTS)))
 def test_what_samples_of_refinement_say_takes_them_back(true, step):
     x, y = refinement_samples(labelled(true, None, step), step, 30)
-    centre, rotation, log_scale, _ = seen(x)
-    back = Poses(centre, rotation, log_scale).moved(y)
+    back = Poses(*seen(x)[:3]).moved(y)
     np.testing.assert_allclose(back.centre, np.tile(true.pose.centre, (30, 1)), atol=1e-9)
     np.testing.assert_allclose(back.rotation, np.tile(true.pose.rotation, (30, 1, 1)), atol=1e-9)
     shift = np.linalg.norm(y[:, :3], axis=1)
@@ -125,9 +123,8 @@ def test_what_samples_of_refinement_say_takes_them_back(true, step):
 def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true, samples):
     x, y = samples(labelled(true, shape), 120)
     assert y.shape == (120, 1)
-    centre, rotation, log_scale, _ = seen(x)
-    error = pose_error(Poses(centre, rotation, log_scale), true, shape)
-    assert np.all(np.diff(y[np.argsort(error), 0]) <= 1e-9)
+    errors = error(Poses(*seen(x)[:3]), true, shape)
+    assert np.all(np.diff(y[np.argsort(errors), 0]) <= 1e-9)
     assert y.max() > 0.5
     assert y.min() < 0.1
 
@@ -135,8 +132,7 @@ def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true
 def test_the_final_rating_learns_to_tell_front_from_back(shape, true):
     # Poses in place but turned half about the valve's axis: there must be some, and rated low.
     x, y = fine_samples(labelled(true, shape), 240)
-    centre, rotation, log_scale, _ = seen(x)
-    by = true.pose.repeated(240).towards(Poses(centre, rotation, log_scale))
+    by = true.pose.repeated(240).towards(Poses(*seen(x)[:3]))
     back = (np.linalg.norm(by[:, :3], axis=1) < 8) & (np.abs(by[:, 5]) > 2.5)
     right = (np.linalg.norm(by[:, :3], axis=1) < 3) & (np.linalg.norm(by[:, 3:6], axis=1) < 0.15)
     assert back.sum() > 20
@@ -167,9 +163,8 @@ def frame():
     return standard_frame(ball_volume([0.8] * 3, direction, origin, shape, [POINT], 5.0), 0)
 
 
-def test_the_best_place_is_first_and_others_are_apart(shape, monkeypatch):
+def test_the_best_place_is_first_and_others_are_apart(true, monkeypatch):
     # Without suppression all places crowd about the first.
-    true = placed(shape, poses(1, 2), np.zeros(2))
     use_geometry(monkeypatch, [true])
     places = likely_places(NumberedFrame(), {"position": position_oracle([true])}, 6)
     assert places.shape == (6, 3)
@@ -180,17 +175,14 @@ def test_the_best_place_is_first_and_others_are_apart(shape, monkeypatch):
     assert between.min() >= 0.8 * pose_search.NEAR_MM
 
 
-def test_fewer_places_than_asked_for_are_all_there_are(monkeypatch):
-    monkeypatch.setattr(pose_search, "_places", lambda frame: np.array([[0.0, 0, 0], [1.0, 0, 0]]))
+@pytest.mark.parametrize(
+    ("places", "found"), [([[0.0, 0, 0], [1.0, 0, 0]], [[1.0, 0, 0]]), (np.zeros((0, 3)),) * 2]
+)
+def test_there_may_be_fewer_places_than_asked_for(monkeypatch, places, found):
+    monkeypatch.setattr(pose_search, "_places", lambda frame: np.array(places))
     monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
     flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
-    np.testing.assert_array_equal(likely_places(NumberedFrame(), flat, 5), [[1.0, 0, 0]])
-
-
-def test_nowhere_to_look_gives_no_places(monkeypatch):
-    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
-    flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
-    assert likely_places(NumberedFrame(), flat, 5).shape == (0, 3)
+    np.testing.assert_array_equal(likely_places(NumberedFrame(), flat, 5), found)
 
 
 def test_places_are_voxels_of_the_field_of_view(frame):
@@ -214,10 +206,8 @@ def test_a_place_looks_alike_from_all_sides(frame):
     assert np.abs(a - b).mean() < 0.3 * np.abs(a - off).mean()
 
 
-def test_samples_are_rated_by_their_distance(shape, frame, monkeypatch):
-    true = placed(shape, poses(1, 2), np.zeros(2))
-    centred = type(true)(true.vertices, true.tips, type(true.pose)(
-        POINT[None], true.pose.rotation, true.pose.log_scale))  # fmt: skip
+def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):
+    centred = true._replace(pose=replace(true.pose, centre=POINT[None]))
     monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
     points, y = position_samples(labelled(centred, shape, frame=frame), 100)
     assert y.shape == (100, 1)
@@ -229,23 +219,15 @@ def test_samples_are_rated_by_their_distance(shape, frame, monkeypatch):
     assert np.any(gap > 15.0)
 
 
-def test_coefficients_and_tips_come_back_as_they_were_learned(shape, monkeypatch):
+def test_coefficients_and_tips_come_back_as_they_were_learned(shape, true):
     # What samples divide by the deviation or subtract is multiplied and added again.
-    monkeypatch.setattr(pose_search, "features", geometry)
-    b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
-    true = placed(shape, poses(1, 2), b)
+    b = shape.coefficients(true.pose.local(true.vertices[None]))[0, :MODES]
     trees = {"shape": start_oracle([true], shape, MODES)}
     found, tips = starting_shape(NumberedFrame(), trees, true.pose.repeated(2), shape)
     assert found.shape == (2, MODES)
     np.testing.assert_allclose(found[1], b, atol=1e-9)
     np.testing.assert_allclose(tips[1], true.tips, atol=1e-9)
-
-
-def test_samples_show_the_valve_as_seen_from_a_missed_pose(shape, monkeypatch):
     # Seen from the true pose instead, all samples would say the same.
-    monkeypatch.setattr(pose_search, "features", geometry)
-    b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
-    true = placed(shape, poses(1, 2), b)
     x, y = shape_start_samples(labelled(true, shape, 1), 25)
     assert y.shape == (25, MODES + 6)
     here = Poses(*seen(x)[:3])

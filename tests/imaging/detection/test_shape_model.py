@@ -27,14 +27,11 @@ def same(a, b, atol=1e-8):
     np.testing.assert_allclose(overlap, 1.0, atol=1e-6)
 
 
-def test_modes_are_orthonormal_and_deviations_decrease(shape):
+def test_modes_are_orthonormal_and_coefficients_undo_shapes(shape):
     flat = shape.modes.reshape(len(shape.modes), -1)
     np.testing.assert_allclose(flat @ flat.T, np.eye(len(flat)), atol=1e-9)
     assert np.all(np.diff(shape.std) <= 0)
     assert shape.std[-1] > 0
-
-
-def test_coefficients_undo_shapes(shape):
     b = np.random.default_rng(0).standard_normal((3, len(shape.std))) * shape.std
     np.testing.assert_allclose(shape.coefficients(shape.shape(b)), b, atol=1e-9)
     # Fewer coefficients are those of the leading modes.
@@ -49,7 +46,8 @@ def test_deviations_are_those_of_the_coefficients():
     found = []
     for valve in valves:
         for x, tips in zip(valve.vertices, valve.tips, strict=True):
-            found.append(model.coefficients(model.pose_of(x, tips).local(x[None]))[0])
+            local = pose_of(x, tips, model.layout, model.size_mm).local(x[None])
+            found.append(model.coefficients(local)[0])
     np.testing.assert_allclose(np.mean(found, axis=0), 0.0, atol=1e-9)
     np.testing.assert_allclose(np.std(found, axis=0), model.std, atol=1e-9)
 
@@ -61,38 +59,29 @@ def test_the_mean_valve_has_the_models_size_and_axes(shape):
     assert np.trace(pose.rotation[0]) > 2.99
 
 
-def test_valves_count_alike_however_many_frames_they_have():
-    # One of them has each of its frames four times: no mean and no mode may lean towards it.
-    valves = [moving_valve(k, 3) for k in range(5)]
-    first = valves[0]
-    longer = replace(
-        first,
-        times=0.01 * np.arange(12),
-        vertices=np.repeat(first.vertices, 4, 0),
-        tips=np.repeat(first.tips, 4, 0),
-    )
-    same(fit_shape_model([longer, *valves[1:]], 5), fit_shape_model(valves, 5))
+def with_repeated_frames(k, valve):
+    """The first valve with each of its frames four times."""
+    if k:
+        return valve
+    x, tips = np.repeat(valve.vertices, 4, 0), np.repeat(valve.tips, 4, 0)
+    return replace(valve, times=0.01 * np.arange(len(x)), vertices=x, tips=tips)
 
 
-def test_pose_is_taken_off():
-    # The same shapes, each frame somewhere else; the model sees no difference.
+def elsewhere(k, valve):
+    by = replace(poses(3, k, 60.0), log_scale=np.zeros(3))
+    return replace(valve, vertices=by.world(valve.vertices), tips=by.world(valve.tips))
+
+
+def scaled(k, valve):
+    factor = np.exp([0.2, -0.2, 0.1, -0.1])[k]  # of geometric mean 1
+    return replace(valve, vertices=factor * valve.vertices, tips=factor * valve.tips)
+
+
+@pytest.mark.parametrize("change", [with_repeated_frames, elsewhere, scaled])
+def test_frames_poses_and_sizes_make_no_difference(change):
     valves = [moving_valve(k, 3) for k in range(4)]
-    moved = []
-    for k, valve in enumerate(valves):
-        by = poses(3, k, 60.0)
-        by = replace(by, log_scale=np.zeros(3))
-        moved.append(replace(valve, vertices=by.world(valve.vertices), tips=by.world(valve.tips)))
-    same(fit_shape_model(moved, 5), fit_shape_model(valves, 5))
-
-
-def test_size_is_taken_off():
-    valves = [moving_valve(k, 3) for k in range(4)]
-    factors = np.exp([0.2, -0.2, 0.1, -0.1])  # of geometric mean 1
-    scaled = [
-        replace(v, vertices=f * v.vertices, tips=f * v.tips)
-        for v, f in zip(valves, factors, strict=True)
-    ]
-    same(fit_shape_model(scaled, 5), fit_shape_model(valves, 5))
+    changed = [change(k, valve) for k, valve in enumerate(valves)]
+    same(fit_shape_model(changed, 5), fit_shape_model(valves, 5))
 
 
 def test_too_few_shapes_and_other_layouts_are_refused():
@@ -136,9 +125,8 @@ def test_pulls_along_normals_alone_count_along_normals_only(shape):
     pose, b = poses(1, 3), np.zeros(4)
     at = np.arange(shape.layout.size)
     z = np.tile(pose.rotation[0][:, 2], (len(at), 1))
-    found, _ = fit_shape(
-        shape, pose, b, Pulls(at, z, np.full(len(at), 2.0), np.full(len(at), 0.02))
-    )
+    pulls = Pulls(at, z, np.full(len(at), 2.0), np.full(len(at), 0.02))
+    found, _ = fit_shape(shape, pose, b, pulls)
     by = pose.towards(found)[0]
     assert by[2] == pytest.approx(2.0, abs=0.05)
     assert np.abs(by[:2]).max() < 0.3
@@ -153,29 +141,17 @@ def test_one_coefficient_shrinks_as_the_analytic_solution_says(shape, monkeypatc
     size = np.linalg.norm(a[vertex])
     direction = a[vertex] / size
     offset = 0.05  # far below std: robust weights are 1
-    monkeypatch.setattr(
-        shape_model, "POSE_STD", shape_model.POSE_STD * 1e-6
-    )  # the pose does not move at all
-    _, found = fit_shape(
-        shape,
-        pose,
-        np.zeros(k),
-        Pulls(np.array([vertex]), direction[None], np.array([offset]), np.array([std])),
-    )
+    # The pose does not move at all.
+    monkeypatch.setattr(shape_model, "POSE_STD", shape_model.POSE_STD * 1e-6)
+
+    def pull(by):
+        return Pulls(np.array([vertex]), direction[None], np.array([by]), np.array([std]))
+
+    _, found = fit_shape(shape, pose, np.zeros(k), pull(offset))
     expected = (offset * size / std**2) / (size**2 / std**2 + 1 / mode_std**2)
     assert found[0] == pytest.approx(expected, rel=1e-3)
     # From an earlier estimate the prior draws towards zero, not towards that estimate.
-    _, again = fit_shape(
-        shape,
-        pose,
-        found + 0.3,
-        Pulls(
-            np.array([vertex]),
-            direction[None],
-            np.array([offset - (found[0] + 0.3) * size]),
-            np.array([std]),
-        ),
-    )
+    _, again = fit_shape(shape, pose, found + 0.3, pull(offset - (found[0] + 0.3) * size))
     assert again[0] == pytest.approx(expected, abs=2e-3 * mode_std)
 
 
@@ -191,12 +167,9 @@ def test_modes_grow_with_the_valve(shape):
     np.testing.assert_allclose(found, b, atol=0.03 * b[0])
 
 
-def test_a_prior_keeps_what_is_not_seen_at_the_mean(shape):
-    # Nothing but weak pulls: coefficients return towards zero.
-    pose, b = poses(1, 5), 1.0 * shape.std[:6]
-    at = np.array([3])
-    pulls = Pulls(at, np.eye(3)[:1], np.zeros(1), np.array([1e4]))
-    _, found = fit_shape(shape, pose, b, pulls)
+def test_weak_pulls_return_coefficients_to_the_mean(shape):
+    pulls = Pulls(np.array([3]), np.eye(3)[:1], np.zeros(1), np.array([1e4]))
+    _, found = fit_shape(shape, poses(1, 5), 1.0 * shape.std[:6], pulls)
     np.testing.assert_allclose(found, 0, atol=1e-3)
 
 
@@ -233,16 +206,17 @@ def some_pulls(count, seed=0):
     )
 
 
+X = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+
+
 def test_pulls_of_nothing_change_nothing():
-    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
-    pulls = some_pulls(30)
-    pulls = Pulls(pulls.vertex, pulls.direction, np.zeros(30), pulls.std)
-    np.testing.assert_allclose(relax(x, SMALL, pulls, 4.0, 0.3), x, atol=1e-12)
+    pulls = some_pulls(30)._replace(offset=np.zeros(30))
+    np.testing.assert_allclose(relax(X, SMALL, pulls, 4.0, 0.3), X, atol=1e-12)
 
 
 def test_a_common_shift_is_taken_whole_by_a_stiff_sheet_without_hold():
     # If stiffness resisted a shift of all vertices together, rows would lag behind.
-    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+    x = X
     d = np.array([1.0, -2.0, 0.5])
     at = np.array([0, 5, 13, 22, 31])
     pulls = Pulls.to_points(at, x[at], x[at] + d, np.full(5, 0.5))
@@ -260,20 +234,14 @@ def test_hold_keeps_what_is_not_pulled_in_place():
 
 def dense(x, layout, pulls, stiffness, hold):
     """The same problem written out: neighbours in a ring of columns and a line of rows."""
-    n = layout.size
+    n, columns = layout.size, layout.columns
     laplacian = np.zeros((n, n))
-    for j in range(layout.rows):
-        for i in range(layout.columns):
-            a = j * layout.columns + i
-            for b in (
-                j * layout.columns + (i + 1) % layout.columns,
-                j * layout.columns + (i - 1) % layout.columns,
-                (j + 1) * layout.columns + i if j + 1 < layout.rows else None,
-                (j - 1) * layout.columns + i if j > 0 else None,
-            ):
-                if b is not None:
-                    laplacian[a, a] += 1
-                    laplacian[a, b] -= 1
+    for a in range(n):
+        j, i = divmod(a, columns)
+        beside = [j * columns + (i + 1) % columns, j * columns + (i - 1) % columns]
+        for b in [*beside, *(b for b in (a + columns, a - columns) if 0 <= b < n)]:
+            laplacian[a, a] += 1
+            laplacian[a, b] -= 1
     matrix = np.kron(stiffness * laplacian.T @ laplacian + hold * np.eye(n), np.eye(3))
     right = np.zeros(3 * n)
     for v, d, o, s in zip(pulls.vertex, pulls.direction, pulls.offset, pulls.std, strict=True):
@@ -283,26 +251,16 @@ def dense(x, layout, pulls, stiffness, hold):
     return x + np.linalg.solve(matrix, right).reshape(n, 3)
 
 
-def test_relax_equals_the_dense_solution():
+def test_relax_equals_the_dense_solution_and_turns_with_the_valve():
     # Columns not joined in a ring, or several pulls of one vertex of which one counts.
-    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
     pulls = some_pulls(60)
     assert len(np.unique(pulls.vertex)) < 60
-    np.testing.assert_allclose(
-        relax(x, SMALL, pulls, 3.0, 0.2), dense(x, SMALL, pulls, 3.0, 0.2), atol=1e-9
-    )
-
-
-def test_relax_turns_with_the_valve():
-    x = np.random.default_rng(1).standard_normal((SMALL.size, 3))
+    found = relax(X, SMALL, pulls, 3.0, 0.2)
+    np.testing.assert_allclose(found, dense(X, SMALL, pulls, 3.0, 0.2), atol=1e-9)
     turn = Rotation.from_rotvec([0.4, -1.0, 0.7]).as_matrix()
-    pulls = some_pulls(40)
-    turned = Pulls(pulls.vertex, pulls.direction @ turn.T, pulls.offset, pulls.std)
-    np.testing.assert_allclose(
-        relax(x @ turn.T, SMALL, turned, 3.0, 0.2),
-        relax(x, SMALL, pulls, 3.0, 0.2) @ turn.T,
-        atol=1e-9,
-    )
+    turned = pulls._replace(direction=pulls.direction @ turn.T)
+    again = relax(X @ turn.T, SMALL, turned, 3.0, 0.2)
+    np.testing.assert_allclose(again, found @ turn.T, atol=1e-9)
 
 
 def test_pulls_to_points_are_along_the_worlds_axes():

@@ -31,14 +31,11 @@ def fields(count: int, std: np.ndarray, seed: int = 0) -> np.ndarray:
     return (white @ factor.T).transpose(0, 1, 3, 2) * std[:, None]
 
 
-def test_the_correlation_is_the_one_that_estimators_take():
-    points = sheet()
+def test_size_and_length_are_found_whatever_the_mean_error():
+    points, std = sheet(), np.linspace(0.3, 1.2, len(sheet()))
+    # The correlation is that of the estimation.
     d = np.linalg.norm(points[:, None] - points[None], axis=2)
     assert np.allclose(matern(d, LENGTH), SpatialCorrelation(points, LENGTH).matrix(), atol=1e-9)
-
-
-def test_size_and_length_are_found_whatever_the_mean_error():
-    std = np.linspace(0.3, 1.2, len(sheet()))
     errors = fields(30, std)
     mean = np.random.default_rng(1).normal(0, 3, errors.shape[1:])
     tips = np.ones((30, 2, 2, 3))
@@ -51,14 +48,11 @@ def test_size_and_length_are_found_whatever_the_mean_error():
     assert accuracy.tip_samples is tips
 
 
-def test_of_few_samples_errors_are_not_told_too_small():
+def test_few_samples_have_no_bias_and_independent_errors_no_length():
     std = np.linspace(0.3, 1.2, len(sheet()))
     tips = np.ones((3, 2, 2, 3))
     few = [measure_accuracy(fields(3, std, k), tips, sheet()).std_mm for k in range(30)]
     assert np.sqrt(np.mean(np.square(few), axis=0)).mean() == pytest.approx(std.mean(), rel=0.05)
-
-
-def test_independent_errors_are_alike_over_nothing():
     white = np.random.default_rng(2).standard_normal((500, len(sheet())))
     assert correlogram(white, sheet())[0].max() < 30
     assert fitted_length(*correlogram(white, sheet())) < 1.5
@@ -85,14 +79,9 @@ def test_errors_are_stated_wider_where_there_is_less_confidence():
     for errors, stated in ((fields(40, std, 3), 0.95), (3.0 * fields(40, std, 4), 0.75)):
         assert share_within(errors, found.at(stated).std_mm) == pytest.approx(0.95, abs=0.015)
 
-
-def test_volumes_off_by_the_same_are_stated_alike_whatever_their_confidence():
-    std = np.full(len(sheet()), 0.7)
-    accuracy = measure_accuracy(fields(40, std, 1), np.zeros((40, 2, 2, 3)), sheet())
-    smaller = 0.5 * fields(30, std, 2)
-    found = widened(accuracy, np.full(40, 0.95), smaller, np.full(30, 0.75))
-    # What is better in volumes that are believed less is luck, and is not extrapolated.
-    assert found.widening[1] == 0.0
+    # Smaller errors with less confidence are luck, and are not extrapolated.
+    lucky = widened(accuracy, np.full(40, 0.95), wide / 6.0, np.full(30, 0.75))
+    assert lucky.widening[1] == 0.0
 
 
 @pytest.mark.parametrize("value", [1.0, np.nan])

@@ -50,8 +50,6 @@ def test_leaflets_are_bright_where_the_truth_says_in_every_frame():
         assert bright > seen(volume, mirrored, k).mean() + 30
         assert seen(volume, blood, k).mean() < 60
 
-
-def test_the_truth_is_the_valve_in_the_world():
     truth = true_sequence(VALVE, PROBE, [0, 2])
     np.testing.assert_allclose(truth.vertices[1], PROBE.to_world(VALVE.vertices[2]))
     np.testing.assert_allclose(truth.tips[1], PROBE.to_world(VALVE.tips[2]))
@@ -62,7 +60,6 @@ def test_a_seed_gives_one_volume_whichever_frames_are_asked_for():
     both = simulate_volume(VALVE, SMALL, PROBE, 7, frames=[0, 2])
     last = simulate_volume(VALVE, SMALL, PROBE, 7, frames=[2])
     np.testing.assert_array_equal(both.frames[1], last.frames[0])
-    assert simulate_volume(VALVE, SMALL, PROBE, 7, frames=[2]).sha256 == last.sha256
     assert simulate_volume(VALVE, SMALL, PROBE, 8, frames=[2]).sha256 != last.sha256
     assert "simulated" in last.source
 
@@ -126,8 +123,9 @@ def test_the_heart_tells_front_from_back_and_leaves_room_for_the_probe():
     for _ in range(20):
         probe = draw_probe(rng)
         heart = make_heart(VALVE, probe.apex_in_valve, rng)
-        gap = np.linalg.norm(heart.ventricle[0][0, 0] - annulus, axis=1)
-        assert (heart.ventricle[0][0, 0] - annulus)[phi == 90, 1] > 12
+        away = heart.ventricle[0][0, 0] - annulus
+        gap = np.linalg.norm(away, axis=1)
+        assert away[phi == 90, 1] > 12
         assert gap[phi == 90] > 18
         assert gap[(phi > 200) & (phi < 340)].max() < 4
         # The aorta's back wall stands on the front of the annulus.
@@ -188,6 +186,7 @@ def test_levels_land_where_the_beams_run_in_the_world():
 def test_it_is_dark_outside_the_pyramid_only():
     grid = BeamGrid.of(SMALL)
     volume = scan_convert(np.full(grid.shape, 200, dtype=np.float32), grid)
+    assert [k for a, b in grid.windows() for k in range(a, b)] == list(range(grid.azimuth.count))
     places = np.indices(SMALL.shape).T.swapaxes(0, 2) * SMALL.voxel_mm
     x, y, z = np.moveaxis(volume_origin(SMALL) + places, -1, 0)
     r = np.sqrt(x**2 + y**2 + z**2)
