@@ -377,13 +377,16 @@ def _case(
     seen_later = world.noise(simulation.std_mm, surface.vertices, length)(moved, moved, rng)
     if simulation.rough_std_mm:
         seen_later = WhiteNoise(simulation.rough_std_mm)(seen_later, moved, rng)
+    exact = surface.vertices
+    open_shape = exact + world.open_moves(seen, other)
     if simulation.rest_std_mm:
-        rest_error = world.noise(simulation.rest_std_mm, surface.vertices, length)
-        exact = surface.vertices[None]
-        surface = replace(surface, vertices=rest_error(exact, exact, rng)[0])
+        rest_error = world.noise(simulation.rest_std_mm, exact, length)
+        open_shape = rest_error(open_shape[None], exact[None], rng)[0]
+    if np.any(open_shape != exact):
+        surface = replace(surface, vertices=open_shape)
         # Where a chord ends is seen on the leaflet, and in error as it is.
-        nearest = cKDTree(exact[0]).query(chordae.insertion)[1]
-        moved_ends = (surface.vertices - exact[0])[nearest]
+        nearest = cKDTree(exact).query(chordae.insertion)[1]
+        moved_ends = (open_shape - exact)[nearest]
         chordae = replace(chordae, insertion=chordae.insertion + moved_ends)
     motion = seen.motion
     at_annulus, at_tips = world.boundary(motion.annulus[-1], motion.papillary_tips[-1], other)

@@ -23,7 +23,8 @@ from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialC
 from mvest.quantities import Factor, Length, Share, Stretch
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
-from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.anatomy.template import smoothstep
+from mvest.valve.anatomy.valve import LeafletSurface, Valve
 from mvest.valve.geometry.triangles import surface_edges
 
 KERNELS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
@@ -64,6 +65,11 @@ class World:
         scaled to that one's (see `MechanicsSettings`); empty: the linear law.
     prestretch : float
         How many times as long in their plane open leaflets are as they would be free of stress.
+    leaflet_scale : float
+        Share by which one leaflet, drawn at random, is seen too long in the open frame, from its
+        annulus on.
+    frame_scale : float
+        Share by which the annulus and both leaflets are seen too large in the open frame.
     """
 
     kernel: str = "matern"
@@ -77,6 +83,8 @@ class World:
     outlier_mm: Length = 4.0
     exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
     prestretch: Stretch = 1.0
+    leaflet_scale: Share = 0.0
+    frame_scale: Share = 0.0
 
     def __post_init__(self) -> None:
         if self.kernel not in ("matern", *KERNELS):
@@ -85,7 +93,8 @@ class World:
             )
         require_numbers(self, "world", "length_factor", "prestretch")
         sizes = "annulus_mm", "tips_mm", "pressure_off", "thickness_off", "outlier_mm"
-        require_numbers(self, "world", *sizes, least=0)
+        scales = "leaflet_scale", "frame_scale"
+        require_numbers(self, "world", *sizes, *scales, least=0)
         for name in ("missing", "outliers"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)}, expected a share below 1")
@@ -160,6 +169,29 @@ class World:
             correlation = SpatialCorrelation(points, self.length_factor * length)
             return CorrelatedNoise(std, correlation)
         return _SmoothNoise(std, _factor(self.kernel, points, self.length_factor * length))
+
+    def open_moves(self, valve: Valve, rng: np.random.Generator) -> FloatArray:
+        """Displacements ``(n, 3)`` mm of the open leaflets as seen, by the errors of their size.
+
+        A leaflet grows away from its annulus, which stays. Within 20 degrees of a commissure its
+        error fades into the other leaflet. The whole frame grows from the centre of its annulus.
+
+        Parameters
+        ----------
+        valve : Valve
+            Sampled from a template (see `band_grid`).
+        rng : numpy.random.Generator
+        """
+        x = valve.surface.vertices
+        annulus = x[valve.annulus]
+        moves = self.frame_scale * (x - annulus.mean(axis=0))
+        if not self.leaflet_scale:
+            return moves
+        column = np.arange(len(x)) % len(annulus)
+        # The anterior leaflet lies where the sine is positive.
+        side = rng.choice([1.0, -1.0]) * np.sin(2.0 * np.pi * column / len(annulus))
+        weight = smoothstep(0.5 + side / (2.0 * np.sin(np.deg2rad(20.0))))
+        return moves + self.leaflet_scale * weight[:, None] * (x - annulus[column])
 
     def boundary(
         self, annulus: FloatArray, tips: FloatArray, rng: np.random.Generator

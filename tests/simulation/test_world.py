@@ -5,12 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mvest.cases.case import Role
 from mvest.errors import InputError
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import CLOSED_STRETCHES, ExponentialLaw, biaxial_stress
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
+from mvest.simulation import virtual_patient
+from mvest.simulation.virtual_patient import PatientSimulation
 from mvest.simulation.world import World
 from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.triangles import surface_edges
 
 LINEAR = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
 TISSUE = {name: ExponentialTissue(0.06, 4.3, 1400.0) for name in LINEAR}
@@ -30,6 +35,7 @@ def test_nothing_is_otherwise_by_default():
     settings = MechanicsSettings(LINEAR)
     assert world.mechanics(settings, {}) is settings
     np.testing.assert_array_equal(world.seen(POINTS, VALVE.surface, drawn), POINTS)
+    assert not world.open_moves(VALVE, drawn).any()
     # Nothing was drawn, so the same seed is the same valve in every world.
     assert drawn.bit_generator.state == before.bit_generator.state
     annulus, tips = world.boundary(POINTS[VALVE.annulus], VALVE.papillary_tips, drawn)
@@ -106,6 +112,56 @@ def test_what_is_missing_is_filled_in_without_its_detail():
     # Where a motion is constant there is no other harmonic value.
     shifted = World(missing=0.2).seen(POINTS + 1.0, VALVE.surface, rng())
     np.testing.assert_allclose(shifted, POINTS + 1.0, atol=1e-9)
+
+
+def open_case(**scales):
+    """A case whose closed leaflets are seen all but without an error."""
+    simulation = PatientSimulation(
+        std_mm=1e-7, held_pressure_mmHg=(), held_relaxation=(), world=World(**scales)
+    )
+    true = {"closed": POINTS + 1.0}
+    case = virtual_patient._case(
+        "n", "d", VALVE, true, simulation, MechanicsSettings(LINEAR), rng()
+    )
+    np.testing.assert_allclose(case.frame(Role.CLOSED).vertices, POINTS + 1.0, atol=1e-5)
+    np.testing.assert_array_equal(case.frame(Role.CLOSED).annulus, VALVE.motion.annulus[-1])
+    assert case.chordae.rest_length == pytest.approx(VALVE.chordae.rest_length)
+    # Chordae end on the leaflets as they are seen.
+    surface = case.surface
+    ends = closest_points(case.chordae.insertion, surface.vertices, surface.triangles)
+    assert ends.distance.max() < 0.15
+    return case
+
+
+def lengths(vertices):
+    """Length of each column of vertices from annulus to free edge, mm."""
+    return np.linalg.norm(np.diff(vertices.reshape(9, 32, 3), axis=0), axis=2).sum(axis=0)
+
+
+def test_one_open_leaflet_is_too_large():
+    case = open_case(leaflet_scale=0.04)
+    np.testing.assert_array_equal(case.surface.vertices[:32], POINTS[:32])
+    ratio = lengths(case.surface.vertices) / lengths(POINTS)
+    anterior, posterior = ratio[3:14], ratio[19:30]
+    own, other = (anterior, posterior) if anterior[0] > 1.02 else (posterior, anterior)
+    np.testing.assert_allclose(own, 1.04, atol=1e-12)
+    np.testing.assert_allclose(other, 1.0, atol=1e-12)
+    np.testing.assert_allclose(ratio[[0, 16]], 1.02)
+    # Both leaflets are drawn.
+    drawn, world = rng(), World(leaflet_scale=0.04)
+    middles = [world.open_moves(VALVE, drawn)[[8 * 32 + 8, 8 * 32 + 24]] for _ in range(40)]
+    assert 10 < np.count_nonzero(np.any(middles, axis=2)[:, 0]) < 30
+
+
+def test_the_open_frame_is_too_large():
+    case = open_case(frame_scale=0.03)
+    edges = surface_edges(VALVE.surface.triangles)
+    before, after = (np.diff(x[edges], axis=1) for x in (POINTS, case.surface.vertices))
+    np.testing.assert_allclose(after, 1.03 * before, atol=1e-12)
+    open_ring = case.frame(Role.REFERENCE).annulus
+    centre = POINTS[VALVE.annulus].mean(axis=0)
+    np.testing.assert_allclose(open_ring.mean(axis=0), centre, atol=1e-12)
+    np.testing.assert_array_equal(open_ring, case.surface.vertices[VALVE.annulus])
 
 
 def test_exponential_tissue_is_as_stiff_as_its_modulus_where_leaflets_are_closed():
