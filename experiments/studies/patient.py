@@ -48,7 +48,7 @@ from mvest.reporting.skill import (
     verdict_table,
 )
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.drawn_patient import PatientSettings
+from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 
 if TYPE_CHECKING:

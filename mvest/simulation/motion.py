@@ -11,7 +11,7 @@ while annulus and papillary tips return part of their way, each in equilibrium.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -202,27 +202,6 @@ class MotionSettings:
         require_numbers(self, "motion", "duration", "tolerance")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ClosingFrames:
-    """The frames of a closure, the open and the closed one among them.
-
-    Attributes
-    ----------
-    vertices : (f, n, 3) mm
-        Of the layout.
-    tips : (f, 2, 3) mm
-    model : ClosureModel
-        Which has been closed with ``at``.
-    at : (p,)
-        Its parameters.
-    """
-
-    vertices: FloatArray
-    tips: FloatArray
-    model: ClosureModel
-    at: FloatArray
-
-
 def close_in_motion(
     name: str,
     template: Template,
@@ -255,26 +234,26 @@ def close_in_motion(
         If a value is inadmissible.
     """
     shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
-    closing = closing_frames(name, template, values, settings, mechanics, shift)
-    model = closing.model
-    states = _held(settings, model.contact_valve, mechanics.protocol.pressure_mmHg)
+    closing, tips, model = closing_frames(name, template, values, settings, mechanics, shift)
+    pressures = [share * mechanics.protocol.pressure_mmHg for share in settings.held_pressure]
+    states = held_states(model.contact_valve, pressures, settings.held_relaxation)
+    at = np.array([values[parameter] for parameter in model.names])
     held = []
-    for state, vertices in zip(states, model.held(closing.at, states), strict=True):
+    for state, vertices in zip(states, model.held(at, states), strict=True):
         if vertices is None:
             raise RefusedError(
                 name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
             )
         held.append(vertices)
-    valve = moving_valve(
+    return moving_valve(
         name,
         template,
-        model.valve.surface.thickness,
+        model.valve,
         settings,
-        np.stack([*closing.vertices, *held]),
-        np.stack([*closing.tips, *(state.papillary_tips for state in states)]),
+        [*closing, *held],
+        [*tips, *(state.papillary_tips for state in states)],
+        settings.frames - 1,
     )
-    check_motion(valve, settings.frames - 1, settings.limits)
-    return valve
 
 
 def closing_frames(
@@ -284,8 +263,17 @@ def closing_frames(
     settings: MotionSettings,
     mechanics: MechanicsSettings,
     tip_motion: FloatArray,
-) -> ClosingFrames:
-    """Close a template: as :func:`close_in_motion`, but up to the closed frame and unchecked."""
+) -> tuple[FloatArray, FloatArray, ClosureModel]:
+    """Close a template: as :func:`close_in_motion`, but up to the closed frame and unchecked.
+
+    Returns
+    -------
+    vertices : (f, n, 3) mm
+        Of the layout, in the open frame, those of closing, and the closed one.
+    tips : (f, 2, 3) mm
+    model : ClosureModel
+        It has been closed with these values.
+    """
     seen, contact = (
         with_tip_motion(template.valve(columns, rows), tip_motion)
         for columns, rows in (
@@ -313,31 +301,70 @@ def closing_frames(
     chosen = frames_along(positions[:, seen.free_edge], settings.frames)
     phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])
     start, end = seen.motion.papillary_tips
-    return ClosingFrames(positions[chosen], start + phase[:, None, None] * (end - start), model, at)
+    return positions[chosen], start + phase[:, None, None] * (end - start), model
+
+
+def held_states(
+    valve: Valve,
+    pressures_mmHg: Iterable[float],
+    relaxations: Iterable[float],
+    lift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> list[HeldState]:
+    """The states of a valve that returns part of its way from the closed to the open shape.
+
+    Parameters
+    ----------
+    valve : Valve
+        The states have its annulus.
+    pressures_mmHg, relaxations : iterable of float
+        Of each state: its pressure, and the share of the way that annulus and tips have gone back.
+    lift : (float, float, float)
+        mm, further displacement of the tips per unit of relaxation.
+    """
+    annulus, tips = valve.motion.annulus, valve.motion.papillary_tips
+    return [
+        HeldState(
+            pressure,
+            annulus[-1] + back * (annulus[0] - annulus[-1]),
+            tips[-1] + back * (np.array(lift) + (tips[0] - tips[-1])),
+        )
+        for pressure, back in zip(pressures_mmHg, relaxations, strict=True)
+    ]
 
 
 def moving_valve(
     name: str,
     template: Template,
-    thickness: FloatArray,
+    seen: Valve,
     settings: MotionSettings,
-    vertices: FloatArray,
-    tips: FloatArray,
+    vertices: Sequence[FloatArray],
+    tips: Sequence[FloatArray],
+    closed: int,
 ) -> MovingValve:
-    """A template's valve with frames ``vertices (T, n, 3)`` and ``tips (T, 2, 3)``, T > 1."""
+    """The frames of a template's valve: two or more, ``vertices (n, 3)`` and ``tips (2, 3)`` mm.
+
+    ``seen`` is the valve in the layout, ``closed`` the number of the closed frame.
+
+    Raises
+    ------
+    RefusedError
+        If it is beyond the limits of the settings.
+    """
     count = len(vertices)
     phi, s, _, tip = template.chord_places()
-    return MovingValve(
+    valve = MovingValve(
         name,
         ValveLayout(settings.columns, settings.rows),
         settings.duration * np.arange(count) / (count - 1),
-        vertices,
-        tips,
-        thickness,
+        np.stack(vertices),
+        np.stack(tips),
+        seen.surface.thickness,
         np.mod(phi, 360.0),
         s,
         tip,
     )
+    check_motion(valve, closed, settings.limits)
+    return valve
 
 
 def with_tip_motion(valve: Valve, shift: FloatArray) -> Valve:
@@ -371,16 +398,3 @@ def frames_along(points: FloatArray, count: int) -> IntArray:
         last = int(allowed[np.argmin(np.abs(way[allowed] - way[-1] * k / (count - 1)))])
         chosen.append(last)
     return np.array([*chosen, total - 1], dtype=np.int64)
-
-
-def _held(settings: MotionSettings, valve: Valve, pressure: float) -> list[HeldState]:
-    """The frames after the closed one, on the annulus of the valve where contact is sampled."""
-    annulus, tips = valve.motion.annulus, valve.motion.papillary_tips
-    return [
-        HeldState(
-            share * pressure,
-            annulus[-1] + back * (annulus[0] - annulus[-1]),
-            tips[-1] + back * (tips[0] - tips[-1]),
-        )
-        for share, back in zip(settings.held_pressure, settings.held_relaxation, strict=True)
-    ]

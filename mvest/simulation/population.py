@@ -180,11 +180,12 @@ def draw_tip_motion(
     return np.asarray(direction * rng.uniform(*reach, size=(2, 1)))
 
 
-SHAPES: dict[str, tuple[int | None, ...]] = {
-    "times": (None,), "vertices": (None, None, 3), "tips": (None, 2, 3), "thickness": (None,),
-    "chord_phi": (None,), "chord_s": (None,),
+SHAPES: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "layout": ("i", (2,)), "times": ("f", (None,)), "vertices": ("f", (None, None, 3)),
+    "tips": ("f", (None, 2, 3)), "thickness": ("f", (None,)), "chord_phi": ("f", (None,)),
+    "chord_s": ("f", (None,)), "chord_tip": ("i", (None,)),
 }  # fmt: skip
-"""Array of a valve -> its shape."""
+"""Array of a valve -> its kind (integers or numbers) and shape."""
 
 
 def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
@@ -197,10 +198,10 @@ def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
     """
     arrays: dict[str, Any] = {"names": np.array([valve.name for valve in valves])}
     for k, valve in enumerate(valves):
-        arrays[f"{k}.layout"] = np.array([valve.layout.columns, valve.layout.rows])
-        arrays[f"{k}.chord_tip"] = np.asarray(valve.chord_tip, dtype=np.int32)
-        for name in SHAPES:
-            arrays[f"{k}.{name}"] = np.asarray(getattr(valve, name), dtype=np.float32)
+        size = {"layout": (valve.layout.columns, valve.layout.rows)}
+        for name, (kind, _) in SHAPES.items():
+            values = size.get(name) or getattr(valve, name)
+            arrays[f"{k}.{name}"] = np.asarray(values, np.int32 if kind == "i" else np.float32)
     write_atomically(path, partial(np.savez_compressed, **arrays))
 
 
@@ -216,13 +217,12 @@ def load_population(path: Path) -> tuple[MovingValve, ...]:
     valves: list[MovingValve] = []
     try:
         for k, name in enumerate(stored["names"].tolist()):
-            layout = check_array(stored[f"{k}.layout"], f"{k}.layout", "i", (2,))
-            tip = check_array(stored[f"{k}.chord_tip"], f"{k}.chord_tip", "i", (None,))
             own: dict[str, Any] = {
-                part: check_array(stored[f"{k}.{part}"], f"{k}.{part}", "f", shape)
-                for part, shape in SHAPES.items()
+                part: check_array(stored[f"{k}.{part}"], f"{k}.{part}", *expected)
+                for part, expected in SHAPES.items()
             }
-            valves.append(MovingValve(name, ValveLayout(*layout.tolist()), chord_tip=tip, **own))
+            own["layout"] = ValveLayout(*own["layout"].tolist())
+            valves.append(MovingValve(name, **own))
     except KeyError as error:
         raise InputError(f"{path}: {error} is missing") from error
     except InputError as error:

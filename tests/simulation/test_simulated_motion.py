@@ -17,7 +17,6 @@ from mvest.simulation import imaged_patient as patients
 from mvest.simulation import motion, population, virtual_patient
 from mvest.simulation.imaged_patient import simulate_imaged_patient
 from mvest.simulation.motion import (
-    ClosingFrames,
     MotionLimits,
     MotionSettings,
     RefusedError,
@@ -468,7 +467,7 @@ def made(monkeypatch):
         assert values == HIDDEN
         vertices = np.stack([rest * (1 - 0.01 * k) for k in range(4)])
         tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * tip_motion
-        return ClosingFrames(vertices, tips, closure, np.zeros(1))
+        return vertices, tips, closure
 
     def model(template, seen, contact, values, simulation, mechanics):
         np.testing.assert_allclose(contact.motion.papillary_tips[0] - TIP_MOTION,

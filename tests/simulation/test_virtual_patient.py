@@ -15,8 +15,9 @@ from mvest.problem.registration import REGISTRATION, displace
 from mvest.simulation import virtual_patient
 from mvest.simulation.virtual_patient import (
     Deviations,
+    PatientSettings,
     PatientSimulation,
-    draw_hidden,
+    draw_patient_values,
     simulate_patient,
 )
 from mvest.valve.anatomy.template import Template
@@ -61,10 +62,16 @@ def patient(values):
     return make(values)
 
 
+def draw(rng, deviations=None, spread=0.0, **simulation):
+    settings = PatientSettings(
+        name="p", description="d", moduli=MODULI, moduli_spread=spread,
+        simulation=PatientSimulation(**simulation), deviations=deviations or Deviations(),
+    )  # fmt: skip
+    return draw_patient_values(settings, rng)
+
+
 def test_what_is_hidden_is_drawn_by_the_seed():
-    one, same, other = (
-        draw_hidden(MODULI, Deviations(), np.random.default_rng(seed)) for seed in (1, 1, 2)
-    )
+    one, same, other = (draw(np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert one == same
     assert all(one[name] != other[name] for name in one if name not in MODULI)
     assert {name: one[name] for name in MODULI} == MODULI
@@ -73,27 +80,27 @@ def test_what_is_hidden_is_drawn_by_the_seed():
     }  # fmt: skip
 
 
-def test_what_is_hidden_spreads_as_it_is_told():
+def test_what_is_hidden_spreads_as_requested():
     rng = np.random.default_rng(0)
-    told = Deviations(0.1, 0.03, 0.25, 1.5, 4.0)
-    drawn = [draw_hidden(MODULI, told, rng) for _ in range(4000)]
-    stds = {
+    drawn = [draw(rng, Deviations(0.1, 0.03, 0.25, 1.5, 4.0), 0.5) for _ in range(4000)]
+    factors = {
+        "E_f.anterior": 0.5,
         "pressure_scale": 0.1,
         "chord_rest_length": 0.03,
         "chord_stiffness": 0.25,
-        **{name: 1.5 if name.startswith("shift") else 4.0 for name in REGISTRATION},
     }
+    displacements = {name: 1.5 if name.startswith("shift") else 4.0 for name in REGISTRATION}
     columns = []
-    for name, std in stds.items():
+    for name, std in (factors | displacements).items():
         found = np.array([values[name] for values in drawn])
         # Factors are log-normal with the median one, so none is negative.
-        found = np.log(found) if name not in REGISTRATION else found
+        found = np.log(found / MODULI.get(name, 1.0)) if name in factors else found
         # Four standard errors: std / sqrt(n) of a mean, std / sqrt(2 n) of a spread.
         assert abs(found.mean()) < 4 * std / np.sqrt(4000)
         assert found.std() == pytest.approx(std, rel=4 / np.sqrt(8000))
         columns.append(found)
     # Nothing is drawn with anything else: correlations of 4000 pairs are below 4 / sqrt(4000).
-    assert np.abs(np.corrcoef(columns) - np.eye(9)).max() < 0.065
+    assert np.abs(np.corrcoef(columns) - np.eye(10)).max() < 0.065
 
 
 def test_a_patient_is_seen_where_it_is_up_to_its_displacement_and_noise(patient, values):
@@ -167,10 +174,9 @@ def test_further_fitted_frames_are_closed_under_pressures_with_errors(patient, v
     rise = [true[name] - other["held_95_mmHg"] for name in ("fitted_95_mmHg", "held_97_mmHg")]
     assert np.linalg.norm(rise[1]) == pytest.approx(2 * np.linalg.norm(rise[0]), rel=0.05)
     np.testing.assert_allclose(true["closed"] - other["closed"], 0.5 * rise[0], atol=0.02)
-    drawn = draw_hidden(MODULI, Deviations(), np.random.default_rng(1), ("closed", "b"))
-    alone = draw_hidden(MODULI, Deviations(), np.random.default_rng(1))
+    drawn, alone = (draw(np.random.default_rng(1), **own) for own in (further, {}))
     assert alone.items() <= drawn.items()
-    assert set(drawn) - set(alone) == {OFFSET, f"{ERROR}.closed", f"{ERROR}.b"}
+    assert set(drawn) - set(alone) == {OFFSET, f"{ERROR}.closed", f"{ERROR}.fitted_95_mmHg"}
 
 
 def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
