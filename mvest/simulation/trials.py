@@ -152,8 +152,8 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
     true = true_sequence(valve, probe)
     model, layout = _model(str(model_file)), valve.layout
     found = detect_valve(volume, model, min_confidence=0.0)
-    pairs = (zip(one.vertices, one.tips, strict=True) for one in (found, true))
-    frames = [_errors(*both, layout) for both in zip(*pairs, strict=True)]
+    shapes = (list(zip(one.vertices, one.tips, strict=True)) for one in (found, true))
+    frames = [_errors(a, b, layout) for a, b in zip(*shapes, strict=True)]
     two = [0, trial.closed]
     row = {
         "kind": trial.kind,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mvest.cases.folder import ATRIUM, VENTRICLE, PressureCurve, generic_curve
+from mvest.cases.folder import ATRIUM, VENTRICLE, generic_curve, pressure_curve
 from mvest.errors import InputError
 
 
@@ -42,4 +42,4 @@ def test_no_curve_is_continued_beyond_its_ends(time):
 )
 def test_a_curve_that_is_none(time, pressure, message):
     with pytest.raises(InputError, match=message):
-        PressureCurve(np.array(time), np.array(pressure))
+        pressure_curve(np.array(time), np.array(pressure))

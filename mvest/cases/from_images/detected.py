@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.cases.folder import PressureCurve, write_case
+from mvest.cases.folder import pressure_curve, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
@@ -164,7 +164,7 @@ def detect_in_volume(
     pressure: Any = settings.pressure_mmHg
     if settings.pressure_curve is not None:
         table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
-        pressure = PressureCurve(*table.T)
+        pressure = pressure_curve(*table.T)
     elif estimate and pressure is None:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "

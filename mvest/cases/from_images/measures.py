@@ -77,12 +77,12 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
         row: Row = {
             "frame": t,
             "time_s": float(time),
-            "confidence": _finite(sequence.frame_confidence[t]),
-            "vertex_confidence_mean": _finite(sequence.vertex_confidence[t].mean()),
+            "confidence": finite_or_none(sequence.frame_confidence[t]),
+            "vertex_confidence_mean": finite_or_none(sequence.vertex_confidence[t].mean()),
             "contact_distance_mm": reach,
         }
         measured = _measured(sequence, t, reach)
-        rows.append(row | {name: _finite(measured.get(name)) for name in names})
+        rows.append(row | {name: finite_or_none(measured.get(name)) for name in names})
     return rows
 
 
@@ -103,7 +103,8 @@ def is_open(measures: Mapping[str, float | None]) -> bool:
     return orifice is None or area is None or orifice >= OPEN_SHARE * area
 
 
-def _finite(value: Any) -> float | None:
+def finite_or_none(value: Any) -> float | None:
+    """A number, or None for what is none."""
     return float(value) if value is not None and np.isfinite(value) else None
 
 
