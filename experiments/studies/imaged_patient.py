@@ -55,7 +55,7 @@ from mvest.simulation.imaged_patient import (
     ImagedPatient,
     simulate_imaged_patient,
 )
-from mvest.simulation.motion import MotionSettings
+from mvest.simulation.motion import DrawnValve, MotionSettings
 from mvest.simulation.population import draw_tip_motion
 from mvest.simulation.virtual_patient import (
     PatientSettings,
@@ -207,9 +207,8 @@ def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> M
 
     def simulate(drawn: Template) -> ImagedPatient:
         motion = draw_tip_motion(drawn, echo.tip_motion_mm, rng)
-        return simulate_imaged_patient(
-            patient.name, drawn, hidden, IMAGED, MotionSettings(), mechanics, motion
-        )
+        valve = DrawnValve(patient.name, drawn, hidden, mechanics, motion)
+        return simulate_imaged_patient(valve, IMAGED, MotionSettings())
 
     made, draws = first_that_closes(
         template_of(values), patient.variation, MAX_DRAWS, rng, simulate

@@ -10,19 +10,17 @@ same images.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.imaging.valve_sequence import MovingValve
-from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import REGISTRATION
 from mvest.quantities import Length
-from mvest.simulation.motion import MotionSettings, closing_frames, moving_valve, with_tip_motion
+from mvest.simulation.motion import DrawnValve, MotionSettings, closing_frames, moving_valve
 from mvest.simulation.virtual_patient import PatientSimulation, close_patient
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points
 
@@ -85,61 +83,39 @@ class ImagedPatient:
 
 
 def simulate_imaged_patient(
-    name: str,
-    template: Template,
-    values: Mapping[str, float],
-    simulation: PatientSimulation,
-    settings: MotionSettings,
-    mechanics: MechanicsSettings,
-    tip_motion: FloatArray,
+    drawn: DrawnValve, simulation: PatientSimulation, settings: MotionSettings
 ) -> ImagedPatient:
-    """Close a template as a patient's valve.
+    """Close a valve as a patient's.
 
     Parameters
     ----------
-    name : str
-    template : Template
-    values : mapping
-        As from :func:`mvest.simulation.virtual_patient.draw_patient_values`; its displacement is
-        not used.
+    drawn : DrawnValve
+        With the values of :func:`mvest.simulation.virtual_patient.draw_patient_values`; their
+        displacement is not used.
     simulation : PatientSimulation
         Of the open, closed and held frames.
     settings : MotionSettings
         Layout, duration and limits; mesh and number of the frames of closing.
-    mechanics : MechanicsSettings
-        Its pressure is what is stated.
-    tip_motion : ndarray
-        ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
 
     Raises
     ------
     GeometryError
         If the valve does not close, or not as a valve does.
+    InputError
+        If its mechanics do not end in an equilibrium.
     """
-    own = {parameter: v for parameter, v in values.items() if parameter not in REGISTRATION}
-    if not mechanics.protocol.equilibrium:
+    values = {name: value for name, value in drawn.values.items() if name not in REGISTRATION}
+    drawn, protocol = replace(drawn, values=values), drawn.mechanics.protocol
+    if not protocol.equilibrium:
         raise InputError(
             "mechanics protocol equilibrium = False, expected True for a patient who is imaged"
         )
     # The coarse closure first: it is soon refused.
-    closing, tips, _ = closing_frames(name, template, own, settings, mechanics, tip_motion)
-    seen, contact = (
-        with_tip_motion(template.valve(columns, rows), tip_motion)
-        for columns, rows in (
-            (settings.columns, settings.rows),
-            (simulation.contact_columns, simulation.contact_rows),
-        )
-    )
-    later = close_patient(name, template, seen, contact, own, simulation, mechanics)
-    held = simulation.held_states(contact).values()
+    closing, tips, _ = closing_frames(drawn, settings)
+    seen = drawn.sampled(settings.columns, settings.rows)
+    later = close_patient(drawn, seen, simulation)
+    shapes = [seen.surface.vertices, *closing[1:-1], *later.values()]
+    tips += [state.papillary_tips for state in simulation.held_states(seen).values()]
     closed = len(closing) - 1
-    valve = moving_valve(
-        name,
-        template,
-        seen,
-        settings,
-        [seen.surface.vertices, *closing[1:-1], *later.values()],
-        [*tips, *(state.papillary_tips for state in held)],
-        closed,
-    )
-    return ImagedPatient(valve, closed, mechanics.protocol.pressure_mmHg, seen, own)
+    valve = moving_valve(drawn, settings, shapes, tips, closed)
+    return ImagedPatient(valve, closed, protocol.pressure_mmHg, seen, values)

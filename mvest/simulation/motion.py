@@ -202,29 +202,46 @@ class MotionSettings:
         require_numbers(self, "motion", "duration", "tolerance")
 
 
-def close_in_motion(
-    name: str,
-    template: Template,
-    values: Mapping[str, float],
-    settings: MotionSettings,
-    mechanics: MechanicsSettings,
-    tip_motion: FloatArray | None = None,
-) -> MovingValve:
-    """Close a template and return its frames.
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnValve:
+    """A valve that is to be closed.
 
-    Parameters
+    Attributes
     ----------
     name : str
-        Of the valve.
     template : Template
     values : mapping
-        Parameter -> value: the moduli ``E_f.REGION`` in MPa, and any of the factors
+        Parameter -> true value: the moduli ``E_f.REGION`` in MPa, and any of the factors
         ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
-    settings : MotionSettings
     mechanics : MechanicsSettings
-        Of its protocol, pressure and ramp; the steps are those of ``settings``.
-    tip_motion : ndarray, optional
-        ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
+        Its pressure is the stated one.
+    tip_motion : (2, 3) mm
+        Where the papillary tips are in the open valve relative to the closed one.
+    """
+
+    name: str
+    template: Template
+    values: Mapping[str, float]
+    mechanics: MechanicsSettings
+    tip_motion: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
+
+    def __post_init__(self) -> None:
+        if np.shape(self.tip_motion) != (2, 3):
+            raise InputError(
+                f"motion of the tips: shape {np.shape(self.tip_motion)}, expected (2, 3)"
+            )
+
+    def sampled(self, columns: int, rows: int) -> Valve:
+        """The valve on ``columns x rows`` vertices; its tips move while it closes."""
+        valve = self.template.valve(columns, rows)
+        motion, end = valve.motion, valve.motion.papillary_tips[-1]
+        tips = end + (1.0 - motion.phase)[:, None, None] * self.tip_motion
+        moving = replace(motion, papillary_tips=tips)
+        return replace(valve, papillary_tips=end + self.tip_motion, motion=moving)
+
+
+def close_in_motion(drawn: DrawnValve, settings: MotionSettings) -> MovingValve:
+    """Close a valve on a coarse mesh, hold it, and return its frames.
 
     Raises
     ------
@@ -233,55 +250,46 @@ def close_in_motion(
     InputError, MaterialError
         If a value is inadmissible.
     """
-    shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
-    closing, tips, model = closing_frames(name, template, values, settings, mechanics, shift)
-    pressures = [share * mechanics.protocol.pressure_mmHg for share in settings.held_pressure]
+    closing, tips, model = closing_frames(drawn, settings)
+    pressure = drawn.mechanics.protocol.pressure_mmHg
+    pressures = [share * pressure for share in settings.held_pressure]
     states = held_states(model.contact_valve, pressures, settings.held_relaxation)
-    at = np.array([values[parameter] for parameter in model.names])
+    at = np.array([drawn.values[parameter] for parameter in model.names])
     held = []
     for state, vertices in zip(states, model.held(at, states), strict=True):
         if vertices is None:
             raise RefusedError(
-                name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
+                drawn.name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
             )
         held.append(vertices)
-    return moving_valve(
-        name,
-        template,
-        model.valve,
-        settings,
-        [*closing, *held],
-        [*tips, *(state.papillary_tips for state in states)],
-        settings.frames - 1,
-    )
+    tips = [*tips, *(state.papillary_tips for state in states)]
+    return moving_valve(drawn, settings, [*closing, *held], tips, settings.frames - 1)
 
 
 def closing_frames(
-    name: str,
-    template: Template,
-    values: Mapping[str, float],
-    settings: MotionSettings,
-    mechanics: MechanicsSettings,
-    tip_motion: FloatArray,
-) -> tuple[FloatArray, FloatArray, ClosureModel]:
-    """Close a template: as :func:`close_in_motion`, but up to the closed frame and unchecked.
+    drawn: DrawnValve, settings: MotionSettings
+) -> tuple[list[FloatArray], list[FloatArray], ClosureModel]:
+    """The frames of a valve up to the closed one, which are not checked.
+
+    Of the mechanics' protocol, pressure and ramp count; the steps are those of ``settings``.
 
     Returns
     -------
-    vertices : (f, n, 3) mm
+    vertices : list of (n, 3) mm
         Of the layout, in the open frame, those of closing, and the closed one.
-    tips : (f, 2, 3) mm
+    tips : list of (2, 3) mm
     model : ClosureModel
-        It has been closed with these values.
+        It has been closed with the values of the valve.
+
+    Raises
+    ------
+    RefusedError
+        If the valve does not close.
     """
-    seen, contact = (
-        with_tip_motion(template.valve(columns, rows), tip_motion)
-        for columns, rows in (
-            (settings.columns, settings.rows),
-            (settings.contact_columns, settings.contact_rows),
-        )
+    mesh = structured_mesh(
+        drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows
     )
-    mesh = structured_mesh(template, settings.element, settings.mesh_columns, settings.mesh_rows)
+    mechanics = drawn.mechanics
     ramp = mechanics.protocol.ramp
     protocol = replace(
         mechanics.protocol,
@@ -291,17 +299,25 @@ def closing_frames(
         equilibrium=True,
     )
     newton = replace(mechanics.newton, tolerance=settings.tolerance, **GIVE_UP)
-    own = replace(mechanics, protocol=protocol, newton=newton)
-    model = ClosureModel(seen, contact, mesh, own, tuple(values), continuation=True)
-    at = np.array([values[parameter] for parameter in model.names])
+    seen = drawn.sampled(settings.columns, settings.rows)
+    model = ClosureModel(
+        seen,
+        drawn.sampled(settings.contact_columns, settings.contact_rows),
+        mesh,
+        replace(mechanics, protocol=protocol, newton=newton),
+        tuple(drawn.values),
+        continuation=True,
+    )
+    at = np.array([drawn.values[parameter] for parameter in model.names])
     simulation = model.close(at, sensitivities=False, every_frame=True).simulation
     if not simulation.converged:
-        raise RefusedError(name, f"the closure does not converge ({simulation.reason.value})")
+        reason = simulation.reason.value
+        raise RefusedError(drawn.name, f"the closure does not converge ({reason})")
     positions = np.stack([model.observed(frame) for frame in simulation.frames])
     chosen = frames_along(positions[:, seen.free_edge], settings.frames)
     phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])
     start, end = seen.motion.papillary_tips
-    return positions[chosen], start + phase[:, None, None] * (end - start), model
+    return list(positions[chosen]), list(start + phase[:, None, None] * (end - start)), model
 
 
 def held_states(
@@ -333,49 +349,36 @@ def held_states(
 
 
 def moving_valve(
-    name: str,
-    template: Template,
-    seen: Valve,
+    drawn: DrawnValve,
     settings: MotionSettings,
     vertices: Sequence[FloatArray],
     tips: Sequence[FloatArray],
     closed: int,
 ) -> MovingValve:
-    """The frames of a template's valve: two or more, ``vertices (n, 3)`` and ``tips (2, 3)`` mm.
+    """A valve in two or more frames, ``vertices (n, 3)`` and ``tips (2, 3)`` mm.
 
-    ``seen`` is the valve in the layout, ``closed`` the number of the closed frame.
+    ``closed`` is the number of the closed frame, the first one is open.
 
     Raises
     ------
     RefusedError
         If it is beyond the limits of the settings.
     """
-    count = len(vertices)
-    phi, s, _, tip = template.chord_places()
+    layout, count = ValveLayout(settings.columns, settings.rows), len(vertices)
+    phi, s, _, tip = drawn.template.chord_places()
     valve = MovingValve(
-        name,
-        ValveLayout(settings.columns, settings.rows),
-        settings.duration * np.arange(count) / (count - 1),
-        np.stack(vertices),
-        np.stack(tips),
-        seen.surface.thickness,
-        np.mod(phi, 360.0),
-        s,
-        tip,
+        name=drawn.name,
+        layout=layout,
+        times=settings.duration * np.arange(count) / (count - 1),
+        vertices=np.stack(vertices),
+        tips=np.stack(tips),
+        thickness=drawn.template.thickness(layout.phi, layout.s),
+        chord_phi=np.mod(phi, 360.0),
+        chord_s=s,
+        chord_tip=tip,
     )
     check_motion(valve, closed, settings.limits)
     return valve
-
-
-def with_tip_motion(valve: Valve, shift: FloatArray) -> Valve:
-    """The valve with papillary tips that begin ``shift (t, 3)`` mm from where they end."""
-    motion = valve.motion
-    end = motion.papillary_tips[-1]
-    if np.shape(shift) != end.shape:
-        raise InputError(f"motion of the tips: shape {np.shape(shift)}, expected {end.shape}")
-    way = (1.0 - motion.phase)[:, None, None] * shift
-    moved = replace(motion, papillary_tips=end + way)
-    return replace(valve, papillary_tips=end + shift, motion=moved)
 
 
 def frames_along(points: FloatArray, count: int) -> IntArray:

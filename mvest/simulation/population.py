@@ -24,7 +24,7 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.processes import side_by_side
 from mvest.quantities import Factor, Length, Logarithm, Modulus
 from mvest.reading.npz import check_array, read_npz
-from mvest.simulation.motion import MotionSettings, RefusedError, close_in_motion
+from mvest.simulation.motion import DrawnValve, MotionSettings, RefusedError, close_in_motion
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
@@ -145,9 +145,9 @@ def _draw(
         values["chord_rest_length"] = _factor(settings.chord_rest_length_spread, rng)
         duration = settings.motion.duration * _factor(settings.duration_spread, rng)
         tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
-        motion = replace(settings.motion, duration=duration)
+        drawn = DrawnValve(name, template, values, mechanics, tip_motion)
         try:
-            return close_in_motion(name, template, values, motion, mechanics, tip_motion)
+            return close_in_motion(drawn, replace(settings.motion, duration=duration))
         except RefusedError as error:
             reasons.append(str(error))
     raise GeometryError(f"simulated valve {name}: refused {MAX_DRAWS} times: {'; '.join(reasons)}")

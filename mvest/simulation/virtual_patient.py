@@ -39,7 +39,7 @@ from mvest.quantities import (
     Share,
 )
 from mvest.simulation.misspecification import Misspecification
-from mvest.simulation.motion import held_states
+from mvest.simulation.motion import DrawnValve, held_states
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
@@ -291,78 +291,61 @@ def simulate_patient(
     values = world.values(values, other)
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
     real = Template(world.anatomy(template.parameters, other))
-    own = world.mechanics(mechanics, values)
-    contact, there = (
-        real.valve(columns, rows)
-        for columns, rows in (
-            (simulation.contact_columns, simulation.contact_rows),
-            (simulation.seen_columns, simulation.seen_rows),
-        )
-    )
+    drawn = DrawnValve(name, real, values, world.mechanics(mechanics, values))
+    there = drawn.sampled(simulation.seen_columns, simulation.seen_rows)
+    shapes = close_patient(drawn, there, simulation)
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
-    shapes = close_patient(name, real, there, contact, values, simulation, own)
     true = {frame: displace(vertices, registration, centre) for frame, vertices in shapes.items()}
     case = _case(name, description, seen, true, simulation, mechanics, rng)
     return VirtualPatient(case, dict(values), {REFERENCE: seen.surface.vertices, **true})
 
 
 def close_patient(
-    name: str,
-    template: Template,
-    seen: Valve,
-    contact: Valve,
-    values: Mapping[str, float],
-    simulation: PatientSimulation,
-    mechanics: MechanicsSettings,
+    drawn: DrawnValve, seen: Valve, simulation: PatientSimulation
 ) -> dict[str, FloatArray]:
     """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
 
-    The first frame is the closed one; the fitted and the held-out ones follow. ``seen`` and
-    ``contact`` are the template where it is seen and where contact is sampled.
+    The first frame is the closed one; the fitted and the held-out ones follow. ``seen`` is the
+    valve where it is seen.
 
     Raises
     ------
     GeometryError
         If the valve does not close, or has no equilibrium in one of these.
     """
-    model = _model(template, seen, contact, values, simulation, mechanics)
-    states = simulation.held_states(contact)
+    model, values = _model(drawn, seen, simulation), drawn.values
+    states = simulation.held_states(model.contact_valve)
     frames = FramesModel(
         model,
         CLOSED,
         {frame: states[frame] for frame in simulation.fitted_frames[1:]},
-        mechanics.protocol.pressure_mmHg,
+        drawn.mechanics.protocol.pressure_mmHg,
         tuple(name for name in values if is_frame_pressure(name)),
     )
     m = np.array([values[parameter] for parameter in frames.names])
     at = frames.of_closure(m)
     prediction = model(at)
+    patient = f"virtual patient {drawn.name}"
     if not prediction.converged:
-        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+        raise GeometryError(f"{patient} does not close: {prediction.reason}")
     true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
     for frame, vertices in zip(states, model.held(at, frames.under(m, states)), strict=True):
         if vertices is None:
-            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
+            raise GeometryError(f"{patient} has no equilibrium in the frame {frame}")
         true[frame] = vertices
     return true
 
 
-def _model(
-    template: Template,
-    seen: Valve,
-    contact: Valve,
-    values: Mapping[str, float],
-    simulation: PatientSimulation,
-    mechanics: MechanicsSettings,
-) -> ClosureModel:
+def _model(drawn: DrawnValve, seen: Valve, simulation: PatientSimulation) -> ClosureModel:
     """The model that closes a virtual patient, with the guides that it follows."""
-    not_modelled = {*REGISTRATION, *filter(is_frame_pressure, values)}
+    not_modelled = {*REGISTRATION, *filter(is_frame_pressure, drawn.values)}
     if simulation.world.exponential:
         # Its coefficients follow from a modulus, which is no parameter of its own.
-        not_modelled |= {name for name in values if name.startswith("E_f.")}
-    names = tuple(name for name in values if name not in not_modelled)
-    protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
+        not_modelled |= {name for name in drawn.values if name.startswith("E_f.")}
+    protocol = drawn.mechanics.protocol
+    finer = replace(protocol, dt=protocol.dt * simulation.dt_factor)
+    contact = drawn.sampled(simulation.contact_columns, simulation.contact_rows)
     guide = None
     own = (simulation.element, simulation.columns, simulation.rows)
     # Closures are followed on coarser meshes only.
@@ -371,9 +354,9 @@ def _model(
         guide = ClosureModel(
             seen,
             contact,
-            structured_mesh(template, element, columns, rows),
-            replace(mechanics, protocol=protocol),
-            names,
+            structured_mesh(drawn.template, element, columns, rows),
+            replace(drawn.mechanics, protocol=finer),
+            tuple(name for name in drawn.values if name not in not_modelled),
             continuation=True,
             guide=guide,
             # A valve that does not follow its guide has more than one way to close.

@@ -1,5 +1,6 @@
 """Simulated valves in motion: what closes, what is drawn, what is refused, and the file of them."""
 
+import itertools
 import pickle
 import time
 from dataclasses import replace
@@ -17,13 +18,13 @@ from mvest.simulation import imaged_patient as patients
 from mvest.simulation import motion, population, virtual_patient
 from mvest.simulation.imaged_patient import simulate_imaged_patient
 from mvest.simulation.motion import (
+    DrawnValve,
     MotionLimits,
     MotionSettings,
     RefusedError,
     check_motion,
     close_in_motion,
     frames_along,
-    with_tip_motion,
 )
 from mvest.simulation.population import (
     PopulationSettings,
@@ -57,10 +58,14 @@ LAYOUT = ValveLayout(32, 9)
 TIP_MOTION = np.array([[0.5, -1.0, 1.5], [0.0, 1.0, 1.0]])
 
 
+def drawn_valve(name, values=VALUES, mechanics=MECHANICS):
+    return DrawnValve(name, TEMPLATE, values, mechanics, TIP_MOTION)
+
+
 @pytest.fixture(scope="module")
 def valve():
     """A valve that is closed in seconds."""
-    return close_in_motion("small", TEMPLATE, VALUES, SMALL, MECHANICS, TIP_MOTION)
+    return close_in_motion(drawn_valve("small"), SMALL)
 
 
 def still(name="still", vertices=None, layout=LAYOUT, frames=2):
@@ -126,33 +131,27 @@ def test_tips_move_while_the_valve_closes_and_return_with_it(valve):
     assert np.all(np.diff(way, axis=0) <= 0)
 
 
-def test_chordae_are_where_those_of_the_template_are():
+def test_chordae_of_a_motion_are_those_of_the_template(valve):
+    phi, s, _, tip = TEMPLATE.chord_places()
+    assert phi.min() < 0 <= valve.chord_phi.min()
+    assert valve.chord_phi.max() < 360
+    np.testing.assert_allclose(
+        TEMPLATE.position(valve.chord_phi, valve.chord_s), TEMPLATE.position(phi, s), atol=1e-9
+    )
+    np.testing.assert_array_equal(valve.chord_tip, tip)
     # One is absent, so that numbers beyond it shift.
-    parameters = TemplateParameters(chordae=ChordLayout(absent=((250.0, 256.0),)))
-    template = Template(parameters)
-    chordae = template.chordae()
-    phi, s, family, tip = template.chord_places()
+    template = Template(TemplateParameters(chordae=ChordLayout(absent=((250.0, 256.0),))))
+    chordae, (phi, s, family, tip) = template.chordae(), template.chord_places()
     assert len(phi) == len(TEMPLATE.chordae()) - 1
     np.testing.assert_array_equal(template.position(phi, s), chordae.insertion)
     np.testing.assert_array_equal(tip, chordae.tip)
     np.testing.assert_array_equal(family, chordae.family)
 
 
-def test_chordae_of_a_motion_have_angles_of_the_layout(valve):
-    phi, s, _, tip = TEMPLATE.chord_places()
-    assert phi.min() < 0
-    assert valve.chord_phi.min() >= 0
-    assert valve.chord_phi.max() < 360
-    np.testing.assert_allclose(
-        TEMPLATE.position(valve.chord_phi, valve.chord_s), TEMPLATE.position(phi, s), atol=1e-9
-    )
-    np.testing.assert_array_equal(valve.chord_tip, tip)
-
-
 def test_a_valve_that_does_not_close_is_refused(monkeypatch):
     monkeypatch.setattr(motion, "GIVE_UP", {"max_iterations": 1, "max_halvings": 0})
     with pytest.raises(RefusedError, match="simulated valve soft: the closure does not converge"):
-        close_in_motion("soft", TEMPLATE, VALUES, SMALL, MECHANICS)
+        close_in_motion(drawn_valve("soft"), SMALL)
 
 
 def test_frames_are_chosen_evenly_along_the_way():
@@ -167,13 +166,12 @@ def test_frames_are_chosen_evenly_along_the_way():
 
 
 def test_tips_keep_where_they_end():
-    seen = TEMPLATE.valve(16, 3)
-    moved = with_tip_motion(seen, TIP_MOTION)
+    seen, moved = TEMPLATE.valve(16, 3), drawn_valve("moved").sampled(16, 3)
     np.testing.assert_allclose(moved.motion.papillary_tips[-1], seen.papillary_tips)
     np.testing.assert_allclose(moved.motion.papillary_tips[0], seen.papillary_tips + TIP_MOTION)
     np.testing.assert_array_equal(moved.motion.papillary_tips[0], moved.papillary_tips)
     with pytest.raises(InputError, match=r"shape \(3,\), expected \(2, 3\)"):
-        with_tip_motion(seen, np.zeros(3))
+        replace(drawn_valve("moved"), tip_motion=np.zeros(3))
 
 
 @pytest.mark.parametrize(
@@ -194,44 +192,31 @@ def test_settings_of_a_motion_are_checked(change, message):
 # --- refusals -----------------------------------------------------------------------------------
 
 
-def refused(limits, words, vertices=None):
+REST = TEMPLATE.valve(LAYOUT.columns, LAYOUT.rows).surface.vertices
+FLAILING = REST * np.array([1, 1, -1.0])
+# Free edges beyond the opposite ones.
+CROSSED = REST - [[0.0, 2.0, 0.0]] * LAYOUT.s[:, None] * (REST - 1.8)
+
+
+@pytest.mark.parametrize(
+    ("limits", "vertices", "words"),
+    [
+        ({}, REST, "of its orifice open"),
+        ({"orifice": 2.0}, REST, "mm apart"),
+        ({"orifice": 2.0, "edge_gap": 50.0, "stretch": 10.0}, FLAILING, "above the annulus"),
+        ({"orifice": 5.0, "edge_gap": 50.0}, 1.7 * REST, "stretched to 1.70"),
+        ({"orifice": 2.0, "edge_gap": 50.0, "stretch": 10.0}, CROSSED, "pass through each other"),
+    ],
+)
+def test_what_no_valve_does_is_refused(limits, vertices, words):
     with pytest.raises(RefusedError, match=f"simulated valve still: .*{words}"):
-        check_motion(still(vertices=vertices), 1, limits)
+        check_motion(still(vertices=vertices), 1, MotionLimits(**limits))
 
 
-def test_a_closed_valve_passes(valve):
+def test_what_a_valve_may_do_passes(valve):
     check_motion(valve, 4, MotionLimits())
-
-
-def test_a_valve_that_stays_open_leaks():
-    refused(MotionLimits(), "of its orifice open")
-
-
-def test_free_edges_that_do_not_lie_at_each_other_are_apart():
-    refused(MotionLimits(orifice=2.0), "mm apart")
-
-
-def test_a_free_edge_above_the_annulus_flails():
-    rest = still().vertices[0]
-    up = rest * np.array([1, 1, -1.0])
-    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
-    refused(limits, "above the annulus", up)
-    check_motion(still(), 1, limits)
-
-
-def test_a_leaflet_that_is_much_longer_is_stretched():
-    rest = still().vertices[0]
-    refused(MotionLimits(orifice=5.0, edge_gap=50.0), "stretched to 1.70", 1.7 * rest)
-    check_motion(still(vertices=1.5 * rest), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
-
-
-def test_leaflets_that_have_changed_sides_have_crossed():
-    x = still().vertices[0].copy()
-    s = LAYOUT.s[:, None]
-    # Free edges beyond the opposite ones.
-    x[:, 1:2] -= 2.0 * s * (x[:, 1:2] - 1.8)
-    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
-    refused(limits, "pass through each other", x)
+    check_motion(still(), 1, MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0))
+    check_motion(still(vertices=1.5 * REST), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
 
 
 @pytest.mark.parametrize(
@@ -255,13 +240,12 @@ def closings(monkeypatch):
     """What valves would be closed with; every third of the anatomy ``other`` is refused."""
     calls = []
 
-    def close(name, template, values, settings, mechanics, tip_motion):
-        calls.append((name, template, values, settings, tip_motion))
-        if name.startswith("other") and len(calls) % 3 == 0:
-            raise RefusedError(name, "a test")
-        found = still(name)
+    def close(drawn, settings):
+        calls.append((drawn, settings))
+        if drawn.name.startswith("other") and len(calls) % 3 == 0:
+            raise RefusedError(drawn.name, "a test")
         # Something by which valves can be told apart.
-        return replace(found, vertices=found.vertices * values["E_f.anterior"])
+        return replace(still(drawn.name), vertices=still().vertices * drawn.values["E_f.anterior"])
 
     monkeypatch.setattr(population, "close_in_motion", close)
     return calls
@@ -293,23 +277,24 @@ def test_refused_valves_are_drawn_again(closings):
     )
     assert seen == list(enumerate(v.name for v in drawn))
     assert len(closings) > 6
-    again = [k for k in range(1, len(closings)) if closings[k][0] == closings[k - 1][0]]
+    valves = [valve for valve, _ in closings]
+    again = [(a, b) for a, b in itertools.pairwise(valves) if a.name == b.name]
     assert again
-    for k in again:
-        assert closings[k][1].parameters != closings[k - 1][1].parameters
-        assert closings[k][2] != closings[k - 1][2]
+    for a, b in again:
+        assert a.template.parameters != b.template.parameters
+        assert a.values != b.values
 
 
 def test_a_valve_that_is_always_refused_is_an_error(monkeypatch):
-    def refuse(name, *_):
-        raise RefusedError(name, "a test")
+    def refuse(drawn, _):
+        raise RefusedError(drawn.name, "a test")
 
     monkeypatch.setattr(population, "close_in_motion", refuse)
     with pytest.raises(GeometryError, match="one_1_000: refused 20 times"):
         draw_population(1, 1, {"one": BASES["one"]}, PopulationSettings(), MECHANICS)
 
 
-def test_what_is_drawn_spreads_as_it_is_told(closings):
+def test_what_is_drawn_spreads_as_requested(closings):
     settings = PopulationSettings(tip_motion=(1.0, 3.0))
     draw_population(60, 4, {"one": BASES["one"]}, settings, MECHANICS)
     assert len(closings) == 60
@@ -319,30 +304,30 @@ def test_what_is_drawn_spreads_as_it_is_told(closings):
         ("pressure_scale", 1.0, 0.12),
         ("chord_rest_length", 1.0, 0.015),
     ):
-        found = np.log([values[name] / median for _, _, values, _, _ in closings])
+        found = np.log([valve.values[name] / median for valve, _ in closings])
         # Four standard errors of a mean, and of a spread.
         assert abs(found.mean()) < 4 * spread / np.sqrt(60)
         assert found.std() == pytest.approx(spread, rel=4 / np.sqrt(120))
-    durations = np.log([motion.duration / 0.35 for _, _, _, motion, _ in closings])
+    durations = np.log([settings.duration / 0.35 for _, settings in closings])
     assert durations.std() == pytest.approx(0.15, rel=4 / np.sqrt(120))
-    reach = np.linalg.norm([tips for *_, tips in closings], axis=2)
+    reach = np.linalg.norm([valve.tip_motion for valve, _ in closings], axis=2)
     assert 1.0 <= reach.min() < 1.3
     assert 2.7 < reach.max() <= 3.0
-    for _, template, _, _, tips in closings:
+    for valve, _ in closings:
         # Open tips are nearer to where their chordae insert.
-        chordae, closed = template.chordae(), template.papillary_tips
+        chordae, closed = valve.template.chordae(), valve.template.papillary_tips
         for k in range(2):
             towards = (chordae.insertion[chordae.tip == k] - closed[k]).mean(axis=0)
-            assert tips[k] @ towards > 0
+            assert valve.tip_motion[k] @ towards > 0
 
 
 def test_processes_change_nothing(monkeypatch):
-    def close(name, template, values, *_):
-        if values["E_f.anterior"] > 7:
-            raise RefusedError(name, "a test")
+    def close(drawn, _):
+        if drawn.values["E_f.anterior"] > 7:
+            raise RefusedError(drawn.name, "a test")
         # The first valve of two is the last to be ready.
-        time.sleep(0.05 * name.endswith("0"))
-        return replace(still(name), vertices=still().vertices * values["E_f.anterior"])
+        time.sleep(0.05 * drawn.name.endswith("0"))
+        return replace(still(drawn.name), vertices=still().vertices * drawn.values["E_f.anterior"])
 
     monkeypatch.setattr(population, "close_in_motion", close)
     config = joblib.parallel_config
@@ -405,11 +390,6 @@ def test_a_population_is_the_same_after_its_file(drawn, tmp_path):
         np.testing.assert_array_equal(a.chord_tip, b.chord_tip)
 
 
-def test_a_file_that_cannot_be_written_is_said(drawn, tmp_path):
-    with pytest.raises(InputError, match="cannot write"):
-        save_population(tmp_path / "none" / "p.npz", drawn)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -436,14 +416,13 @@ def test_a_file_of_something_else_is_refused(drawn, tmp_path):
     path = tmp_path / "p.npz"
     with pytest.raises(InputError, match="is missing"):
         load_population(path)
-    for content in (b"", b"nothing", pickle.dumps([1, 2])):
+    with pytest.raises(InputError, match="cannot write"):
+        save_population(tmp_path / "none" / "p.npz", drawn)
+    save_population(path, drawn)
+    for content in (b"", b"nothing", pickle.dumps([1, 2]), path.read_bytes()[:2000]):
         path.write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             load_population(path)
-    save_population(path, drawn)
-    path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(InputError, match="cannot be read"):
-        load_population(path)
     np.savez(path, times=np.array([1.0]))
     with pytest.raises(InputError, match="'names' is missing"):
         load_population(path)
@@ -463,26 +442,17 @@ def made(monkeypatch):
     closure = MadeUpClosure(tuple(HIDDEN))
     rest = made_up_closure.VALVE.surface.vertices
 
-    def close(name, template, values, settings, mechanics, tip_motion):
-        assert values == HIDDEN
-        vertices = np.stack([rest * (1 - 0.01 * k) for k in range(4)])
-        tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * tip_motion
-        return vertices, tips, closure
-
-    def model(template, seen, contact, values, simulation, mechanics):
-        np.testing.assert_allclose(contact.motion.papillary_tips[0] - TIP_MOTION,
-                                   contact.motion.papillary_tips[1])  # fmt: skip
-        return closure
+    def close(drawn, _):
+        assert drawn.values == HIDDEN
+        tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * drawn.tip_motion
+        return [rest * (1 - 0.01 * k) for k in range(4)], list(tips), closure
 
     monkeypatch.setattr(patients, "closing_frames", close)
-    monkeypatch.setattr(virtual_patient, "_model", model)
+    monkeypatch.setattr(virtual_patient, "_model", lambda *_: closure)
     wide = MotionLimits(2.0, 50.0, 50.0, 10.0, 100_000)
     displaced = dict.fromkeys(REGISTRATION, 3.0)
-    simulation = replace(SIMULATION, contact_columns=32, contact_rows=9)
-    return simulate_imaged_patient(
-        "p", TEMPLATE, {**HIDDEN, **displaced}, simulation, replace(SMALL, limits=wide), MECHANICS,
-        TIP_MOTION,
-    )  # fmt: skip
+    valve = drawn_valve("p", {**HIDDEN, **displaced})
+    return simulate_imaged_patient(valve, SIMULATION, replace(SMALL, limits=wide))
 
 
 def test_an_imaged_patient_is_closed_as_a_patient_and_nowhere_displaced(made):
@@ -525,4 +495,4 @@ def test_chord_ratios_are_true_lengths_over_what_they_span_in_the_closed_valve(m
 def test_an_imaged_patient_is_in_equilibrium():
     moving = replace(MECHANICS, protocol=replace(MECHANICS.protocol, equilibrium=False))
     with pytest.raises(InputError, match="equilibrium = False, expected True"):
-        simulate_imaged_patient("p", TEMPLATE, HIDDEN, SIMULATION, SMALL, moving, TIP_MOTION)
+        simulate_imaged_patient(drawn_valve("p", HIDDEN, moving), SIMULATION, SMALL)
