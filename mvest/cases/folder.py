@@ -40,7 +40,7 @@ from mvest.cases.frames import (
     read_frame,
     reference_band,
 )
-from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, ChordaeEntry, PointData
+from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, PointData
 from mvest.cases.tissue import CHORD_COLUMNS, point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
@@ -162,7 +162,7 @@ def read_case(path: Path | str) -> ValveCase:
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
     document = folder.document
-    check_different("regions", list(document.region_names().values()), folder.wrong)
+    check_different("regions", list(document.regions.values()), folder.wrong)
     check_frames(document.frames, folder.wrong)
     seen = [read_frame(folder, number) for number in range(len(document.frames))]
     first = next(s for s in seen if s.entry.role == Role.REFERENCE)
@@ -184,7 +184,7 @@ def read_case(path: Path | str) -> ValveCase:
         derived=tuple(folder.derived),
         sha256=folder.sha256(),
         error_samples=samples,
-        chordae_follow=entry is None or (isinstance(entry, ChordaeEntry) and entry.follow),
+        chordae_follow=entry is None or entry.follow,
     )
     if entry is not None:
         with folder.at("chordae"):

@@ -72,7 +72,7 @@ def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
     else:
         files = {name: folder.file(f, f"{where}.surface.{name}") for name, f in given.items()}
     with folder.at(f"{where}.surface"):
-        surface = read_regions(files, folder.document.region_names())
+        surface = read_regions(files, folder.document.regions)
     triangles, ears = without_ears(surface.triangles)
     return SeenFrame(
         entry,

@@ -17,7 +17,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+)
 
 from mvest.cases.case import Role
 from mvest.errors import InputError
@@ -49,11 +57,13 @@ NUMBER, TEXT, LIST, MAPPING, POINT_DATA = map(
     Tag, ("\0number", "\0text", "\0list", "\0mapping", "\0point data")
 )
 EITHER = Discriminator(_kind)
-Label = Annotated[int, Field(strict=True)]
 Regions = Annotated[
-    Annotated[list[Name], Field(min_length=1), LIST]
-    | Annotated[dict[Label, Name], Field(min_length=1), MAPPING],
-    EITHER,
+    dict[Annotated[int, Field(strict=True)], Name],
+    Field(min_length=1),
+    BeforeValidator(
+        lambda given: dict(enumerate(given)) if isinstance(given, list) else given,
+        json_schema_input_type=list[Name] | dict[int, Name],
+    ),
 ]
 SurfaceFiles = Annotated[
     Annotated[Name, TEXT] | Annotated[dict[Name, Name], Field(min_length=1), MAPPING], EITHER
@@ -134,7 +144,13 @@ class ChordaeEntry(_Model):
     )
 
 
-ChordaeTable = Annotated[Annotated[Name, TEXT] | Annotated[ChordaeEntry, MAPPING], EITHER]
+ChordaeTable = Annotated[
+    ChordaeEntry,
+    BeforeValidator(
+        lambda given: {"file": given} if isinstance(given, str) else given,
+        json_schema_input_type=Name | ChordaeEntry,
+    ),
+]
 
 
 class ObservationEntry(_Model):
@@ -195,15 +211,11 @@ class CaseFile(_Model):
         description="sentences on what had been derived when the case was written by a program",
     )
 
-    def region_names(self) -> dict[int, str]:
-        """Name of every label, in order."""
-        return dict(enumerate(self.regions)) if isinstance(self.regions, list) else self.regions
-
     def files(self) -> list[tuple[str, str]]:
         """Field and name of every file that the case names."""
         named: list[tuple[str, object]] = [
             ("pressure_curve", self.pressure_curve),
-            ("chordae", getattr(self.chordae, "file", self.chordae)),
+            ("chordae", getattr(self.chordae, "file", None)),
             ("observation", getattr(self.observation, "error_samples", None)),
         ]
         for number, frame in enumerate(self.frames):

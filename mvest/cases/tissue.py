@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from mvest.cases.case import Frame, Role
 from mvest.cases.checks import check_thickness
 from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
 from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
-from mvest.cases.schema import CaseFolder, ChordaeEntry, PointData
+from mvest.cases.schema import CaseFolder, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
@@ -54,7 +53,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 
 def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
     """The midsurface of the reference frame; what was not given is added to ``derived``."""
-    seen, names = reference.seen, tuple(folder.document.region_names().values())
+    seen, names = reference.seen, tuple(folder.document.regions.values())
     n = len(seen.vertices)
     shape = seen.vertices, seen.triangles, reference.region, names
     bare = LeafletSurface(*shape, np.tile([1.0, 0.0, 0.0], (n, 1)), np.ones(n))
@@ -131,44 +130,38 @@ def read_chordae(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
     """The chordae of the table, or those laid out; then this is added to ``derived``."""
-    given = folder.document.chordae
-    if given is None:
+    entry = folder.document.chordae
+    if entry is None:
         with folder.at("chordae"):
             return _laid_out(folder, reference, placed)
-    entry = given if isinstance(given, ChordaeEntry) else ChordaeEntry(file=given)  # type: ignore[call-arg]
     file = folder.file(entry.file, "chordae")
-    with folder.at("chordae"):
-        chordae = _chord_table(file, entry, MM_PER[folder.document.units.length])
-    if isinstance(given, str):
+    if "toe_strain" not in entry.model_fields_set:
         folder.derived.append(f"chordae: toe strain {entry.toe_strain:g} assumed")
-    return chordae
-
-
-def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
-    columns = read_columns(file, CHORD_COLUMNS)
-    names = entry.families or list(dict.fromkeys(columns["family"]))
-    for row, name in enumerate(columns["family"]):
-        if name not in names:
-            raise InputError(
-                f"{file}: family of row {row} is {name!r}; known are {', '.join(names)}"
-            )
     measured = ("x", "y", "z", "rest_length_mm", "stiffness_n")
-    values = {name: numbers(file, name, columns[name]) for name in measured}
-    return Chordae(
-        tip=indices(file, "tip", columns["tip"]),
-        insertion=scale * np.column_stack([values[name] for name in ("x", "y", "z")]),
-        family=np.array([names.index(name) for name in columns["family"]], dtype=np.int64),
-        family_names=tuple(names),
-        rest_length=values["rest_length_mm"],
-        axial_stiffness=values["stiffness_n"],
-        toe_strain=entry.toe_strain,
-    )
+    with folder.at("chordae"):
+        columns = read_columns(file, CHORD_COLUMNS)
+        names = entry.families or list(dict.fromkeys(columns["family"]))
+        for row, name in enumerate(columns["family"]):
+            if name not in names:
+                raise InputError(
+                    f"{file}: family of row {row} is {name!r}; known are {', '.join(names)}"
+                )
+        x, y, z, length, stiffness = (numbers(file, name, columns[name]) for name in measured)
+        return Chordae(
+            tip=indices(file, "tip", columns["tip"]),
+            insertion=MM_PER[folder.document.units.length] * np.column_stack([x, y, z]),
+            family=np.array([names.index(name) for name in columns["family"]], dtype=np.int64),
+            family_names=tuple(names),
+            rest_length=length,
+            axial_stiffness=stiffness,
+            toe_strain=entry.toe_strain,
+        )
 
 
 def _laid_out(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
-    names = list(folder.document.region_names().values())
+    names = list(folder.document.regions.values())
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
         raise InputError(
