@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.distance import cdist
 
-from mvest.errors import InputError, require_numbers
+from mvest.errors import InputError
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
@@ -91,10 +91,6 @@ class Misspecification:
             raise InputError(
                 f"kernel = {self.kernel!r}, expected one of matern, {', '.join(KERNELS)}"
             )
-        require_numbers(self, "world", "length_factor", "prestretch")
-        sizes = "annulus_mm", "tips_mm", "pressure_off", "thickness_off", "outlier_mm"
-        scales = "leaflet_scale", "frame_scale"
-        require_numbers(self, "world", *sizes, *scales, least=0)
         for name in ("missing", "outliers"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)}, expected a share below 1")

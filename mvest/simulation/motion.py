@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import GeometryError, InputError, require_numbers
+from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
@@ -79,15 +79,6 @@ class MotionLimits:
     edge_height: Place = 0.0
     stretch: Factor = 1.6
     crossings: Count = 4
-
-    def __post_init__(self) -> None:
-        if not (
-            self.orifice > 0 and self.edge_gap > 0 and self.stretch > 1 and self.crossings >= 0
-        ):
-            raise InputError(
-                f"limits of a motion {self}: expected orifice, edge_gap > 0, stretch > 1, "
-                "crossings >= 0"
-            )
 
 
 def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
@@ -199,7 +190,6 @@ class MotionSettings:
                 f"frames = {self.frames} to the closed one, expected 2 to {self.steps + 2} of "
                 f"{self.steps} steps"
             )
-        require_numbers(self, "motion", "duration", "tolerance")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.errors import GeometryError, InputError, require_numbers
+from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
@@ -70,8 +70,6 @@ class PopulationSettings:
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise InputError(f"population {name} = ({low}, {high}), expected 0 <= low <= high")
-        spreads = "moduli_spread", "pressure_spread", "chord_rest_length_spread", "duration_spread"
-        require_numbers(self, "population", *spreads, least=0)
 
 
 def draw_population(

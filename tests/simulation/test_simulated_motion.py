@@ -180,8 +180,6 @@ def test_tips_keep_where_they_end():
         ({"held_pressure": (0.5,)}, "expected as many"),
         ({"frames": 9}, "frames = 9 to the closed one, expected 2 to 8"),
         ({"frames": 1}, "frames = 1"),
-        ({"duration": 0.0}, "motion duration = 0.0, expected > 0"),
-        ({"tolerance": -1.0}, "motion tolerance"),
     ],
 )
 def test_settings_of_a_motion_are_checked(change, message):
@@ -217,14 +215,6 @@ def test_what_a_valve_may_do_passes(valve):
     check_motion(valve, 4, MotionLimits())
     check_motion(still(), 1, MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0))
     check_motion(still(vertices=1.5 * REST), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
-
-
-@pytest.mark.parametrize(
-    "change", [{"orifice": 0.0}, {"edge_gap": 0.0}, {"stretch": 1.0}, {"crossings": -1}]
-)
-def test_limits_are_checked(change):
-    with pytest.raises(InputError, match="limits of a motion"):
-        MotionLimits(**change)
 
 
 # --- populations --------------------------------------------------------------------------------
@@ -358,9 +348,7 @@ def test_a_population_of_nothing_is_an_error(count, bases, processes):
         draw_population(count, 1, bases, PopulationSettings(), MECHANICS, processes=processes)
 
 
-@pytest.mark.parametrize(
-    "change", [{"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}, {"moduli_spread": -0.1}]
-)
+@pytest.mark.parametrize("change", [{"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}])
 def test_settings_of_a_population_are_checked(change):
     with pytest.raises(InputError, match=f"population {next(iter(change))}"):
         PopulationSettings(**change)
