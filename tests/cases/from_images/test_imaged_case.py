@@ -109,23 +109,6 @@ def test_thickness_and_fibres_vary_as_in_the_template():
     assert thicker.surface.thickness[middle] == pytest.approx(2.64)
 
 
-def test_errors_go_with_what_they_are_in_a_mirror():
-    rng = np.random.default_rng(0)
-    errors, tips = rng.standard_normal((4, 2, LAYOUT.size, 3)), rng.standard_normal((4, 2, 2, 3))
-    seen = sequence()
-    found = samples_in_world(seen, FRAMES, np.concatenate([errors, tips], axis=2))
-    np.testing.assert_array_equal(found.source, [0, 1, 2, 3, 0, 1, 2, 3])
-    axes = valve_axes(seen, 2)
-    own, mirrored = found.vertices[:4, 1] @ axes, found.vertices[4:, 1] @ axes
-    np.testing.assert_allclose(own, -errors[:, 1], atol=1e-9)
-    # x runs between the commissures: what was seen at 45 degrees is mirrored to 135.
-    for phi, other in ((45.0, 135.0), (225.0, 315.0), (0.0, 180.0), (90.0, 90.0)):
-        here, there = LAYOUT.vertex(phi, 4), LAYOUT.vertex(other, 4)
-        np.testing.assert_allclose(mirrored[:, there], own[:, here] * [-1, 1, 1], atol=1e-9)
-    tips_found = found.tips[:, 1] @ axes
-    np.testing.assert_allclose(tips_found[4:, 0], tips_found[:4, 1] * [-1, 1, 1], atol=1e-9)
-
-
 def test_what_was_seen_last_may_be_the_open_valve():
     case = case_of_sequence(sequence(), CaseFrames(3, 2, 100.0), TEXTS)
     assert [frame.role for frame in case.frames] == [Role.CLOSED, Role.REFERENCE]
@@ -152,25 +135,25 @@ def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
         choose_frames(seen, rows, 120.0, closed=4)
 
 
-def test_axes_are_those_of_a_moving_valve():
-    np.testing.assert_allclose(valve_axes(sequence(), 0), np.eye(3), atol=0.05)
-    turned = valve_axes(sequence(TURN), 0)
-    np.testing.assert_allclose(turned, TURN @ valve_axes(sequence(), 0), atol=1e-9)
-    assert np.linalg.det(turned) == pytest.approx(1.0)
-
-
-def test_errors_become_displacements_back_to_where_it_may_have_been():
-    errors = np.zeros((4, 2, LAYOUT.size, 3))
-    errors[1, 0, :, 2] = 0.7  # found towards the atrium, in the open frame
-    tips = np.zeros((4, 2, 2, 3))
-    tips[2, 1, 0, 0] = 1.5
-    seen = sequence(TURN)
+def test_errors_become_displacements_back_to_where_it_may_have_been_and_so_in_a_mirror():
+    rng, seen = np.random.default_rng(0), sequence(TURN)
+    errors, tips = rng.standard_normal((4, 2, LAYOUT.size, 3)), rng.standard_normal((4, 2, 2, 3))
     found = samples_in_world(seen, FRAMES, np.concatenate([errors, tips], axis=2))
-    assert found.vertices.shape == (8, 2, LAYOUT.size, 3)
-    atrium = valve_axes(seen, 0)[:, 2]
-    np.testing.assert_allclose(found.vertices[1, 0], np.tile(-0.7 * atrium, (LAYOUT.size, 1)))
-    across = valve_axes(seen, 2)[:, 0]
-    np.testing.assert_allclose(found.tips[2, 1, 0], -1.5 * across)
+    np.testing.assert_array_equal(found.source, [0, 1, 2, 3, 0, 1, 2, 3])
+    # Axes are those of a moving valve.
+    np.testing.assert_allclose(valve_axes(sequence(), 0), np.eye(3), atol=0.05)
+    for which, number in enumerate((FRAMES.open, FRAMES.closed)):
+        axes = valve_axes(seen, number)
+        np.testing.assert_allclose(axes, TURN @ valve_axes(sequence(), number), atol=1e-9)
+        own, mirrored = found.vertices[:4, which] @ axes, found.vertices[4:, which] @ axes
+        np.testing.assert_allclose(own, -errors[:, which], atol=1e-9)
+        # x runs between the commissures: what was seen at 45 degrees is mirrored to 135.
+        for phi, other in ((45.0, 135.0), (225.0, 315.0), (0.0, 180.0), (90.0, 90.0)):
+            here, there = LAYOUT.vertex(phi, 4), LAYOUT.vertex(other, 4)
+            np.testing.assert_allclose(mirrored[:, there], own[:, here] * [-1, 1, 1], atol=1e-9)
+        moved = found.tips[:, which] @ axes
+        np.testing.assert_allclose(moved[:4], -tips[:, which], atol=1e-9)
+        np.testing.assert_allclose(moved[4:, 0], moved[:4, 1] * [-1, 1, 1], atol=1e-9)
     case = case_of_sequence(seen, FRAMES, TEXTS, error_samples=found)
     assert case.error_samples is found
 
@@ -213,30 +196,19 @@ def test_vertices_that_were_never_measured_have_no_weight():
         case_of_sequence(replace(seen, std_mm=np.full(LAYOUT.size, np.nan)), FRAMES, TEXTS)
 
 
-def broken(change, frame=0):
-    seen = sequence()
-    vertices = np.array(seen.vertices)
-    change(vertices[frame])
-    return replace(seen, vertices=vertices)
-
-
-def fold(x):
-    x[LAYOUT.vertex(90.0, 4)] = x[LAYOUT.vertex(270.0, 4)] + [0.0, -4.0, 0.0]
-
-
-def spoil(x):
-    x[5] = np.nan
-
-
 def test_a_surface_that_is_no_valve_is_refused_with_its_frame():
-    with pytest.raises(GeometryError, match="open frame 0: "):
-        case_of_sequence(broken(fold), FRAMES, TEXTS)
-    with pytest.raises(GeometryError, match="closed frame 2: a position is not finite"):
-        case_of_sequence(broken(spoil, 2), FRAMES, TEXTS)
-    seen = sequence()
-    above = replace(seen, tips=seen.tips + np.array([0.0, 0.0, 60.0]))
-    with pytest.raises(GeometryError, match=r"open frame 0: tip 0 .* above the annulus"):
-        case_of_sequence(above, FRAMES, TEXTS)
+    folded, spoilt, above = sequence(), sequence(), sequence()
+    x = folded.vertices[0]
+    x[LAYOUT.vertex(90.0, 4)] = x[LAYOUT.vertex(270.0, 4)] + [0.0, -4.0, 0.0]
+    spoilt.vertices[2, 5] = np.nan
+    above.tips[...] += [0.0, 0.0, 60.0]
+    for seen, message in (
+        (folded, "open frame 0: "),
+        (spoilt, "closed frame 2: a position is not finite"),
+        (above, "open frame 0: tip 0 .* above the annulus"),
+    ):
+        with pytest.raises(GeometryError, match=message):
+            case_of_sequence(seen, FRAMES, TEXTS)
 
 
 def test_frames_and_pressures_that_are_none_are_refused():
