@@ -132,27 +132,26 @@ def _draw(
 ) -> MovingValve:
     """The first valve that is not refused."""
     rng = np.random.default_rng(sequence)
+    medians = {name: (median, settings.moduli_spread) for name, median in settings.moduli.items()}
+    medians["pressure_scale"] = (1.0, settings.pressure_spread)
+    medians["chord_rest_length"] = (1.0, settings.chord_rest_length_spread)
+    medians["duration"] = (settings.motion.duration, settings.duration_spread)
     reasons: list[str] = []
     while len(reasons) < MAX_DRAWS:
         template = Template(vary(base, rng, rng.uniform(*settings.scale)))
         values = {
-            parameter: median * _factor(settings.moduli_spread, rng)
-            for parameter, median in settings.moduli.items()
+            parameter: median * float(np.exp(spread * rng.standard_normal()))
+            for parameter, (median, spread) in medians.items()
         }
-        values["pressure_scale"] = _factor(settings.pressure_spread, rng)
-        values["chord_rest_length"] = _factor(settings.chord_rest_length_spread, rng)
-        duration = settings.motion.duration * _factor(settings.duration_spread, rng)
+        motion = replace(settings.motion, duration=values.pop("duration"))
         tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
-        drawn = DrawnValve(name, template, values, mechanics, tip_motion)
         try:
-            return close_in_motion(drawn, replace(settings.motion, duration=duration))
+            return close_in_motion(
+                DrawnValve(name, template, values, mechanics, tip_motion), motion
+            )
         except RefusedError as error:
             reasons.append(str(error))
     raise GeometryError(f"simulated valve {name}: refused {MAX_DRAWS} times: {'; '.join(reasons)}")
-
-
-def _factor(spread: float, rng: np.random.Generator) -> float:
-    return float(np.exp(spread * rng.standard_normal()))
 
 
 def draw_tip_motion(

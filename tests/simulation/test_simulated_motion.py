@@ -42,17 +42,9 @@ TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2
 MECHANICS = MechanicsSettings(TISSUE, ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04))
 VALUES = {"E_f.anterior": 6.0, "E_f.posterior": 4.0, "pressure_scale": 1.1}
 SMALL = MotionSettings(
-    columns=32,
-    rows=9,
-    mesh_columns=16,
-    mesh_rows=2,
-    contact_columns=60,
-    contact_rows=16,
-    steps=6,
-    frames=5,
-    held_pressure=(0.8, 0.6),
-    held_relaxation=(0.1, 0.3),
-)
+    columns=32, rows=9, mesh_columns=16, mesh_rows=2, contact_columns=60, contact_rows=16, steps=6,
+    frames=5, held_pressure=(0.8, 0.6), held_relaxation=(0.1, 0.3),
+)  # fmt: skip
 TEMPLATE = Template()
 LAYOUT = ValveLayout(32, 9)
 TIP_MOTION = np.array([[0.5, -1.0, 1.5], [0.0, 1.0, 1.0]])
@@ -68,22 +60,16 @@ def valve():
     return close_in_motion(drawn_valve("small"), SMALL)
 
 
-def still(name="still", vertices=None, layout=LAYOUT, frames=2):
+REST = TEMPLATE.valve(LAYOUT.columns, LAYOUT.rows).surface.vertices
+
+
+def still(name="still", vertices=REST, frames=2):
     """A valve that does not move, or in which the later frames are as given."""
-    rest = TEMPLATE.valve(layout.columns, layout.rows).surface.vertices
-    later = rest if vertices is None else vertices
+    shapes = np.stack([REST, *[vertices] * (frames - 1)])
     tips = np.tile(TEMPLATE.papillary_tips, (frames, 1, 1))
-    return MovingValve(
-        name,
-        layout,
-        0.1 * np.arange(frames),
-        np.stack([rest, *[later] * (frames - 1)]),
-        tips,
-        np.ones(layout.size),
-        np.array([10.0, 200.0]),
-        np.array([0.5, 1.0]),
-        np.array([0, 1]),
-    )
+    chordae = np.array([10.0, 200.0]), np.array([0.5, 1.0]), np.array([0, 1])
+    times = 0.1 * np.arange(frames)
+    return MovingValve(name, LAYOUT, times, shapes, tips, np.ones(LAYOUT.size), *chordae)
 
 
 # --- closing ------------------------------------------------------------------------------------
@@ -190,7 +176,6 @@ def test_settings_of_a_motion_are_checked(change, message):
 # --- refusals -----------------------------------------------------------------------------------
 
 
-REST = TEMPLATE.valve(LAYOUT.columns, LAYOUT.rows).surface.vertices
 FLAILING = REST * np.array([1, 1, -1.0])
 # Free edges beyond the opposite ones.
 CROSSED = REST - [[0.0, 2.0, 0.0]] * LAYOUT.s[:, None] * (REST - 1.8)
@@ -340,18 +325,13 @@ def test_what_goes_to_another_process_arrives_there(valve):
     assert back.layout == valve.layout
 
 
-@pytest.mark.parametrize(
-    ("count", "bases", "processes"), [(0, BASES, 1), (1, {}, 1), (1, BASES, 0)]
-)
-def test_a_population_of_nothing_is_an_error(count, bases, processes):
-    with pytest.raises(InputError, match="expected at least one of each"):
-        draw_population(count, 1, bases, PopulationSettings(), MECHANICS, processes=processes)
-
-
-@pytest.mark.parametrize("change", [{"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}])
-def test_settings_of_a_population_are_checked(change):
-    with pytest.raises(InputError, match=f"population {next(iter(change))}"):
-        PopulationSettings(**change)
+def test_settings_of_a_population_are_checked():
+    for count, bases, processes in ((0, BASES, 1), (1, {}, 1), (1, BASES, 0)):
+        with pytest.raises(InputError, match="expected at least one of each"):
+            draw_population(count, 1, bases, PopulationSettings(), MECHANICS, processes=processes)
+    for change in ({"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}):
+        with pytest.raises(InputError, match=f"population {next(iter(change))}"):
+            PopulationSettings(**change)
 
 
 # --- files --------------------------------------------------------------------------------------
@@ -359,9 +339,8 @@ def test_settings_of_a_population_are_checked(change):
 
 @pytest.fixture
 def drawn():
-    first = replace(still("first"), chord_phi=np.array([1.0]), chord_s=np.ones(1),
-                    chord_tip=np.array([1]))  # fmt: skip
-    return first, still("second", frames=4)
+    one = {"chord_phi": np.array([1.0]), "chord_s": np.ones(1), "chord_tip": np.array([1])}
+    return replace(still("first"), **one), still("second", frames=4)
 
 
 def test_a_population_is_the_same_after_its_file(drawn, tmp_path):
@@ -444,19 +423,12 @@ def made(monkeypatch):
 
 
 def test_an_imaged_patient_is_closed_as_a_patient_and_nowhere_displaced(made):
-    assert made.closed == 3
-    assert made.pressure_mmHg == 100.0
-    assert made.values == HIDDEN
+    assert (made.closed, made.pressure_mmHg, made.values) == (3, 100.0, HIDDEN)
     rest = made_up_closure.VALVE.surface.vertices
-    np.testing.assert_array_equal(made.valve.vertices[0], rest)
-    np.testing.assert_array_equal(made.valve.vertices[1], 0.99 * rest)
     # The formula, not the coarse closed frame.
-    np.testing.assert_allclose(made.valve.vertices[3], made_up_closure.shape(HIDDEN, 100.0))
-    np.testing.assert_array_equal(made.valve.vertices[2], 0.98 * rest)
+    expected = [rest, 0.99 * rest, 0.98 * rest, made_up_closure.shape(HIDDEN, 100.0)]
+    np.testing.assert_allclose(made.valve.vertices[:4], expected)
     assert len(made.valve.vertices) == 5
-
-
-def test_an_imaged_patient_has_moving_tips_and_stated_chordae(made):
     closed = TEMPLATE.papillary_tips
     for frame, share in ((0, 1.0), (1, 2 / 3), (2, 1 / 3), (3, 0.0), (4, 0.2)):
         np.testing.assert_allclose(made.valve.tips[frame], closed + share * TIP_MOTION)

@@ -29,18 +29,10 @@ MECHANICS = MechanicsSettings(TISSUE, CLOSING)
 MODULI = {"E_f.anterior": 6.0, "E_f.posterior": 4.0}
 TEMPLATE = Template()
 SMALL = PatientSimulation(
-    columns=16,
-    rows=2,
-    dt_factor=1.0,
-    contact_columns=60,
-    contact_rows=16,
-    seen_columns=32,
-    seen_rows=9,
-    std_mm=0.4,
-    correlation_length_mm=8.0,
-    held_pressure_mmHg=(95.0,),
+    columns=16, rows=2, dt_factor=1.0, contact_columns=60, contact_rows=16, seen_columns=32,
+    seen_rows=9, std_mm=0.4, correlation_length_mm=8.0, held_pressure_mmHg=(95.0,),
     held_relaxation=(0.1,),
-)
+)  # fmt: skip
 
 
 def make(values, simulation=SMALL, mechanics=MECHANICS, seed=3):
