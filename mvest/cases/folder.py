@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 import yaml
 
+from mvest.cases.band import check_closing_pressure
 from mvest.cases.case import (
     ErrorSamples,
     Frame,
@@ -31,7 +32,6 @@ from mvest.cases.case import (
     check_different,
     check_frames,
 )
-from mvest.cases.checks import check_closing_pressure
 from mvest.cases.frames import (
     LOOPS,
     SECONDS_PER,

@@ -9,16 +9,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.cases.case import Frame
-from mvest.cases.checks import (
+from mvest.cases.band import (
     check_annulus_size,
     check_band,
-    check_no_handle,
     check_normals,
     check_tips,
+    find_loops,
+    match_annulus,
     ventricular_side,
+    without_ears,
 )
-from mvest.cases.rims import find_rims, match_annulus, two_loops, without_ears
+from mvest.cases.case import Frame
 from mvest.cases.schema import CaseFolder, FrameEntry
 from mvest.errors import InputError
 from mvest.exchange.surfaces import read_regions
@@ -34,7 +35,7 @@ class SeenFrame(NamedTuple):
     """One entry of ``frames`` with its files read; lengths in mm, all else as in `Frame`.
 
     ``loops`` has vertex numbers ``(k,)``, points ``(k, 3)`` mm, or None if not given, for each of
-    `LOOPS`. ``ears`` are the triangles whose inner edge was turned (`mvest.cases.rims`).
+    `LOOPS`. ``ears`` are the triangles whose inner edge was turned (`mvest.cases.band`).
     """
 
     entry: FrameEntry
@@ -130,8 +131,6 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> C
     """The regions and loops of a frame that is checked to be a band."""
     with folder.at(f"{seen.where}.surface"):
         check_band(seen.vertices, seen.triangles, self_intersections=self_intersections)
-        two_loops(seen.vertices, seen.triangles)
-        check_no_handle(seen.vertices, seen.triangles)
         if seen.region is None:
             raise InputError(
                 "leaflets without labels; expected cell data 'region', OBJ groups with the names "
@@ -142,14 +141,14 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> C
         for loop in seen.loops.values()
     )
     with folder.at(seen.where):
-        rims = find_rims(seen.vertices, seen.triangles, seen.tips, *numbers)
+        loops = find_loops(seen.vertices, seen.triangles, seen.tips, *numbers)
     if len(seen.ears):
         folder.derived.append(
             f"surface of frame {seen.entry.name!r}: inner edge turned of triangles "
             f"{seen.ears[:5].tolist()} ({len(seen.ears)} in all), which had all three corners on "
             "one edge of the valve"
         )
-    return CheckedFrame(seen, seen.region, *rims)
+    return CheckedFrame(seen, seen.region, *loops)
 
 
 def place_frame(

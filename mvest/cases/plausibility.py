@@ -15,8 +15,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mvest.cases.band import loop_vector_area
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.rims import loop_vector_area
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import lumped_areas

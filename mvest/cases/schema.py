@@ -1,7 +1,7 @@
 """What may stand in the file ``case.yaml`` (its fields, version 1), and the files of its folder.
 
 The models say what the fields are and which kinds of values they take. Whether the values make
-sense together, and with the files they name, is for `mvest.cases.checks`.
+sense together, and with the files they name, is for `mvest.cases.band`.
 
 The files of a case folder are found by name, never outside the folder, and hashed.
 """

@@ -17,10 +17,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mvest.cases.band import (
+    arc_shares,
+    check_thickness,
+    commissures,
+    directed,
+    loop_vector_area,
+)
 from mvest.cases.case import Frame, Role
-from mvest.cases.checks import check_thickness
 from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
-from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
 from mvest.cases.schema import CaseFolder, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
-from mvest.cases.checks import (
+from mvest.cases.band import (
     CLOSING_PRESSURE,
     check_annulus_size,
     check_band,
@@ -18,6 +17,7 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
+from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.from_images.measures import Row, closed_frame
 from mvest.cases.tissue import GENERIC_THICKNESS, SEEN_CLOSURE, Places, lay_out_chordae
 from mvest.errors import GeometryError, InputError

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from mvest.cases.band import commissures, directed, find_loops, match_annulus, without_ears
 from mvest.cases.folder import read_case
-from mvest.cases.rims import commissures, directed, find_rims, match_annulus, without_ears
 from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.surface_coordinates import boundary_loops
@@ -31,9 +31,9 @@ def renumbered(vertices, triangles, region, seed=0):
 def test_loops_are_named_whatever_the_numbering(seed):
     valve = Template().valve(24, 8)
     x, t, _ = renumbered(*parts(valve), seed)
-    rims = find_rims(x, t, np.array(TIPS))
+    loops_ = find_loops(x, t, np.array(TIPS))
     for name in ("annulus", "free_edge"):
-        ours, theirs = x[getattr(rims, name)], valve.surface.vertices[getattr(valve, name)]
+        ours, theirs = x[getattr(loops_, name)], valve.surface.vertices[getattr(valve, name)]
         assert set(map(tuple, ours)) == set(map(tuple, theirs))
 
 
@@ -44,7 +44,7 @@ def test_an_annulus_of_another_mesh_is_matched_from_commissure_to_commissure(rev
     annulus = np.roll(ours.annulus[::-1] if reverse else ours.annulus, 7)
     x, t, r = renumbered(*parts(other), seed)
     shift = np.array([1.0, -2.0, 3.0])
-    seen = find_rims(x, t, np.array(TIPS)).annulus
+    seen = find_loops(x, t, np.array(TIPS)).annulus
     found = match_annulus(parts(ours), annulus, (x + shift, t, r), np.roll(seen, 5)) - shift
     # Both polygons are inscribed in one curve of circumference C = 101 mm, whose radius of
     # curvature R is 11 mm at least: chords of h = C / 40 leave it by h^2 / 8 R < 0.08 mm. An
