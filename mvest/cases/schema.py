@@ -1,7 +1,7 @@
 """What may stand in the file ``case.yaml`` (its fields, version 1), and the files of its folder.
 
-The models say what the fields are and which kinds of values they take. Whether the values make
-sense together, and with the files they name, is for `mvest.cases.band`.
+The models define the fields and the kinds of their values. The modules that read the files check
+whether the values make sense together.
 
 The files of a case folder are found by name, never outside the folder, and hashed.
 """
@@ -163,7 +163,7 @@ class ObservationEntry(_Model):
         "{point_data: NAME} of the reference surface"
     )
     correlation_length_mm: NotNegative = Field(
-        description="mm along the leaflets over which errors are alike, >= 0"
+        description="mm along the leaflets over which errors are correlated, >= 0"
     )
     error_samples: Name | None = Field(
         None, description="a .npz file with joint errors of all frames: frames, vertices and tips"

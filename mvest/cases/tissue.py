@@ -179,10 +179,11 @@ def _laid_out(
         return LeafletBand.of(*band.labelled, *loops, names.index("anterior"))
 
     opened = coordinates(reference)
-    seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
-    closed, band = seen_closed[0] if seen_closed else placed[0]
+    closed, band = next((p for p in placed if p[0].role is Role.CLOSED), placed[0])
     goal: LeafletBand | FloatArray
-    if not seen_closed:
+    layout = SEEN_ON_BAND
+    if closed.role is not Role.CLOSED:
+        layout = ChordLayout()
         how = (
             "an assumed closure: the free edges meet half-way between where they are open, at "
             f"{CLOSED_DEPTH:g} of their depth below the annulus"
@@ -193,7 +194,6 @@ def _laid_out(
     else:
         how = "the closed frame (through the same material coordinates in it)"
         goal = coordinates(band)
-    layout = SEEN_ON_BAND if seen_closed else ChordLayout()
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
@@ -203,14 +203,7 @@ def _laid_out(
 
 
 class Places(NamedTuple):
-    """A valve whose points are found by the template's coordinates.
-
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-    locate : callable
-        phi ``(k,)`` (degrees) and s ``(k,)`` -> corners ``(k, 3)`` and weights ``(k, 3)``.
-    """
+    """Vertices ``(n, 3)`` mm of a valve, and the function of `LeafletBand.locate` for it."""
 
     vertices: FloatArray
     locate: Callable[[FloatArray, FloatArray], tuple[IntArray, FloatArray]]
@@ -312,8 +305,8 @@ def assumed_closure(
     The free edges of the two leaflets meet half-way between where they are, point by point of equal
     share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
     follow in proportion to their coordinate s. The valve does not close like this, but the shape
-    says how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the tips
-    ``(t, 3)`` mm are on the side of the ventricle.
+    determines how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the
+    tips ``(t, 3)`` mm are on the side of the ventricle.
     """
     phi, theta = open_valve.edge_angle
     here, there = (open_valve.position(turn, np.ones(len(phi))) for turn in (phi, 360.0 - phi))

@@ -4,8 +4,8 @@ Motions are refused that would teach what no valve does.
 
 The closure is that of :mod:`mvest.closure.model` on a coarse mesh, with the steps of the pressure's
 rise as frames. A valve snaps shut within a small share of this rise, so that frames are chosen
-evenly along the way of the free edge and shown evenly over time: they look like a systole, and say
-nothing about how fast a valve closes. After the closed frame, the valve is held at lower pressures
+evenly along the way of the free edge and shown evenly over time: they look like a systole, but not
+as fast as a valve closes. After the closed frame, the valve is held at lower pressures
 while annulus and papillary tips return part of their way, each in equilibrium.
 """
 

@@ -3,7 +3,7 @@
 Every valve has a random stream of its own, spawned from the seed, so that it does not depend on
 how many processes work or on how often another valve was drawn again.
 
-A population is kept in one ``.npz`` file without pickled objects.
+A population is stored in one ``.npz`` file without pickled objects.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def draw_population(
     Raises
     ------
     InputError
-        If nothing is asked for or known, or a valve is refused 20 times in a row.
+        If no valve is requested or no anatomy given, or a valve is refused 20 times in a row.
     """
     if count < 1 or processes < 1 or not bases:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The frames that are chosen of a sequence, and the case that they tell."""
+"""The frames that are chosen of a sequence, and the case that they make."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def case_of_sequence(
     thickness_mm: Mapping[str, float] | None = None,
     error_samples: ErrorSamples | None = None,
 ) -> ValveCase:
-    """The case that a sequence tells.
+    """The case that the two frames of a sequence make.
 
     Thickness and fibres vary over a leaflet as they do in the template: that cannot be seen.
 
@@ -156,7 +156,7 @@ def case_of_sequence(
     Raises
     ------
     InputError, GeometryError
-        A surface is no valve: the message names the frame and says what is wrong.
+        A surface is no valve: the message names the frame and the fault.
     """
     layout = sequence.layout
     derived = list(frames.derived)

@@ -1,12 +1,12 @@
 """Errors of detectors on other valves: what is expected of them, and what they make of a case.
 
-Detectors are drawn to what they were trained on: what they are off by depends on how far from it a
-valve is, and so on what they find. The errors of S valves are regressed on the shapes in which
-these were found, linearly, with a penalty on the square of the coefficients that is chosen by
-leaving each valve out (ridge regression: Hoerl and Kennard, Technometrics 12, 1970; what is left of
-a valve that is left out, r / (1 - h): Allen, Technometrics 16, 1974). As a Gaussian process with a
-linear kernel (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sec. 2.1) it
-also says how much wider the error of one more valve varies about what is expected of it.
+Detectors are biased towards the valves that they were trained on. So their error depends on how far
+a valve is from these, and on the shape that they find. The errors of S valves are regressed
+linearly on the shapes that were found (ridge regression: Hoerl and Kennard, Technometrics 12,
+1970). The penalty is chosen by leaving each valve out; the error of prediction is then r / (1 - h)
+(Allen, Technometrics 16, 1974). As a Gaussian process with a linear kernel (Rasmussen and Williams,
+Gaussian Processes for Machine Learning, 2006, sec. 2.1) it also states how much wider the error of
+one more valve varies about its expectation.
 
 Valves and detectors are nearly symmetric about the middle of the leaflets. So the even and the odd
 part of errors and shapes are regressed apart: neither tells of the other.
@@ -33,7 +33,7 @@ from mvest.typing import FloatArray
 from mvest.valve.measure.clinical import annulus_and_tips
 
 PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
-"""Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
+"""Those tried, over the mean variance of the shapes; at infinity the shape has no effect."""
 
 
 BANDED = (
@@ -47,7 +47,7 @@ BANDED = (
 """Measures that get a band: those of annulus and tips, which need no fine detail of leaflets.
 
 Detected leaflets are smoother than true ones, and differences between the two rougher than either:
-areas of leaflets that are moved by them would say more of the roughness than of the area.
+areas of leaflets that are moved by them would measure the roughness rather than the area.
 """
 
 

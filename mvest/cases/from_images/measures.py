@@ -98,7 +98,7 @@ def _measured(sequence: ValveSequence, t: int, reach: float) -> Mapping[str, flo
 
 
 def is_open(measures: Mapping[str, float | None]) -> bool:
-    """Whether a valve of these measures is open, or cannot be told to be closed."""
+    """Whether a valve of these measures is open, or not known to be closed."""
     orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
     return orifice is None or area is None or orifice >= OPEN_SHARE * area
 
