@@ -8,7 +8,7 @@ A population is stored in one ``.npz`` file without pickled objects.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -80,9 +80,8 @@ def draw_population(
     mechanics: MechanicsSettings,
     *,
     processes: int = 1,
-    progress: Callable[[int, MovingValve], None] | None = None,
-) -> tuple[MovingValve, ...]:
-    """Draw and close valves.
+) -> Iterator[MovingValve]:
+    """Draw and close valves, one after another in their order.
 
     Parameters
     ----------
@@ -93,8 +92,6 @@ def draw_population(
     mechanics : MechanicsSettings
     processes : int
         1 computes here, without further processes.
-    progress : callable, optional
-        Called with the number of each valve and the valve, in their order.
 
     Raises
     ------
@@ -106,21 +103,15 @@ def draw_population(
             f"a population of {count} valves in {processes} processes from {len(bases)} anatomies, "
             "expected at least one of each"
         )
-    root = np.random.SeedSequence(seed)
-    names = list(bases)
+    root, names = np.random.SeedSequence(seed), list(bases)
     order = np.random.default_rng(root.spawn(1)[0]).permuted(
         np.resize(np.arange(len(names)), count)
     )
     jobs = [
-        (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence)
+        (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence, settings, mechanics)
         for k, (which, sequence) in enumerate(zip(order, root.spawn(count), strict=True))
     ]
-    valves: list[MovingValve] = []
-    for valve in side_by_side(_draw, ((*job, settings, mechanics) for job in jobs), processes):
-        if progress is not None:
-            progress(len(valves), valve)
-        valves.append(valve)
-    return tuple(valves)
+    return side_by_side(_draw, jobs, processes)
 
 
 def _draw(

@@ -226,15 +226,16 @@ def closings(monkeypatch):
     return calls
 
 
+def population_of(count, seed, bases=BASES, **settings):
+    return tuple(draw_population(count, seed, bases, PopulationSettings(), MECHANICS, **settings))
+
+
 def same_shape(one, other):
     return [np.array_equal(a.vertices, b.vertices) for a, b in zip(one, other, strict=True)]
 
 
 def test_a_population_is_drawn_by_its_seed(closings):
-    def draw(seed, count=6):
-        return draw_population(count, seed, BASES, PopulationSettings(), MECHANICS)
-
-    one, same, other = draw(1), draw(1), draw(2)
+    one, same, other = (population_of(6, seed) for seed in (1, 1, 2))
     assert [v.name for v in one] == [v.name for v in same]
     assert sum(v.name.startswith("one") for v in one) == 3
     assert len({v.name for v in (*one, *other)}) == 12
@@ -246,12 +247,7 @@ def test_a_population_is_drawn_by_its_seed(closings):
 
 
 def test_refused_valves_are_drawn_again(closings):
-    seen = []
-    drawn = draw_population(
-        6, 1, BASES, PopulationSettings(), MECHANICS, progress=lambda k, v: seen.append((k, v.name))
-    )
-    assert seen == list(enumerate(v.name for v in drawn))
-    assert len(closings) > 6
+    assert len(population_of(6, 1)) == 6 < len(closings)
     valves = [valve for valve, _ in closings]
     again = [(a, b) for a, b in itertools.pairwise(valves) if a.name == b.name]
     assert again
@@ -266,12 +262,11 @@ def test_a_valve_that_is_always_refused_is_an_error(monkeypatch):
 
     monkeypatch.setattr(population, "close_in_motion", refuse)
     with pytest.raises(GeometryError, match="one_1_000: refused 20 times"):
-        draw_population(1, 1, {"one": BASES["one"]}, PopulationSettings(), MECHANICS)
+        population_of(1, 1, {"one": BASES["one"]})
 
 
 def test_what_is_drawn_spreads_as_requested(closings):
-    settings = PopulationSettings(tip_motion=(1.0, 3.0))
-    draw_population(60, 4, {"one": BASES["one"]}, settings, MECHANICS)
+    population_of(60, 4, {"one": BASES["one"]})
     assert len(closings) == 60
     for name, median, spread in (
         ("E_f.anterior", 6.23, 0.35),
@@ -308,10 +303,7 @@ def test_processes_change_nothing(monkeypatch):
     config = joblib.parallel_config
     # Threads, as what is replaced here is not replaced in other processes.
     monkeypatch.setattr(joblib, "parallel_config", lambda **_: config(backend="threading"))
-    one, two = (
-        draw_population(8, 3, BASES, PopulationSettings(), MECHANICS, processes=processes)
-        for processes in (1, 2)
-    )
+    one, two = (population_of(8, 3, processes=processes) for processes in (1, 2))
     for a, b in zip(one, two, strict=True):
         assert a.name == b.name
         np.testing.assert_array_equal(a.vertices, b.vertices)
@@ -328,7 +320,7 @@ def test_what_goes_to_another_process_arrives_there(valve):
 def test_settings_of_a_population_are_checked():
     for count, bases, processes in ((0, BASES, 1), (1, {}, 1), (1, BASES, 0)):
         with pytest.raises(InputError, match="expected at least one of each"):
-            draw_population(count, 1, bases, PopulationSettings(), MECHANICS, processes=processes)
+            population_of(count, 1, bases, processes=processes)
     for change in ({"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}):
         with pytest.raises(InputError, match=f"population {next(iter(change))}"):
             PopulationSettings(**change)
