@@ -106,6 +106,34 @@ class DetectedValve:
             *(() if self.settings.states_pressure else (NO_PRESSURE,)),
         )
 
+    def details(
+        self, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
+    ) -> dict[str, tuple[Mapping[str, Any], ...]]:
+        """Details for a record (`mvest.personalisation.record`).
+
+        ``image_step`` has one row about volume, frames, model and files beside the report,
+        ``image_frames`` the measures of each frame, ``pictures`` the ``file`` and ``caption`` of
+        each.
+        """
+        volume, frames = self.volume, self.frames
+        about = {
+            "volume": called(volume),
+            "sha256": volume.sha256,
+            "modality": volume.modality.value,
+            "shape": list(volume.frames.shape),
+            "spacing_mm": volume.spacing.tolist(),
+            "open_frame": frames.open,
+            "closed_frame": frames.closed,
+            "confidence": self.valve.frame_confidence.tolist(),
+            "unlike": self.unlike,
+            "model_sha256": self.model.sha256,
+            "trained_on": dict(self.model.trained_on),
+            "sentences": list(self.sentences),
+            "files": list(files),
+        }
+        rows = tuple(dict(row) for row in self.rows)
+        return {"image_step": (about,), "image_frames": rows, "pictures": tuple(pictures)}
+
 
 def called(volume: VolumeSequence) -> str:
     """A volume named by its content: files are often named after a patient."""
@@ -239,52 +267,10 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
     for frame in (detected.frames.open, detected.frames.closed):
         write_landmarks(images / f"valve_{frame:04d}.mrk.json", detected.valve, frame)
     files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.pvd"]
-    if detected.settings.states_pressure:
-        write_case(case, detected.case)
-        files.append(f"{CASE}/case.yaml")
-    return files
-
-
-def image_step(
-    detected: DetectedValve, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
-) -> dict[str, tuple[Mapping[str, Any], ...]]:
-    """Details of the image step for a record (`mvest.personalisation.record`).
-
-    Parameters
-    ----------
-    detected : DetectedValve
-    files : sequence of str
-        Files beside the report (`write_detected`).
-    pictures : sequence of mapping
-        ``file`` and ``caption`` of pictures beside it.
-
-    Returns
-    -------
-    dict
-        ``image_step``, one row about volume, frames, model and files; ``image_frames``: the
-        measures of each frame; ``pictures``.
-    """
-    volume, frames = detected.volume, detected.frames
-    about = {
-        "volume": called(volume),
-        "sha256": volume.sha256,
-        "modality": volume.modality.value,
-        "shape": list(volume.frames.shape),
-        "spacing_mm": volume.spacing.tolist(),
-        "open_frame": frames.open,
-        "closed_frame": frames.closed,
-        "confidence": detected.valve.frame_confidence.tolist(),
-        "unlike": detected.unlike,
-        "model_sha256": detected.model.sha256,
-        "trained_on": dict(detected.model.trained_on),
-        "sentences": list(detected.sentences),
-        "files": list(files),
-    }
-    return {
-        "image_step": (about,),
-        "image_frames": tuple(dict(row) for row in detected.rows),
-        "pictures": tuple(pictures),
-    }
+    if not detected.settings.states_pressure:
+        return files
+    write_case(case, detected.case)
+    return [*files, f"{CASE}/case.yaml"]
 
 
 def _model(
