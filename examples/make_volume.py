@@ -13,7 +13,7 @@ import mvest
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.simulation.motion import MotionSettings, close_in_motion
+from mvest.simulation.motion import DrawnValve, MotionSettings, close_in_motion
 from mvest.valve.anatomy.dimensions import AnnulusDimensions
 
 MODULI = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
@@ -24,7 +24,8 @@ def make_volume(frames=4, seed=3):
     """The volume and, for comparison, where the valve in it truly is."""
     template = mvest.Template(mvest.TemplateParameters(AnnulusDimensions(17.2, 13.4)))
     settings = MotionSettings(frames=frames, held_pressure=(), held_relaxation=())
-    valve = close_in_motion("example", template, MODULI, settings, mvest.MechanicsSettings(TISSUE))
+    drawn = DrawnValve("example", template, MODULI, mvest.MechanicsSettings(TISSUE))
+    valve = close_in_motion(drawn, settings)
     probe = draw_probe(np.random.default_rng(5), tilt_deg=(0.0, 25.0))
     volume = simulate_volume(valve, Acquisition(), probe, seed)
     return volume, true_sequence(valve, probe)

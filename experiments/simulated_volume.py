@@ -28,7 +28,7 @@ from mvest.files import write_atomically
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.quantities import Angle, Count, Length, Modulus, Seed
-from mvest.simulation.motion import MotionSettings, close_in_motion
+from mvest.simulation.motion import DrawnValve, MotionSettings, close_in_motion
 
 SUFFIX = ".seq.nrrd"
 
@@ -119,7 +119,7 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     )
     announce_compilation("the simulation")
     with PartBar("closure of the valve", 1, "closure") as bar:
-        valve = close_in_motion("simulated", template, moduli, motion, mechanics)
+        valve = close_in_motion(DrawnValve("simulated", template, moduli, mechanics), motion)
         bar.step()
     with PartBar("echo of all frames", 1, "volume") as bar:
         volume = simulate_volume(valve, options.acquisition, probe, options.seed)

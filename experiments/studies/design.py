@@ -53,8 +53,12 @@ from mvest.quantities import (
     TimeStep,
 )
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.drawn_patient import PatientSettings, draw_patient_values
-from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
+from mvest.simulation.virtual_patient import (
+    PatientSettings,
+    VirtualPatient,
+    draw_patient_values,
+    simulate_patient,
+)
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary

@@ -49,15 +49,19 @@ from mvest.reporting.skill import (
     verdict_table,
 )
 from mvest.reporting.tables import Column, Table, joined, table
-from mvest.simulation.drawn_patient import (
+from mvest.simulation.imaged_patient import (
+    IMAGED,
     EchoSettings,
+    ImagedPatient,
+    simulate_imaged_patient,
+)
+from mvest.simulation.motion import DrawnValve, MotionSettings
+from mvest.simulation.population import draw_tip_motion
+from mvest.simulation.virtual_patient import (
     PatientSettings,
     draw_patient_values,
     first_that_closes,
 )
-from mvest.simulation.imaged_patient import IMAGED, ImagedPatient, simulate_imaged_patient
-from mvest.simulation.motion import MotionSettings
-from mvest.simulation.population import draw_tip_motion
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 
@@ -203,9 +207,8 @@ def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> M
 
     def simulate(drawn: Template) -> ImagedPatient:
         motion = draw_tip_motion(drawn, echo.tip_motion_mm, rng)
-        return simulate_imaged_patient(
-            patient.name, drawn, hidden, IMAGED, MotionSettings(), mechanics, motion
-        )
+        valve = DrawnValve(patient.name, drawn, hidden, mechanics, motion)
+        return simulate_imaged_patient(valve, IMAGED, MotionSettings())
 
     made, draws = first_that_closes(
         template_of(values), patient.variation, MAX_DRAWS, rng, simulate

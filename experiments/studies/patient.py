@@ -49,7 +49,7 @@ from mvest.reporting.skill import (
     verdict_table,
 )
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.drawn_patient import PatientSettings
+from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.measure.strain import mean_strains
 

@@ -36,7 +36,7 @@ from mvest.reporting.skill import (
 )
 from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.arrival import KINDS, DoorSettings, arrive
-from mvest.simulation.drawn_patient import PatientSettings
+from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import closest_points
 

@@ -1,7 +1,7 @@
 """One case: a valve at rest, and how it was seen in further frames.
 
 A case is what an estimation knows of a patient. It is read from a folder (`mvest.cases.folder`) or
-written by a simulation; nothing in it says what the moduli are. All lengths are mm, times s.
+written by a simulation. It does not contain the moduli. All lengths are mm, times s.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def check_different(
     for name in names:
         key = " ".join(normalize("NFKC", name).casefold().split())
         if key in seen:
-            alike = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
-            raise wrong(field, f"the name {name!r} {alike}; expected different names")
+            fault = "occurs twice" if seen[key] == name else f"and {seen[key]!r} look the same"
+            raise wrong(field, f"the name {name!r} {fault}; expected different names")
         seen[key] = name
 
 
@@ -130,7 +130,7 @@ class Uncertainty:
     std_mm : float or (n,) ndarray
         Standard deviation of each coordinate, of all vertices or of each vertex.
     correlation_length_mm : float
-        Over which errors of neighbouring vertices are alike along the leaflets; 0: independent.
+        Correlation length of errors along the leaflets; 0: independent.
     """
 
     std_mm: float | FloatArray
@@ -221,7 +221,7 @@ class ValveCase:
     ----------
     name, description, source, licence : str
     simulated : bool
-        Whether the frames come from a simulation; every picture and table says so.
+        Whether the frames come from a simulation, which every picture and table then states.
     surface : LeafletSurface
         Midsurface of the reference frame with thickness and fibres; its vertices and triangles are
         those of the reference frame.

@@ -14,8 +14,7 @@ beyond its ends: a time outside is an error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ import numpy as np
 import scipy
 import yaml
 
+from mvest.cases.band import check_closing_pressure
 from mvest.cases.case import (
     ErrorSamples,
     Frame,
@@ -32,9 +32,15 @@ from mvest.cases.case import (
     check_different,
     check_frames,
 )
-from mvest.cases.checks import check_closing_pressure
-from mvest.cases.frames import LOOPS, SECONDS_PER, place_frame, read_frame, reference_band
-from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, ChordaeEntry, PointData
+from mvest.cases.frames import (
+    LOOPS,
+    SECONDS_PER,
+    SeenFrame,
+    place_frame,
+    read_frame,
+    reference_band,
+)
+from mvest.cases.schema import CASE_FILE, VERSION, CaseFolder, PointData
 from mvest.cases.tissue import CHORD_COLUMNS, point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
 from mvest.exchange.surfaces import write_surface
@@ -52,56 +58,40 @@ GENERIC_SAMPLES = 301
 """One for every ms from 0.40 to 0.70 s."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PressureCurve:
-    """Transmitral pressure, positive where it closes the valve; PCHIP between its points.
+def pressure_curve(time: FloatArray, pressure_mmhg: FloatArray) -> Callable[[float], float]:
+    """Transmitral pressure (mmHg) over time (s): PCHIP between points ``(k,)``, k >= 2.
 
-    Attributes
-    ----------
-    time : ndarray
-        ``(k,)`` s, increasing, k >= 2.
-    pressure_mmHg : ndarray
-        ``(k,)``.
+    The curve raises InputError at a time outside it.
 
     Raises
     ------
     InputError
         On wrong shapes, values that are not finite, or times that do not increase.
     """
+    time = checked_floats("pressure curve: times", time, (None,))
+    pressure = checked_floats("pressure curve: pressures", pressure_mmhg, time.shape)
+    if len(time) < 2:
+        raise InputError(f"pressure curve: {len(time)} point, expected two or more")
+    if (np.diff(time) <= 0).any():
+        row = int(np.argmax(np.diff(time) <= 0)) + 1
+        raise InputError(
+            f"pressure curve: time {time[row]:g} s of point {row} does not follow "
+            f"{time[row - 1]:g} s; expected increasing times"
+        )
+    interpolated = scipy.interpolate.PchipInterpolator(time, pressure)
 
-    time: FloatArray
-    pressure_mmHg: FloatArray
-
-    def __post_init__(self) -> None:
-        time = checked_floats("pressure curve: times", self.time, (None,))
-        checked_floats("pressure curve: pressures", self.pressure_mmHg, time.shape)
-        if len(time) < 2:
-            raise InputError(f"pressure curve: {len(time)} point, expected two or more")
-        if (np.diff(time) <= 0).any():
-            row = int(np.argmax(np.diff(time) <= 0)) + 1
+    def curve(at: float) -> float:
+        if not time[0] <= at <= time[-1]:
             raise InputError(
-                f"pressure curve: time {time[row]:g} s of point {row} does not follow "
-                f"{time[row - 1]:g} s; expected increasing times"
+                f"time {at:g} s lies outside the pressure curve, which runs from {time[0]:g} to "
+                f"{time[-1]:g} s; give the pressure of the frame, or a curve that covers its time"
             )
+        return float(interpolated(at))
 
-    def __call__(self, time: float) -> float:
-        """Pressure in mmHg.
-
-        Raises
-        ------
-        InputError
-            The time lies outside the curve.
-        """
-        first, last = float(self.time[0]), float(self.time[-1])
-        if not first <= time <= last:
-            raise InputError(
-                f"time {time:g} s lies outside the pressure curve, which runs from {first:g} to "
-                f"{last:g} s; give the pressure of the frame, or a curve that covers its time"
-            )
-        return float(scipy.interpolate.PchipInterpolator(self.time, self.pressure_mmHg)(time))
+    return curve
 
 
-def generic_curve() -> PressureCurve:
+def generic_curve() -> Callable[[float], float]:
     """Ventricular minus atrial pressure from 0.40 to 0.70 s, where both are known."""
     end = min(VENTRICLE[-1][0], ATRIUM[-1][0])
     time = np.linspace(VENTRICLE[0][0], end, GENERIC_SAMPLES)
@@ -109,11 +99,7 @@ def generic_curve() -> PressureCurve:
         scipy.interpolate.PchipInterpolator(*np.transpose(part))(time)
         for part in (VENTRICLE, ATRIUM)
     )
-    return PressureCurve(time, ventricle - atrium)
-
-
-ARRAYS = ("frames", "vertices", "tips")
-SOURCE = "source"
+    return pressure_curve(time, ventricle - atrium)
 
 
 def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
@@ -121,7 +107,7 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
 
     ``frames`` are names ``(f,)``, ``vertices (K, f, n, 3)`` and ``tips (K, f, t, 3)`` displacements
     in mm from where a point was seen to where it may have been. ``source (K,)`` may be there:
-    integers, alike for samples that are not independent of each other.
+    integers, equal for samples that are not independent of each other.
 
     Raises
     ------
@@ -131,19 +117,21 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     """
     if file.suffix.lower() != ".npz":
         raise InputError(f"{file.name}: extension {file.suffix!r}, expected .npz")
-    stored = read_npz(file, ARRAYS, exact=True, optional=(SOURCE,), where=file.name)
-    names, vertices, tips = (stored[name] for name in ARRAYS)
+    arrays = "frames", "vertices", "tips"
+    stored = read_npz(file, arrays, exact=True, optional=("source",), where=file.name)
+    names = stored.pop("frames")
     if names.ndim != 1 or names.dtype.kind != "U" or names.tolist() != list(frames):
         text = names.dtype.kind == "U"
         shown = one_line(names.tolist(), 80) if text else f"an array of {names.dtype}"
         raise InputError(f"{file.name}: frames {shown}, expected {one_line(list(frames), 120)}")
-    return ErrorSamples(vertices, tips, stored.get(SOURCE))
+    return ErrorSamples(**stored)
 
 
 def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]) -> None:
     """Write samples so that they are read back unchanged."""
-    source = {} if samples.source is None else {SOURCE: samples.source}
-    arrays: dict[str, Any] = {"vertices": samples.vertices, "tips": samples.tips} | source
+    arrays: dict[str, Any] = {"vertices": samples.vertices, "tips": samples.tips}
+    if samples.source is not None:
+        arrays["source"] = samples.source
     np.savez_compressed(file, frames=np.array(list(frames)), **arrays)
 
 
@@ -173,8 +161,8 @@ def read_case(path: Path | str) -> ValveCase:
         raise InputError(f"{folder.root}: no such folder; expected a folder with {CASE_FILE}")
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
-    document, derived = folder.document, folder.derived
-    check_different("regions", list(document.region_names().values()), folder.wrong)
+    document = folder.document
+    check_different("regions", list(document.regions.values()), folder.wrong)
     check_frames(document.frames, folder.wrong)
     seen = [read_frame(folder, number) for number in range(len(document.frames))]
     first = next(s for s in seen if s.entry.role == Role.REFERENCE)
@@ -183,23 +171,7 @@ def read_case(path: Path | str) -> ValveCase:
     placed = [place_frame(folder, reference, s, p) for s, p in zip(seen, pressures, strict=True)]
     surface = read_leaflets(folder, reference)
     chordae = read_chordae(folder, reference, placed)
-    uncertainty, samples, given = GENERIC_UNCERTAINTY, None, document.observation
-    if given is None:
-        derived.append(
-            f"observation: standard deviation {uncertainty.std_mm:g} mm and correlation length "
-            f"{uncertainty.correlation_length_mm:g} mm assumed"
-        )
-    else:
-        with folder.at("observation.std_mm"):
-            std = given.std_mm
-            seen_std = (
-                point_data(first, std.point_data, 1)[:, 0] if isinstance(std, PointData) else std
-            )
-            uncertainty = Uncertainty(seen_std, given.correlation_length_mm)
-        if given.error_samples is not None:
-            file = folder.file(given.error_samples, "observation.error_samples")
-            with folder.at("observation.error_samples"):
-                samples = read_error_samples(file, [frame.name for frame in document.frames])
+    uncertainty, samples = _observation(folder, first)
     entry = document.chordae
     case = ValveCase(
         **{name: getattr(document, name) for name in TEXTS},
@@ -209,15 +181,41 @@ def read_case(path: Path | str) -> ValveCase:
         frames=tuple(frame for frame, _ in placed),
         chordae=chordae,
         uncertainty=uncertainty,
-        derived=tuple(derived),
+        derived=tuple(folder.derived),
         sha256=folder.sha256(),
         error_samples=samples,
-        chordae_follow=entry is None or (isinstance(entry, ChordaeEntry) and entry.follow),
+        chordae_follow=entry is None or entry.follow,
     )
     if entry is not None:
         with folder.at("chordae"):
             _ = case.valve  # whose chordae start at its tips and end on its leaflets
     return case
+
+
+def _observation(
+    folder: CaseFolder, reference: SeenFrame
+) -> tuple[Uncertainty, ErrorSamples | None]:
+    """How well vertices are seen, and the joint errors of all frames."""
+    given = folder.document.observation
+    if given is None:
+        folder.derived.append(
+            f"observation: standard deviation {GENERIC_UNCERTAINTY.std_mm:g} mm and correlation "
+            f"length {GENERIC_UNCERTAINTY.correlation_length_mm:g} mm assumed"
+        )
+        return GENERIC_UNCERTAINTY, None
+    with folder.at("observation.std_mm"):
+        std: float | FloatArray
+        if isinstance(given.std_mm, PointData):
+            std = point_data(reference, given.std_mm.point_data, 1)[:, 0]
+        else:
+            std = given.std_mm
+        uncertainty = Uncertainty(std, given.correlation_length_mm)
+    if given.error_samples is None:
+        return uncertainty, None
+    file = folder.file(given.error_samples, "observation.error_samples")
+    with folder.at("observation.error_samples"):
+        names = [frame.name for frame in folder.document.frames]
+        return uncertainty, read_error_samples(file, names)
 
 
 def _pressures(folder: CaseFolder) -> list[float]:
@@ -231,7 +229,7 @@ def _pressures(folder: CaseFolder) -> list[float]:
         file = folder.file(document.pressure_curve, "pressure_curve")
         with folder.at("pressure_curve"):
             table = read_numbers(file, ("time", "pressure"))
-            curve = PressureCurve(to_seconds * table[:, 0], to_mmhg * table[:, 1])
+            curve = pressure_curve(to_seconds * table[:, 0], to_mmhg * table[:, 1])
     result = []
     for number, frame in enumerate(document.frames):
         with folder.at(f"frames.{number}.pressure"):

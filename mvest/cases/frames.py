@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.cases.case import Frame
-from mvest.cases.checks import (
+from mvest.cases.band import (
     check_annulus_size,
     check_band,
-    check_no_handle,
     check_normals,
     check_tips,
+    find_loops,
+    match_annulus,
     ventricular_side,
+    without_ears,
 )
-from mvest.cases.rims import find_rims, match_annulus, two_loops, without_ears
+from mvest.cases.case import Frame
 from mvest.cases.schema import CaseFolder, FrameEntry
 from mvest.errors import InputError
-from mvest.exchange.surfaces import Surface, read_regions
+from mvest.exchange.surfaces import read_regions
 from mvest.reading.text import read_numbers, read_vertices
 from mvest.typing import FloatArray, IntArray
 
@@ -30,12 +31,11 @@ SECONDS_PER = {"s": 1.0, "ms": 1e-3}
 LOOPS = ("annulus", "free_edge")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SeenFrame:
+class SeenFrame(NamedTuple):
     """One entry of ``frames`` with its files read; lengths in mm, all else as in `Frame`.
 
     ``loops`` has vertex numbers ``(k,)``, points ``(k, 3)`` mm, or None if not given, for each of
-    `LOOPS`. ``ears`` are the triangles whose inner edge was turned (`mvest.cases.rims`).
+    `LOOPS`. ``ears`` are the triangles whose inner edge was turned (`mvest.cases.band`).
     """
 
     entry: FrameEntry
@@ -49,8 +49,7 @@ class SeenFrame:
     tips: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CheckedFrame:
+class CheckedFrame(NamedTuple):
     """A frame that was checked to be a band of leaflets, with its labels and boundary loops."""
 
     seen: SeenFrame
@@ -63,18 +62,18 @@ class CheckedFrame:
         """Vertices, triangles and the region of each triangle."""
         return self.seen.vertices, self.seen.triangles, self.region
 
-    @property
-    def side(self) -> float:
-        """See `mvest.cases.checks.ventricular_side`."""
-        x = self.seen.vertices
-        return ventricular_side(x[self.annulus], x[self.free_edge])
-
 
 def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
     """Read the files of one entry of ``frames``; what they hold is not yet checked."""
     entry, where = folder.document.frames[number], f"frames.{number}"
-    scale = MM_PER[folder.document.units.length]
-    surface = _read_surface(folder, entry, f"{where}.surface")
+    scale, given = MM_PER[folder.document.units.length], entry.surface
+    files: Path | dict[str, Path]
+    if isinstance(given, str):
+        files = folder.file(given, f"{where}.surface")
+    else:
+        files = {name: folder.file(f, f"{where}.surface.{name}") for name, f in given.items()}
+    with folder.at(f"{where}.surface"):
+        surface = read_regions(files, folder.document.regions)
     triangles, ears = without_ears(surface.triangles)
     return SeenFrame(
         entry,
@@ -92,21 +91,11 @@ def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
     )
 
 
-def _read_surface(folder: CaseFolder, entry: FrameEntry, where: str) -> Surface:
-    files: Path | dict[str, Path]
-    if isinstance(entry.surface, str):
-        files = folder.file(entry.surface, where)
-    else:
-        files = {name: folder.file(file, f"{where}.{name}") for name, file in entry.surface.items()}
-    with folder.at(where):
-        return read_regions(files, folder.document.region_names())
-
-
 def _read_loop(
     folder: CaseFolder, given: str | list[int] | None, where: str, scale: float
 ) -> FloatArray | IntArray | None:
     """Vertex numbers ``(k,)`` or points ``(k, 3)`` mm, by the table's header."""
-    if given is None or isinstance(given, list):
+    if not isinstance(given, str):
         return None if given is None else np.array(given, dtype=np.int64)
     file = folder.file(given, where)
     with folder.at(where):
@@ -135,7 +124,6 @@ def reference_band(folder: CaseFolder, seen: SeenFrame) -> CheckedFrame:
             "annulus and free edge: the two boundary loops of the reference surface"
             + (", the free edge nearer to the papillary tips" if "annulus" in missing else "")
         )
-    _check_place(folder, band, seen.vertices[band.annulus], band.side, "surface")
     return band
 
 
@@ -143,8 +131,6 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> C
     """The regions and loops of a frame that is checked to be a band."""
     with folder.at(f"{seen.where}.surface"):
         check_band(seen.vertices, seen.triangles, self_intersections=self_intersections)
-        two_loops(seen.vertices, seen.triangles)
-        check_no_handle(seen.vertices, seen.triangles)
         if seen.region is None:
             raise InputError(
                 "leaflets without labels; expected cell data 'region', OBJ groups with the names "
@@ -155,49 +141,51 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> C
         for loop in seen.loops.values()
     )
     with folder.at(seen.where):
-        rims = find_rims(seen.vertices, seen.triangles, seen.tips, *numbers)
+        loops = find_loops(seen.vertices, seen.triangles, seen.tips, *numbers)
     if len(seen.ears):
         folder.derived.append(
             f"surface of frame {seen.entry.name!r}: inner edge turned of triangles "
             f"{seen.ears[:5].tolist()} ({len(seen.ears)} in all), which had all three corners on "
             "one edge of the valve"
         )
-    return CheckedFrame(seen, seen.region, *rims)
-
-
-def _check_place(
-    folder: CaseFolder, band: CheckedFrame, annulus: FloatArray, side: float, field: str
-) -> None:
-    """Raise unless annulus, tips and triangles lie to each other as in a valve."""
-    seen = band.seen
-    with folder.at(f"{seen.where}.{field}"):
-        check_annulus_size(annulus)
-    with folder.at(f"{seen.where}.papillary_tips"):
-        check_tips(annulus, side, seen.tips)
-    with folder.at(f"{seen.where}.surface"):
-        check_normals(seen.vertices, seen.triangles, band.annulus, seen.tips)
+    return CheckedFrame(seen, seen.region, *loops)
 
 
 def place_frame(
     folder: CaseFolder, reference: CheckedFrame, seen: SeenFrame, pressure_mmhg: float
 ) -> tuple[Frame, CheckedFrame]:
-    """A frame with its annulus and free edge where they are."""
+    """A frame with its annulus and free edge where they are.
+
+    It is checked that annulus, tips and triangles lie to each other as in a valve.
+    """
     corresponds = _corresponds(folder, reference.seen, seen)
     if seen is reference.seen:
         band = reference
     elif corresponds:
         _check_same_valve(folder, seen, reference)
-        band = CheckedFrame(seen, reference.region, reference.annulus, reference.free_edge)
+        band = reference._replace(seen=seen)
     else:
         band = _band(folder, seen, self_intersections=False)
-        with folder.at(f"{seen.where}.surface"):
+    stated, edge = (
+        None if loop is None or loop.ndim == 1 else loop.astype(np.float64)
+        for loop in seen.loops.values()
+    )
+    with folder.at(f"{seen.where}.surface"):
+        if stated is None:
             check_annulus_size(seen.vertices[band.annulus])
-            check_normals(seen.vertices, seen.triangles, band.annulus, seen.tips)
-    annulus = _annulus(folder, reference, band, corresponds)
-    _check_place(folder, band, annulus, reference.side, "annulus")
-    edge = seen.loops["free_edge"]
-    if edge is None or edge.ndim == 1:
-        edge = seen.vertices[band.free_edge]
+        check_normals(seen.vertices, seen.triangles, band.annulus, seen.tips)
+    with folder.at(f"{seen.where}.annulus"):
+        annulus = _annulus(folder, reference, band, corresponds) if stated is None else stated
+        if len(annulus) != len(reference.annulus):
+            raise InputError(
+                f"{len(annulus)} points, expected {len(reference.annulus)}: one for every annulus "
+                "vertex of the reference frame, in its order"
+            )
+        check_annulus_size(annulus)
+    with folder.at(f"{seen.where}.papillary_tips"):
+        x = reference.seen.vertices
+        side = ventricular_side(x[reference.annulus], x[reference.free_edge])
+        check_tips(annulus, side, seen.tips)
     frame = Frame(
         name=seen.entry.name,
         time=SECONDS_PER[folder.document.units.time] * seen.entry.time,
@@ -207,11 +195,29 @@ def place_frame(
         triangles=seen.triangles,
         region=band.region,
         annulus=annulus,
-        free_edge=np.asarray(edge, dtype=np.float64),
+        free_edge=seen.vertices[band.free_edge] if edge is None else edge,
         papillary_tips=seen.tips,
         corresponds=corresponds,
     )
     return frame, band
+
+
+def _corresponds(folder: CaseFolder, first: SeenFrame, seen: SeenFrame) -> bool:
+    same = len(seen.vertices) == len(first.vertices)
+    same = same and np.array_equal(seen.triangles, first.triangles)
+    stated, where = seen.entry.corresponds, f"{seen.where}.corresponds"
+    if stated is None and folder.document.corresponds != "auto":
+        stated, where = folder.document.corresponds, "corresponds"
+    if stated is None or seen is first:
+        return same
+    if stated and not same:
+        raise folder.wrong(
+            where,
+            f"true, but frame {seen.entry.name!r} has {len(seen.vertices)} vertices and "
+            f"{len(seen.triangles)} triangles and the reference {len(first.vertices)} and "
+            f"{len(first.triangles)}, or others; expected identical triangles",
+        )
+    return stated
 
 
 def _check_same_valve(folder: CaseFolder, seen: SeenFrame, reference: CheckedFrame) -> None:
@@ -232,44 +238,15 @@ def _check_same_valve(folder: CaseFolder, seen: SeenFrame, reference: CheckedFra
             )
 
 
-def _corresponds(folder: CaseFolder, first: SeenFrame, seen: SeenFrame) -> bool:
-    if seen is first:
-        return True
-    same = len(seen.vertices) == len(first.vertices)
-    same = same and np.array_equal(seen.triangles, first.triangles)
-    stated, where = seen.entry.corresponds, f"{seen.where}.corresponds"
-    if stated is None:
-        if folder.document.corresponds == "auto":
-            return same
-        stated, where = bool(folder.document.corresponds), "corresponds"
-    if stated and not same:
-        raise folder.wrong(
-            where,
-            f"true, but frame {seen.entry.name!r} has {len(seen.vertices)} vertices and "
-            f"{len(seen.triangles)} triangles and the reference {len(first.vertices)} and "
-            f"{len(first.triangles)}, or others; expected identical triangles",
-        )
-    return stated
-
-
 def _annulus(
     folder: CaseFolder, reference: CheckedFrame, band: CheckedFrame, corresponds: bool
 ) -> FloatArray:
     """Where the annulus vertices of the reference are in a frame, ``(k, 3)`` mm."""
-    seen, given = band.seen, band.seen.loops["annulus"]
-    with folder.at(f"{seen.where}.annulus"):
-        if given is not None and given.ndim == 2:
-            if len(given) != len(reference.annulus):
-                raise InputError(
-                    f"{len(given)} points, expected {len(reference.annulus)}: one for every "
-                    "annulus vertex of the reference frame, in its order"
-                )
-            return given.astype(np.float64)
-        if corresponds:
-            return seen.vertices[reference.annulus]
-        matched = match_annulus(reference.labelled, reference.annulus, band.labelled, band.annulus)
+    if corresponds:
+        return band.seen.vertices[reference.annulus]
+    matched = match_annulus(reference.labelled, reference.annulus, band.labelled, band.annulus)
     folder.derived.append(
-        f"annulus of frame {seen.entry.name!r}: matched to the reference by its share of the arc "
-        "length between the commissures"
+        f"annulus of frame {band.seen.entry.name!r}: matched to the reference by its share of the "
+        "arc length between the commissures"
     )
     return matched

@@ -15,8 +15,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mvest.cases.band import loop_vector_area
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.rims import loop_vector_area
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import lumped_areas
@@ -42,46 +42,35 @@ class HumanRange(NamedTuple):
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
 
-_SIZES = (
-    "3D echocardiography of normal and regurgitant valves: means and standard deviations of "
-    "24 ± 3 to 36 ± 5 mm (AP) and 35 ± 5 to 43 ± 5 mm (commissural), and three of them beyond"
-)
 RANGES: Mapping[str, HumanRange] = {
-    "ap_diameter": HumanRange(15.0, 51.0, "mm", _SIZES),
-    "commissural_diameter": HumanRange(20.0, 58.0, "mm", _SIZES),
-    "anterior_length": HumanRange(
-        13.0, 40.0, "mm", "20 to 25 mm in adults, 40 % more in myxomatous valves, less in children"
-    ),
-    "posterior_length": HumanRange(
-        6.0, 30.0, "mm", "10 to 14 mm in adults, up to twice that in myxomatous valves"
-    ),
-    "open_orifice": HumanRange(
-        50.0, 900.0, "mm²", "4 to 6 cm² in adults; below 1 cm² is severe stenosis, no model's valve"
-    ),
-    "chord_length": HumanRange(
-        3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion; branches are shorter"
-    ),
-    "thickness": HumanRange(
-        0.3, 3.5, "mm", "1.2 to 1.3 mm in the paper, 5 mm at the rough edge of myxomatous leaflets"
-    ),
-    "closing_pressure": HumanRange(
-        60.0, 200.0, "mmHg", "left ventricular systolic less left atrial pressure"
-    ),
-    "area_change": HumanRange(
-        0.8, 1.5, "", "areal stretch of leaflets in vivo is 1.1 to 1.4; they do not shrink"
-    ),
-    "stretch": HumanRange(
-        0.55, 1.6, "", "principal stretches in vivo are 1.0 to 1.3; bends bring points nearer"
-    ),
-    "chord_strain": HumanRange(
-        -0.2, 0.25, "", "chordae stretch by 4.3 ± 3.4 % (porcine); a closed valve hangs on them"
-    ),
-    "annulus_change": HumanRange(0.7, 1.3, "", "its area changes by 10 to 25 % over a beat"),
-    "motion": HumanRange(0.0, 30.0, "mm", "a leaflet's edge travels at most about its own length"),
-    "tip_motion": HumanRange(
-        0.0, 15.0, "mm", "papillary muscles shorten by less than a centimetre"
-    ),
-}
+    name: HumanRange(low, high, unit, why)
+    for name, low, high, unit, why in (
+        ("ap_diameter", 15.0, 51.0, "mm", "24 ± 3 to 36 ± 5 mm, and three of them beyond: 3D "
+         "echocardiography of normal and regurgitant valves, means and standard deviations"),
+        ("commissural_diameter", 20.0, 58.0, "mm", "35 ± 5 to 43 ± 5 mm, likewise"),
+        ("anterior_length", 13.0, 40.0, "mm", "20 to 25 mm in adults, 40 % more in myxomatous "
+         "valves, less in children"),
+        ("posterior_length", 6.0, 30.0, "mm", "10 to 14 mm in adults, up to twice that in "
+         "myxomatous valves"),
+        ("open_orifice", 50.0, 900.0, "mm²", "4 to 6 cm² in adults; below 1 cm² is severe "
+         "stenosis, no model's valve"),
+        ("chord_length", 3.0, 45.0, "mm", "10 to 25 mm from papillary tip to insertion; branches "
+         "are shorter"),
+        ("thickness", 0.3, 3.5, "mm", "1.2 to 1.3 mm in the paper, 5 mm at the rough edge of "
+         "myxomatous leaflets"),
+        ("closing_pressure", 60.0, 200.0, "mmHg", "left ventricular systolic less left atrial "
+         "pressure"),
+        ("area_change", 0.8, 1.5, "", "areal stretch of leaflets in vivo is 1.1 to 1.4; they do "
+         "not shrink"),
+        ("stretch", 0.55, 1.6, "", "principal stretches in vivo are 1.0 to 1.3; bends bring "
+         "points nearer"),
+        ("chord_strain", -0.2, 0.25, "", "chordae stretch by 4.3 ± 3.4 % (porcine); a closed "
+         "valve hangs on them"),
+        ("annulus_change", 0.7, 1.3, "", "its area changes by 10 to 25 % over a beat"),
+        ("motion", 0.0, 30.0, "mm", "a leaflet's edge travels at most about its own length"),
+        ("tip_motion", 0.0, 15.0, "mm", "papillary muscles shorten by less than a centimetre"),
+    )
+}  # fmt: skip
 """What is expected of a human mitral valve."""
 
 LOST = (0.2, 4.0)
@@ -127,7 +116,7 @@ def doubts(case: ValveCase) -> tuple[Doubt, ...]:
     values = [*_anatomy(case), *_motion(case)]
     if case.closed is not None:
         values += _closing(case, case.closed)
-    found = _exchanged(case)
+    found = [*_exchanged(case)]
     for field, what, value, name, hint in values:
         expected = RANGES[name]
         if not expected.holds(value):
@@ -148,15 +137,14 @@ def require_plausible(case: ValveCase) -> None:
 
 def _anatomy(case: ValveCase) -> Iterator[Value]:
     """Thickness, chordae, annulus of each frame, leaflets and open orifice."""
-    surface, reference = case.surface, case.frame(Role.REFERENCE)
-    typical = float(np.median(surface.thickness))
+    reference = case.frame(Role.REFERENCE)
+    typical = float(np.median(case.surface.thickness))
     hint = "is it in cm?" if RANGES["thickness"].holds(10 * typical) else ""
     yield "thickness", "the leaflets' typical thickness", typical, "thickness", hint
-    if len(case.chordae):
-        tips = reference.papillary_tips[case.chordae.tip]
-        length = np.linalg.norm(case.chordae.insertion - tips, axis=1)
-        for what, extreme in (("shortest", length.min()), ("longest", length.max())):
-            yield "chordae", f"the length of the {what} chord", float(extreme), "chord_length", ""
+    tips = reference.papillary_tips[case.chordae.tip]
+    length = np.linalg.norm(case.chordae.insertion - tips, axis=1)
+    for what, extreme in (("shortest", min), ("longest", max)) if len(length) else ():
+        yield "chordae", f"the length of the {what} chord", extreme(length), "chord_length", ""
     for frame in case.frames:
         field, plane = f"frames.{frame.name}.annulus", _plane(case, frame)
         if plane is None:
@@ -174,15 +162,23 @@ def _anatomy(case: ValveCase) -> Iterator[Value]:
         yield f"frames.{reference.name}", "the open orifice", free, "open_orifice", ""
 
 
+def _leaflets(case: ValveCase) -> dict[str, IntArray]:
+    """Triangles ``(m, 3)`` of each leaflet."""
+    surface = case.surface
+    names = enumerate(surface.region_names)
+    return {name: surface.triangles[surface.region == number] for number, name in names}
+
+
 def _leaflet_lengths(case: ValveCase) -> dict[str, float]:
     """Length (mm) of the anterior and the posterior leaflet; empty for other leaflets."""
-    surface, plane = case.surface, _plane(case, case.frame(Role.REFERENCE))
-    if set(surface.region_names) != {"anterior", "posterior"} or plane is None:
+    x, plane, leaflets = (
+        case.surface.vertices,
+        _plane(case, case.frame(Role.REFERENCE)),
+        _leaflets(case),
+    )
+    if set(leaflets) != {"anterior", "posterior"} or plane is None:
         return {}
-    return {
-        name: leaflet_length(surface.vertices, surface.triangles[surface.region == number], plane)
-        for number, name in enumerate(surface.region_names)
-    }
+    return {name: leaflet_length(x, own, plane) for name, own in leaflets.items()}
 
 
 def _motion(case: ValveCase) -> Iterator[Value]:
@@ -211,23 +207,21 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
         hint = "is it in kPa?" if 8.0 <= pressure <= 27.0 else ""
         field = "frames.pressure" if frame is closed else f"frames.{frame.name}.pressure"
         yield field, "the pressure on the closed valve", pressure, "closing_pressure", hint
-    surface, field = case.surface, f"frames.{closed.name}.surface"
-    for number, name in enumerate(surface.region_names):
-        own = surface.triangles[surface.region == number]
+    surface, chordae, field = case.surface, case.chordae, f"frames.{closed.name}.surface"
+    for number, (name, own) in enumerate(_leaflets(case).items()):
         before = _area(surface.vertices, own)
         after = _area(closed.vertices, closed.triangles[closed.region == number])
         if before <= 0 or after <= 0:
             continue
         what = f"area of the {name} leaflet, closed over open,"
         yield field, what, after / before, "area_change", ""
+        what = (
+            f"the distance of points of the {name} leaflet {0.7 * REACH_MM:.1f} to {REACH_MM:g} mm "
+            "apart, closed over open,"
+        )
         for stretch in _stretches(surface.vertices, closed, np.unique(own)):
-            what = (
-                f"the distance of points of the {name} leaflet {0.7 * REACH_MM:.1f} to "
-                f"{REACH_MM:g} mm apart, closed over open,"
-            )
             yield field, what, stretch, "stretch", "do its vertices correspond?"
-    if closed.corresponds and len(case.chordae):
-        chordae = case.chordae
+    if closed.corresponds and len(chordae):
         _, at = cKDTree(surface.vertices).query(chordae.insertion)
         length = np.linalg.norm(closed.vertices[at] - closed.papillary_tips[chordae.tip], axis=1)
         # Not the extremes: noise moves the ends of single chords.
@@ -252,10 +246,9 @@ def _stretches(rest: FloatArray, closed: Frame, members: IntArray) -> tuple[floa
     return tuple(np.quantile(now[far] / apart[far], [EXTREME_SHARE, 1 - EXTREME_SHARE]).tolist())
 
 
-def _exchanged(case: ValveCase) -> list[Doubt]:
+def _exchanged(case: ValveCase) -> Iterator[Doubt]:
     """Leaflets, frames and pressures that seem to be exchanged."""
-    reference, closed, found = case.frame(Role.REFERENCE), case.closed, []
-    length = _leaflet_lengths(case)
+    reference, closed, length = case.frame(Role.REFERENCE), case.closed, _leaflet_lengths(case)
     part = _annulus_share(case, "anterior") if length else 0.0
     if part > 0.5 and length["anterior"] < length["posterior"]:
         text = (
@@ -263,16 +256,16 @@ def _exchanged(case: ValveCase) -> list[Doubt]:
             f"{length['anterior']:.1f} mm long, the posterior {length['posterior']:.1f} mm; the "
             "anterior one is the longer, on the shorter part of the annulus: are they exchanged?"
         )
-        found.append(Doubt("regions", text, mistake=True))
+        yield Doubt("regions", text, mistake=True)
     if closed is None:
-        return found
-    free = [free_orifice(case, frame) for frame in (reference, closed)]
-    if free[0] is not None and free[1] is not None and free[1] > free[0]:
+        return
+    before, after = (free_orifice(case, frame) for frame in (reference, closed))
+    if before is not None and after is not None and after > before:
         text = (
-            f"the closed frame {closed.name!r} leaves {free[1]:.0f} mm² free, the reference "
-            f"{reference.name!r} {free[0]:.0f} mm²: are the frames exchanged?"
+            f"the closed frame {closed.name!r} leaves {after:.0f} mm² free, the reference "
+            f"{reference.name!r} {before:.0f} mm²: are the frames exchanged?"
         )
-        found.append(Doubt("frames", text, mistake=True))
+        yield Doubt("frames", text, mistake=True)
     for other in case.fitted:
         rise = _rise_with_pressure(case, closed, other)
         if rise < 0:
@@ -282,19 +275,18 @@ def _exchanged(case: ValveCase) -> list[Doubt]:
                 f"{-rise:.1f} mm farther from the atrium than under {low.pressure_mmHg:.3g} mmHg "
                 f"in {low.name!r}: are frames or pressures exchanged?"
             )
-            found.append(Doubt(f"frames.{other.name}.pressure", text, mistake=True))
-    return found
+            yield Doubt(f"frames.{other.name}.pressure", text, mistake=True)
 
 
 def _annulus_share(case: ValveCase, name: str) -> float:
     """Share of the annulus' length that belongs to a leaflet."""
-    surface, annulus = case.surface, case.surface.vertices[case.annulus]
+    annulus = case.surface.vertices[case.annulus]
     step = np.linalg.norm(np.roll(annulus, -1, axis=0) - annulus, axis=1)
-    length = []
-    for number in range(len(surface.region_names)):
-        own = np.isin(case.annulus, surface.triangles[surface.region == number])
-        length.append(float(step[own & np.roll(own, -1)].sum()))
-    return length[surface.region_names.index(name)] / max(sum(length), 1e-12)
+    length = {}
+    for leaflet, triangles in _leaflets(case).items():
+        own = np.isin(case.annulus, triangles)
+        length[leaflet] = float(step[own & np.roll(own, -1)].sum())
+    return length[name] / max(sum(length.values()), 1e-12)
 
 
 def _area(vertices: FloatArray, triangles: IntArray) -> float:
@@ -346,9 +338,9 @@ def _plane(case: ValveCase, frame: Frame) -> AnnulusPlane | None:
 
     The anterior direction is to the leaflet of that name, or to the first.
     """
-    surface, names = case.surface, case.surface.region_names
-    number = names.index("anterior") if "anterior" in names else 0
-    anterior = np.isin(case.annulus, surface.triangles[surface.region == number])
+    leaflets = _leaflets(case)
+    own = leaflets.get("anterior", next(iter(leaflets.values())))
+    anterior = np.isin(case.annulus, own)
     if not anterior.any() or len(frame.annulus) != len(case.annulus):
         return None
     with suppress(GeometryError):

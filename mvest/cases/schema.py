@@ -1,7 +1,7 @@
 """What may stand in the file ``case.yaml`` (its fields, version 1), and the files of its folder.
 
-The models say what the fields are and which kinds of values they take. Whether the values make
-sense together, and with the files they name, is for `mvest.cases.checks`.
+The models define the fields and the kinds of their values. The modules that read the files check
+whether the values make sense together.
 
 The files of a case folder are found by name, never outside the folder, and hashed.
 """
@@ -17,7 +17,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+)
 
 from mvest.cases.case import Role
 from mvest.errors import InputError
@@ -49,11 +57,13 @@ NUMBER, TEXT, LIST, MAPPING, POINT_DATA = map(
     Tag, ("\0number", "\0text", "\0list", "\0mapping", "\0point data")
 )
 EITHER = Discriminator(_kind)
-Label = Annotated[int, Field(strict=True)]
 Regions = Annotated[
-    Annotated[list[Name], Field(min_length=1), LIST]
-    | Annotated[dict[Label, Name], Field(min_length=1), MAPPING],
-    EITHER,
+    dict[Annotated[int, Field(strict=True)], Name],
+    Field(min_length=1),
+    BeforeValidator(
+        lambda given: dict(enumerate(given)) if isinstance(given, list) else given,
+        json_schema_input_type=list[Name] | dict[int, Name],
+    ),
 ]
 SurfaceFiles = Annotated[
     Annotated[Name, TEXT] | Annotated[dict[Name, Name], Field(min_length=1), MAPPING], EITHER
@@ -134,7 +144,13 @@ class ChordaeEntry(_Model):
     )
 
 
-ChordaeTable = Annotated[Annotated[Name, TEXT] | Annotated[ChordaeEntry, MAPPING], EITHER]
+ChordaeTable = Annotated[
+    ChordaeEntry,
+    BeforeValidator(
+        lambda given: {"file": given} if isinstance(given, str) else given,
+        json_schema_input_type=Name | ChordaeEntry,
+    ),
+]
 
 
 class ObservationEntry(_Model):
@@ -147,7 +163,7 @@ class ObservationEntry(_Model):
         "{point_data: NAME} of the reference surface"
     )
     correlation_length_mm: NotNegative = Field(
-        description="mm along the leaflets over which errors are alike, >= 0"
+        description="mm along the leaflets over which errors are correlated, >= 0"
     )
     error_samples: Name | None = Field(
         None, description="a .npz file with joint errors of all frames: frames, vertices and tips"
@@ -195,15 +211,11 @@ class CaseFile(_Model):
         description="sentences on what had been derived when the case was written by a program",
     )
 
-    def region_names(self) -> dict[int, str]:
-        """Name of every label, in order."""
-        return dict(enumerate(self.regions)) if isinstance(self.regions, list) else self.regions
-
     def files(self) -> list[tuple[str, str]]:
         """Field and name of every file that the case names."""
         named: list[tuple[str, object]] = [
             ("pressure_curve", self.pressure_curve),
-            ("chordae", getattr(self.chordae, "file", self.chordae)),
+            ("chordae", getattr(self.chordae, "file", None)),
             ("observation", getattr(self.observation, "error_samples", None)),
         ]
         for number, frame in enumerate(self.frames):

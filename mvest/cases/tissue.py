@@ -13,16 +13,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from mvest.cases.band import (
+    arc_shares,
+    check_thickness,
+    commissures,
+    directed,
+    loop_vector_area,
+)
 from mvest.cases.case import Frame, Role
-from mvest.cases.checks import check_thickness
 from mvest.cases.frames import MM_PER, CheckedFrame, SeenFrame
-from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
-from mvest.cases.schema import CaseFolder, ChordaeEntry, PointData
+from mvest.cases.schema import CaseFolder, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.text import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
@@ -54,7 +58,7 @@ SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
 
 def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
     """The midsurface of the reference frame; what was not given is added to ``derived``."""
-    seen, names = reference.seen, tuple(folder.document.region_names().values())
+    seen, names = reference.seen, tuple(folder.document.regions.values())
     n = len(seen.vertices)
     shape = seen.vertices, seen.triangles, reference.region, names
     bare = LeafletSurface(*shape, np.tile([1.0, 0.0, 0.0], (n, 1)), np.ones(n))
@@ -131,44 +135,38 @@ def read_chordae(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
     """The chordae of the table, or those laid out; then this is added to ``derived``."""
-    given = folder.document.chordae
-    if given is None:
+    entry = folder.document.chordae
+    if entry is None:
         with folder.at("chordae"):
             return _laid_out(folder, reference, placed)
-    entry = given if isinstance(given, ChordaeEntry) else ChordaeEntry(file=given)  # type: ignore[call-arg]
     file = folder.file(entry.file, "chordae")
-    with folder.at("chordae"):
-        chordae = _chord_table(file, entry, MM_PER[folder.document.units.length])
-    if isinstance(given, str):
+    if "toe_strain" not in entry.model_fields_set:
         folder.derived.append(f"chordae: toe strain {entry.toe_strain:g} assumed")
-    return chordae
-
-
-def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
-    columns = read_columns(file, CHORD_COLUMNS)
-    names = entry.families or list(dict.fromkeys(columns["family"]))
-    for row, name in enumerate(columns["family"]):
-        if name not in names:
-            raise InputError(
-                f"{file}: family of row {row} is {name!r}; known are {', '.join(names)}"
-            )
     measured = ("x", "y", "z", "rest_length_mm", "stiffness_n")
-    values = {name: numbers(file, name, columns[name]) for name in measured}
-    return Chordae(
-        tip=indices(file, "tip", columns["tip"]),
-        insertion=scale * np.column_stack([values[name] for name in ("x", "y", "z")]),
-        family=np.array([names.index(name) for name in columns["family"]], dtype=np.int64),
-        family_names=tuple(names),
-        rest_length=values["rest_length_mm"],
-        axial_stiffness=values["stiffness_n"],
-        toe_strain=entry.toe_strain,
-    )
+    with folder.at("chordae"):
+        columns = read_columns(file, CHORD_COLUMNS)
+        names = entry.families or list(dict.fromkeys(columns["family"]))
+        for row, name in enumerate(columns["family"]):
+            if name not in names:
+                raise InputError(
+                    f"{file}: family of row {row} is {name!r}; known are {', '.join(names)}"
+                )
+        x, y, z, length, stiffness = (numbers(file, name, columns[name]) for name in measured)
+        return Chordae(
+            tip=indices(file, "tip", columns["tip"]),
+            insertion=MM_PER[folder.document.units.length] * np.column_stack([x, y, z]),
+            family=np.array([names.index(name) for name in columns["family"]], dtype=np.int64),
+            family_names=tuple(names),
+            rest_length=length,
+            axial_stiffness=stiffness,
+            toe_strain=entry.toe_strain,
+        )
 
 
 def _laid_out(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
-    names = list(folder.document.region_names().values())
+    names = list(folder.document.regions.values())
     seen = reference.seen
     if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
         raise InputError(
@@ -181,10 +179,11 @@ def _laid_out(
         return LeafletBand.of(*band.labelled, *loops, names.index("anterior"))
 
     opened = coordinates(reference)
-    seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
-    closed, band = seen_closed[0] if seen_closed else placed[0]
+    closed, band = next((p for p in placed if p[0].role is Role.CLOSED), placed[0])
     goal: LeafletBand | FloatArray
-    if not seen_closed:
+    layout = SEEN_ON_BAND
+    if closed.role is not Role.CLOSED:
+        layout = ChordLayout()
         how = (
             "an assumed closure: the free edges meet half-way between where they are open, at "
             f"{CLOSED_DEPTH:g} of their depth below the annulus"
@@ -195,7 +194,6 @@ def _laid_out(
     else:
         how = "the closed frame (through the same material coordinates in it)"
         goal = coordinates(band)
-    layout = SEEN_ON_BAND if seen_closed else ChordLayout()
     chordae = lay_out_chordae(opened, seen.tips, goal, closed.papillary_tips, layout)
     folder.derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
@@ -205,14 +203,7 @@ def _laid_out(
 
 
 class Places(NamedTuple):
-    """A valve whose points are found by the template's coordinates.
-
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-    locate : callable
-        phi ``(k,)`` (degrees) and s ``(k,)`` -> corners ``(k, 3)`` and weights ``(k, 3)``.
-    """
+    """Vertices ``(n, 3)`` mm of a valve, and the function of `LeafletBand.locate` for it."""
 
     vertices: FloatArray
     locate: Callable[[FloatArray, FloatArray], tuple[IntArray, FloatArray]]
@@ -314,8 +305,8 @@ def assumed_closure(
     The free edges of the two leaflets meet half-way between where they are, point by point of equal
     share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
     follow in proportion to their coordinate s. The valve does not close like this, but the shape
-    says how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the tips
-    ``(t, 3)`` mm are on the side of the ventricle.
+    determines how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the
+    tips ``(t, 3)`` mm are on the side of the ventricle.
     """
     phi, theta = open_valve.edge_angle
     here, there = (open_valve.position(turn, np.ones(len(phi))) for turn in (phi, 360.0 - phi))

@@ -25,7 +25,7 @@ narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a 
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
 seconds        part, seconds: wall-clock time
-image_step     with image_frames and pictures: `mvest.cases.from_images.detected.image_step`
+image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """
 
@@ -87,7 +87,7 @@ def record_of_case(
     gate : bool, optional
         Whether its anatomy has passed the gate; None if that was not tested.
     images : mapping, optional
-        What `mvest.cases.from_images.detected.image_step` says of the volume that the case is from.
+        What `DetectedValve.details` states of the volume that the case is from.
     """
     result, images = fit.result, images or {}
     others = {"moduli_only": fit.moduli_only, "paper": fit.paper}

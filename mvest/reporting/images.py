@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import map_coordinates
 
-from mvest.cases.from_images.detected import DetectedValve, called, image_step, write_detected
+from mvest.cases.from_images.detected import DetectedValve, called, write_detected
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence, landmarks
 from mvest.imaging.volume import VolumeSequence
@@ -109,7 +109,7 @@ def write_image_step(
     Returns
     -------
     dict
-        As `mvest.cases.from_images.detected.image_step` has it.
+        As `DetectedValve.details` has it.
     """
     files = write_detected(detected, folder)
     volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
@@ -121,7 +121,7 @@ def write_image_step(
     for key, figure in drawn.items():
         save_figure_with(folder / key, figure, called(volume))
     pictures = [{"file": f"{key}.png", "caption": CAPTIONS[key]} for key in drawn]
-    return image_step(detected, files, pictures)
+    return detected.details(files, pictures)
 
 
 def draw_candidate(

@@ -32,7 +32,7 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 
 KINDS = ("vertices", "surfaces", "slicerheart", "labels")
-"""Of doors, in the order of tables."""
+"""Ways in which a geometry arrives, in the order of tables."""
 
 POSE = Rotation.from_euler("xz", [1.0, 0.4]).as_matrix()
 SHIFT = np.array([31.0, -12.0, 140.0])
@@ -58,7 +58,7 @@ class DoorSettings:
     seen_with_errors: bool = False  # the closed surface has the errors of the patient's case
     voxel_mm: Length | None = None  # of a label map
     closed: bool = False  # the closed frame is a label map as well
-    std_mm: Length = 0.6  # of the closed surface, where the case itself does not say it
+    std_mm: Length = 0.6  # of the closed surface, where the case itself does not state it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ def arrive(
     Raises
     ------
     MvestError
-        If there is no such door, or what was exported is refused.
+        If the kind is unknown, or the importer refuses what was exported.
     """
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
     patient = Arrived(case, opened, replace(closed, vertices=positions))

@@ -1,4 +1,4 @@
-"""A virtual patient who is to be imaged: a valve in motion, and what its images do not say.
+"""A virtual patient who is to be imaged: a valve in motion, and what its images do not state.
 
 Open, closed and held frames are those of a virtual patient
 (:mod:`mvest.simulation.virtual_patient`): closed on a fine mesh, in exact equilibrium under the
@@ -10,28 +10,17 @@ same images.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.imaging.valve_sequence import MovingValve
-from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import REGISTRATION
-from mvest.simulation.motion import (
-    MotionSettings,
-    check_motion,
-    closing_frames,
-    moving_valve,
-    with_tip_motion,
-)
-from mvest.simulation.virtual_patient import (
-    PatientSimulation,
-    close_patient,
-    held_states,
-)
+from mvest.quantities import Length
+from mvest.simulation.motion import DrawnValve, MotionSettings, closing_frames, moving_valve
+from mvest.simulation.virtual_patient import PatientSimulation, close_patient
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points
 
@@ -42,7 +31,15 @@ IMAGED = PatientSimulation(
     held_relaxation=(0.15, 0.3),
     held_tips=(0.0, 0.0, 0.0),
 )
-"""How patients are made who are imaged; what is seen of them is not up to it."""
+"""How these patients are closed. Its settings of what is seen are not used."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EchoSettings:
+    """How a virtual patient who is to be imaged moves, and how the volume is simulated."""
+
+    spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
+    tip_motion_mm: tuple[Length, Length] = (1.0, 3.0)  # of papillary tips
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +53,7 @@ class ImagedPatient:
     closed : int
         Number of the closed frame.
     pressure_mmHg : float
-        What would be stated of it in the closed frame.
+        Stated of the closed frame.
     stated : Valve
         In the layout, with the chordae as they would be stated.
     values : mapping
@@ -86,59 +83,39 @@ class ImagedPatient:
 
 
 def simulate_imaged_patient(
-    name: str,
-    template: Template,
-    values: Mapping[str, float],
-    simulation: PatientSimulation,
-    settings: MotionSettings,
-    mechanics: MechanicsSettings,
-    tip_motion: FloatArray,
+    drawn: DrawnValve, simulation: PatientSimulation, settings: MotionSettings
 ) -> ImagedPatient:
-    """Close a template as a patient's valve.
+    """Close a valve as a patient's.
 
     Parameters
     ----------
-    name : str
-    template : Template
-    values : mapping
-        As from :func:`mvest.simulation.virtual_patient.draw_hidden`; its displacement is left out.
+    drawn : DrawnValve
+        With the values of :func:`mvest.simulation.virtual_patient.draw_patient_values`; their
+        displacement is not used.
     simulation : PatientSimulation
-        Of the open, closed and held frames. What is seen, and its errors, are left out.
+        Of the open, closed and held frames.
     settings : MotionSettings
-        Layout, duration and limits; mesh and number of the frames of closing. Its held frames are
-        left out for those of ``simulation``.
-    mechanics : MechanicsSettings
-        Its pressure is what is stated.
-    tip_motion : ndarray
-        ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
+        Layout, duration and limits; mesh and number of the frames of closing.
 
     Raises
     ------
     GeometryError
         If the valve does not close, or not as a valve does.
+    InputError
+        If its mechanics do not end in an equilibrium.
     """
-    own = {parameter: v for parameter, v in values.items() if parameter not in REGISTRATION}
-    if not mechanics.protocol.equilibrium:
+    values = {name: value for name, value in drawn.values.items() if name not in REGISTRATION}
+    drawn, protocol = replace(drawn, values=values), drawn.mechanics.protocol
+    if not protocol.equilibrium:
         raise InputError(
             "mechanics protocol equilibrium = False, expected True for a patient who is imaged"
         )
     # The coarse closure first: it is soon refused.
-    closing = closing_frames(name, template, own, settings, mechanics, tip_motion)
-    seen = with_tip_motion(template.valve(settings.columns, settings.rows), tip_motion)
-    contact = with_tip_motion(
-        template.valve(simulation.contact_columns, simulation.contact_rows), tip_motion
-    )
-    later = close_patient(name, template, seen, contact, own, simulation, mechanics)
-    tips = [state.papillary_tips for state in held_states(simulation, contact).values()]
-    shapes = [seen.surface.vertices, *closing.vertices[1:-1], *later.values()]
-    closed = len(closing.vertices) - 1
-    valve = moving_valve(
-        name,
-        template,
-        seen.surface.thickness,
-        settings,
-        np.stack(shapes),
-        np.stack([*closing.tips, *tips]),
-    )
-    check_motion(valve, closed, settings.limits)
-    return ImagedPatient(valve, closed, mechanics.protocol.pressure_mmHg, seen, own)
+    closing, tips, _ = closing_frames(drawn, settings)
+    seen = drawn.sampled(settings.columns, settings.rows)
+    later = close_patient(drawn, seen, simulation)
+    shapes = [seen.surface.vertices, *closing[1:-1], *later.values()]
+    tips += [state.papillary_tips for state in simulation.held_states(seen).values()]
+    closed = len(closing) - 1
+    valve = moving_valve(drawn, settings, shapes, tips, closed)
+    return ImagedPatient(valve, closed, protocol.pressure_mmHg, seen, values)

@@ -4,21 +4,21 @@ Motions are refused that would teach what no valve does.
 
 The closure is that of :mod:`mvest.closure.model` on a coarse mesh, with the steps of the pressure's
 rise as frames. A valve snaps shut within a small share of this rise, so that frames are chosen
-evenly along the way of the free edge and shown evenly over time: they look like a systole, and say
-nothing about how fast a valve closes. After the closed frame, the valve is held at lower pressures
+evenly along the way of the free edge and shown evenly over time: they look like a systole, but not
+as fast as a valve closes. After the closed frame, the valve is held at lower pressures
 while annulus and papillary tips return part of their way, each in equilibrium.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.errors import GeometryError, InputError, require_numbers
+from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
@@ -79,15 +79,6 @@ class MotionLimits:
     edge_height: Place = 0.0
     stretch: Factor = 1.6
     crossings: Count = 4
-
-    def __post_init__(self) -> None:
-        if not (
-            self.orifice > 0 and self.edge_gap > 0 and self.stretch > 1 and self.crossings >= 0
-        ):
-            raise InputError(
-                f"limits of a motion {self}: expected orifice, edge_gap > 0, stretch > 1, "
-                "crossings >= 0"
-            )
 
 
 def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
@@ -199,53 +190,48 @@ class MotionSettings:
                 f"frames = {self.frames} to the closed one, expected 2 to {self.steps + 2} of "
                 f"{self.steps} steps"
             )
-        require_numbers(self, "motion", "duration", "tolerance")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ClosingFrames:
-    """The frames of a closure, the open and the closed one among them.
+class DrawnValve:
+    """A valve that is to be closed.
 
     Attributes
     ----------
-    vertices : (f, n, 3) mm
-        Of the layout.
-    tips : (f, 2, 3) mm
-    model : ClosureModel
-        Which has been closed with ``at``.
-    at : (p,)
-        Its parameters.
-    """
-
-    vertices: FloatArray
-    tips: FloatArray
-    model: ClosureModel
-    at: FloatArray
-
-
-def close_in_motion(
-    name: str,
-    template: Template,
-    values: Mapping[str, float],
-    settings: MotionSettings,
-    mechanics: MechanicsSettings,
-    tip_motion: FloatArray | None = None,
-) -> MovingValve:
-    """Close a template and return its frames.
-
-    Parameters
-    ----------
     name : str
-        Of the valve.
     template : Template
     values : mapping
-        Parameter -> value: the moduli ``E_f.REGION`` in MPa, and any of the factors
+        Parameter -> true value: the moduli ``E_f.REGION`` in MPa, and any of the factors
         ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
-    settings : MotionSettings
     mechanics : MechanicsSettings
-        Of its protocol, pressure and ramp; the steps are those of ``settings``.
-    tip_motion : ndarray, optional
-        ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
+        Its pressure is the stated one.
+    tip_motion : (2, 3) mm
+        Where the papillary tips are in the open valve relative to the closed one.
+    """
+
+    name: str
+    template: Template
+    values: Mapping[str, float]
+    mechanics: MechanicsSettings
+    tip_motion: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
+
+    def __post_init__(self) -> None:
+        if np.shape(self.tip_motion) != (2, 3):
+            raise InputError(
+                f"motion of the tips: shape {np.shape(self.tip_motion)}, expected (2, 3)"
+            )
+
+    def sampled(self, columns: int, rows: int) -> Valve:
+        """The valve on ``columns x rows`` vertices; its tips move while it closes."""
+        valve = self.template.valve(columns, rows)
+        motion, end = valve.motion, valve.motion.papillary_tips[-1]
+        tips = end + (1.0 - motion.phase)[:, None, None] * self.tip_motion
+        moving = replace(motion, papillary_tips=tips)
+        return replace(valve, papillary_tips=end + self.tip_motion, motion=moving)
+
+
+def close_in_motion(drawn: DrawnValve, settings: MotionSettings) -> MovingValve:
+    """Close a valve on a coarse mesh, hold it, and return its frames.
 
     Raises
     ------
@@ -254,46 +240,46 @@ def close_in_motion(
     InputError, MaterialError
         If a value is inadmissible.
     """
-    shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
-    closing = closing_frames(name, template, values, settings, mechanics, shift)
-    model = closing.model
-    states = _held(settings, model.contact_valve, mechanics.protocol.pressure_mmHg)
+    closing, tips, model = closing_frames(drawn, settings)
+    pressure = drawn.mechanics.protocol.pressure_mmHg
+    pressures = [share * pressure for share in settings.held_pressure]
+    states = held_states(model.contact_valve, pressures, settings.held_relaxation)
+    at = np.array([drawn.values[parameter] for parameter in model.names])
     held = []
-    for state, vertices in zip(states, model.held(closing.at, states), strict=True):
+    for state, vertices in zip(states, model.held(at, states), strict=True):
         if vertices is None:
             raise RefusedError(
-                name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
+                drawn.name, f"closed it has no equilibrium under {state.pressure_mmHg:.0f} mmHg"
             )
         held.append(vertices)
-    valve = moving_valve(
-        name,
-        template,
-        model.valve.surface.thickness,
-        settings,
-        np.stack([*closing.vertices, *held]),
-        np.stack([*closing.tips, *(state.papillary_tips for state in states)]),
-    )
-    check_motion(valve, settings.frames - 1, settings.limits)
-    return valve
+    tips = [*tips, *(state.papillary_tips for state in states)]
+    return moving_valve(drawn, settings, [*closing, *held], tips, settings.frames - 1)
 
 
 def closing_frames(
-    name: str,
-    template: Template,
-    values: Mapping[str, float],
-    settings: MotionSettings,
-    mechanics: MechanicsSettings,
-    tip_motion: FloatArray,
-) -> ClosingFrames:
-    """Close a template: as :func:`close_in_motion`, but up to the closed frame and unchecked."""
-    seen, contact = (
-        with_tip_motion(template.valve(columns, rows), tip_motion)
-        for columns, rows in (
-            (settings.columns, settings.rows),
-            (settings.contact_columns, settings.contact_rows),
-        )
+    drawn: DrawnValve, settings: MotionSettings
+) -> tuple[list[FloatArray], list[FloatArray], ClosureModel]:
+    """The frames of a valve up to the closed one, which are not checked.
+
+    Of the mechanics' protocol, pressure and ramp count; the steps are those of ``settings``.
+
+    Returns
+    -------
+    vertices : list of (n, 3) mm
+        Of the layout, in the open frame, those of closing, and the closed one.
+    tips : list of (2, 3) mm
+    model : ClosureModel
+        It has been closed with the values of the valve.
+
+    Raises
+    ------
+    RefusedError
+        If the valve does not close.
+    """
+    mesh = structured_mesh(
+        drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows
     )
-    mesh = structured_mesh(template, settings.element, settings.mesh_columns, settings.mesh_rows)
+    mechanics = drawn.mechanics
     ramp = mechanics.protocol.ramp
     protocol = replace(
         mechanics.protocol,
@@ -303,52 +289,86 @@ def closing_frames(
         equilibrium=True,
     )
     newton = replace(mechanics.newton, tolerance=settings.tolerance, **GIVE_UP)
-    own = replace(mechanics, protocol=protocol, newton=newton)
-    model = ClosureModel(seen, contact, mesh, own, tuple(values), continuation=True)
-    at = np.array([values[parameter] for parameter in model.names])
+    seen = drawn.sampled(settings.columns, settings.rows)
+    model = ClosureModel(
+        seen,
+        drawn.sampled(settings.contact_columns, settings.contact_rows),
+        mesh,
+        replace(mechanics, protocol=protocol, newton=newton),
+        tuple(drawn.values),
+        continuation=True,
+    )
+    at = np.array([drawn.values[parameter] for parameter in model.names])
     simulation = model.close(at, sensitivities=False, every_frame=True).simulation
     if not simulation.converged:
-        raise RefusedError(name, f"the closure does not converge ({simulation.reason.value})")
+        reason = simulation.reason.value
+        raise RefusedError(drawn.name, f"the closure does not converge ({reason})")
     positions = np.stack([model.observed(frame) for frame in simulation.frames])
     chosen = frames_along(positions[:, seen.free_edge], settings.frames)
     phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])
     start, end = seen.motion.papillary_tips
-    return ClosingFrames(positions[chosen], start + phase[:, None, None] * (end - start), model, at)
+    return list(positions[chosen]), list(start + phase[:, None, None] * (end - start)), model
+
+
+def held_states(
+    valve: Valve,
+    pressures_mmHg: Iterable[float],
+    relaxations: Iterable[float],
+    lift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> list[HeldState]:
+    """The states of a valve that returns part of its way from the closed to the open shape.
+
+    Parameters
+    ----------
+    valve : Valve
+        The states have its annulus.
+    pressures_mmHg, relaxations : iterable of float
+        Of each state: its pressure, and the share of the way that annulus and tips have gone back.
+    lift : (float, float, float)
+        mm, further displacement of the tips per unit of relaxation.
+    """
+    annulus, tips = valve.motion.annulus, valve.motion.papillary_tips
+    return [
+        HeldState(
+            pressure,
+            annulus[-1] + back * (annulus[0] - annulus[-1]),
+            tips[-1] + back * (np.array(lift) + (tips[0] - tips[-1])),
+        )
+        for pressure, back in zip(pressures_mmHg, relaxations, strict=True)
+    ]
 
 
 def moving_valve(
-    name: str,
-    template: Template,
-    thickness: FloatArray,
+    drawn: DrawnValve,
     settings: MotionSettings,
-    vertices: FloatArray,
-    tips: FloatArray,
+    vertices: Sequence[FloatArray],
+    tips: Sequence[FloatArray],
+    closed: int,
 ) -> MovingValve:
-    """A template's valve with frames ``vertices (T, n, 3)`` and ``tips (T, 2, 3)``, T > 1."""
-    count = len(vertices)
-    phi, s, _, tip = template.chord_places()
-    return MovingValve(
-        name,
-        ValveLayout(settings.columns, settings.rows),
-        settings.duration * np.arange(count) / (count - 1),
-        vertices,
-        tips,
-        thickness,
-        np.mod(phi, 360.0),
-        s,
-        tip,
+    """A valve in two or more frames, ``vertices (n, 3)`` and ``tips (2, 3)`` mm.
+
+    ``closed`` is the number of the closed frame, the first one is open.
+
+    Raises
+    ------
+    RefusedError
+        If it is beyond the limits of the settings.
+    """
+    layout, count = ValveLayout(settings.columns, settings.rows), len(vertices)
+    phi, s, _, tip = drawn.template.chord_places()
+    valve = MovingValve(
+        name=drawn.name,
+        layout=layout,
+        times=settings.duration * np.arange(count) / (count - 1),
+        vertices=np.stack(vertices),
+        tips=np.stack(tips),
+        thickness=drawn.template.thickness(layout.phi, layout.s),
+        chord_phi=np.mod(phi, 360.0),
+        chord_s=s,
+        chord_tip=tip,
     )
-
-
-def with_tip_motion(valve: Valve, shift: FloatArray) -> Valve:
-    """The valve with papillary tips that begin ``shift (t, 3)`` mm from where they end."""
-    motion = valve.motion
-    end = motion.papillary_tips[-1]
-    if np.shape(shift) != end.shape:
-        raise InputError(f"motion of the tips: shape {np.shape(shift)}, expected {end.shape}")
-    way = (1.0 - motion.phase)[:, None, None] * shift
-    moved = replace(motion, papillary_tips=end + way)
-    return replace(valve, papillary_tips=end + shift, motion=moved)
+    check_motion(valve, closed, settings.limits)
+    return valve
 
 
 def frames_along(points: FloatArray, count: int) -> IntArray:
@@ -371,16 +391,3 @@ def frames_along(points: FloatArray, count: int) -> IntArray:
         last = int(allowed[np.argmin(np.abs(way[allowed] - way[-1] * k / (count - 1)))])
         chosen.append(last)
     return np.array([*chosen, total - 1], dtype=np.int64)
-
-
-def _held(settings: MotionSettings, valve: Valve, pressure: float) -> list[HeldState]:
-    """The frames after the closed one, on the annulus of the valve where contact is sampled."""
-    annulus, tips = valve.motion.annulus, valve.motion.papillary_tips
-    return [
-        HeldState(
-            share * pressure,
-            annulus[-1] + back * (annulus[0] - annulus[-1]),
-            tips[-1] + back * (tips[0] - tips[-1]),
-        )
-        for share, back in zip(settings.held_pressure, settings.held_relaxation, strict=True)
-    ]

@@ -3,12 +3,12 @@
 Every valve has a random stream of its own, spawned from the seed, so that it does not depend on
 how many processes work or on how often another valve was drawn again.
 
-A population is kept in one ``.npz`` file without pickled objects.
+A population is stored in one ``.npz`` file without pickled objects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.errors import GeometryError, InputError, require_numbers
+from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import MovingValve
@@ -24,7 +24,7 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.processes import side_by_side
 from mvest.quantities import Factor, Length, Logarithm, Modulus
 from mvest.reading.npz import check_array, read_npz
-from mvest.simulation.motion import MotionSettings, RefusedError, close_in_motion
+from mvest.simulation.motion import DrawnValve, MotionSettings, RefusedError, close_in_motion
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
@@ -70,8 +70,6 @@ class PopulationSettings:
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise InputError(f"population {name} = ({low}, {high}), expected 0 <= low <= high")
-        spreads = "moduli_spread", "pressure_spread", "chord_rest_length_spread", "duration_spread"
-        require_numbers(self, "population", *spreads, least=0)
 
 
 def draw_population(
@@ -82,9 +80,8 @@ def draw_population(
     mechanics: MechanicsSettings,
     *,
     processes: int = 1,
-    progress: Callable[[int, MovingValve], None] | None = None,
-) -> tuple[MovingValve, ...]:
-    """Draw and close valves.
+) -> Iterator[MovingValve]:
+    """Draw and close valves, one after another in their order.
 
     Parameters
     ----------
@@ -95,34 +92,26 @@ def draw_population(
     mechanics : MechanicsSettings
     processes : int
         1 computes here, without further processes.
-    progress : callable, optional
-        Called with the number of each valve and the valve, in their order.
 
     Raises
     ------
     InputError
-        If nothing is asked for or known, or a valve is refused 20 times in a row.
+        If no valve is requested or no anatomy given, or a valve is refused 20 times in a row.
     """
     if count < 1 or processes < 1 or not bases:
         raise InputError(
             f"a population of {count} valves in {processes} processes from {len(bases)} anatomies, "
             "expected at least one of each"
         )
-    root = np.random.SeedSequence(seed)
-    names = list(bases)
+    root, names = np.random.SeedSequence(seed), list(bases)
     order = np.random.default_rng(root.spawn(1)[0]).permuted(
         np.resize(np.arange(len(names)), count)
     )
     jobs = [
-        (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence)
+        (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence, settings, mechanics)
         for k, (which, sequence) in enumerate(zip(order, root.spawn(count), strict=True))
     ]
-    valves: list[MovingValve] = []
-    for valve in side_by_side(_draw, ((*job, settings, mechanics) for job in jobs), processes):
-        if progress is not None:
-            progress(len(valves), valve)
-        valves.append(valve)
-    return tuple(valves)
+    return side_by_side(_draw, jobs, processes)
 
 
 def _draw(
@@ -134,27 +123,26 @@ def _draw(
 ) -> MovingValve:
     """The first valve that is not refused."""
     rng = np.random.default_rng(sequence)
+    medians = {name: (median, settings.moduli_spread) for name, median in settings.moduli.items()}
+    medians["pressure_scale"] = (1.0, settings.pressure_spread)
+    medians["chord_rest_length"] = (1.0, settings.chord_rest_length_spread)
+    medians["duration"] = (settings.motion.duration, settings.duration_spread)
     reasons: list[str] = []
     while len(reasons) < MAX_DRAWS:
         template = Template(vary(base, rng, rng.uniform(*settings.scale)))
         values = {
-            parameter: median * _factor(settings.moduli_spread, rng)
-            for parameter, median in settings.moduli.items()
+            parameter: median * float(np.exp(spread * rng.standard_normal()))
+            for parameter, (median, spread) in medians.items()
         }
-        values["pressure_scale"] = _factor(settings.pressure_spread, rng)
-        values["chord_rest_length"] = _factor(settings.chord_rest_length_spread, rng)
-        duration = settings.motion.duration * _factor(settings.duration_spread, rng)
+        motion = replace(settings.motion, duration=values.pop("duration"))
         tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
-        motion = replace(settings.motion, duration=duration)
         try:
-            return close_in_motion(name, template, values, motion, mechanics, tip_motion)
+            return close_in_motion(
+                DrawnValve(name, template, values, mechanics, tip_motion), motion
+            )
         except RefusedError as error:
             reasons.append(str(error))
     raise GeometryError(f"simulated valve {name}: refused {MAX_DRAWS} times: {'; '.join(reasons)}")
-
-
-def _factor(spread: float, rng: np.random.Generator) -> float:
-    return float(np.exp(spread * rng.standard_normal()))
 
 
 def draw_tip_motion(
@@ -180,11 +168,12 @@ def draw_tip_motion(
     return np.asarray(direction * rng.uniform(*reach, size=(2, 1)))
 
 
-SHAPES: dict[str, tuple[int | None, ...]] = {
-    "times": (None,), "vertices": (None, None, 3), "tips": (None, 2, 3), "thickness": (None,),
-    "chord_phi": (None,), "chord_s": (None,),
+SHAPES: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "layout": ("i", (2,)), "times": ("f", (None,)), "vertices": ("f", (None, None, 3)),
+    "tips": ("f", (None, 2, 3)), "thickness": ("f", (None,)), "chord_phi": ("f", (None,)),
+    "chord_s": ("f", (None,)), "chord_tip": ("i", (None,)),
 }  # fmt: skip
-"""Array of a valve -> its shape."""
+"""Array of a valve -> its kind (integers or numbers) and shape."""
 
 
 def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
@@ -197,10 +186,10 @@ def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
     """
     arrays: dict[str, Any] = {"names": np.array([valve.name for valve in valves])}
     for k, valve in enumerate(valves):
-        arrays[f"{k}.layout"] = np.array([valve.layout.columns, valve.layout.rows])
-        arrays[f"{k}.chord_tip"] = np.asarray(valve.chord_tip, dtype=np.int32)
-        for name in SHAPES:
-            arrays[f"{k}.{name}"] = np.asarray(getattr(valve, name), dtype=np.float32)
+        size = {"layout": (valve.layout.columns, valve.layout.rows)}
+        for name, (kind, _) in SHAPES.items():
+            values = size.get(name) or getattr(valve, name)
+            arrays[f"{k}.{name}"] = np.asarray(values, np.int32 if kind == "i" else np.float32)
     write_atomically(path, partial(np.savez_compressed, **arrays))
 
 
@@ -216,13 +205,12 @@ def load_population(path: Path) -> tuple[MovingValve, ...]:
     valves: list[MovingValve] = []
     try:
         for k, name in enumerate(stored["names"].tolist()):
-            layout = check_array(stored[f"{k}.layout"], f"{k}.layout", "i", (2,))
-            tip = check_array(stored[f"{k}.chord_tip"], f"{k}.chord_tip", "i", (None,))
             own: dict[str, Any] = {
-                part: check_array(stored[f"{k}.{part}"], f"{k}.{part}", "f", shape)
-                for part, shape in SHAPES.items()
+                part: check_array(stored[f"{k}.{part}"], f"{k}.{part}", *expected)
+                for part, expected in SHAPES.items()
             }
-            valves.append(MovingValve(name, ValveLayout(*layout.tolist()), chord_tip=tip, **own))
+            own["layout"] = ValveLayout(*own["layout"].tolist())
+            valves.append(MovingValve(name, **own))
     except KeyError as error:
         raise InputError(f"{path}: {error} is missing") from error
     except InputError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -29,6 +30,8 @@ from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area
 
 Row = Mapping[str, Any]
+Shape = tuple[FloatArray, FloatArray]
+"""Vertices ``(n, 3)`` and papillary tips ``(2, 3)`` of a valve, mm."""
 
 ABSENT_DB = -80.0
 """Echo of what is absent: far below the noise."""
@@ -100,7 +103,7 @@ def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, 
     -------
     dict
         ``row``: JSON text with kind, number, valve, frame and confidence. Where there is a valve,
-        also the errors of `_distances` (mm), and of `_differences`, with sign.
+        also the errors of `_errors`, with sign.
     """
     choose, render = trial.random.spawn(2)
     frame = int(np.random.default_rng(choose).integers(len(valve.times)))
@@ -123,8 +126,7 @@ def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, 
         "confidence": float(found.confidence),
     }
     if has_valve:
-        both = found.vertices, found.tips, seen.vertices[0], seen.tips[0], seen.layout
-        row |= _distances(*both) | _differences(*both)
+        row |= _errors((found.vertices, found.tips), (seen.vertices[0], seen.tips[0]), seen.layout)
     return {"row": json.dumps(row)}
 
 
@@ -136,8 +138,8 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
     Returns
     -------
     dict
-        ``row``: JSON text like that of `try_volume`, with means over the frames: of distances, and
-        of differences without sign; ``confidence`` is that of the best frame. In mm, found minus
+        ``row``: JSON text like that of `try_volume`, with means over the frames of errors without
+        sign; ``confidence`` is that of the best frame. In mm, found minus
         true in the valve's own axes, ``errors`` (2, n, 3) and ``tip_errors`` (2, 2, 3) of the open
         and the closed frame; ``shapes`` and ``tip_shapes``, where the valve was found, in its found
         axes; ``rest`` (n, 3), the true open vertices.
@@ -150,10 +152,8 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
     true = true_sequence(valve, probe)
     model, layout = _model(str(model_file)), valve.layout
     found = detect_valve(volume, model, min_confidence=0.0)
-    frames = []
-    for k in range(len(true.times)):
-        both = found.vertices[k], found.tips[k], true.vertices[k], true.tips[k], layout
-        frames.append(_distances(*both) | _differences(*both))
+    shapes = (list(zip(one.vertices, one.tips, strict=True)) for one in (found, true))
+    frames = [_errors(a, b, layout) for a, b in zip(*shapes, strict=True)]
     two = [0, trial.closed]
     row = {
         "kind": trial.kind,
@@ -187,64 +187,51 @@ def _mean_size(frames: Sequence[Row], name: str) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _distances(
-    vertices: FloatArray,
-    tips: FloatArray,
-    true_vertices: FloatArray,
-    true_tips: FloatArray,
-    layout: ValveLayout,
-) -> dict[str, float | None]:
-    """Mean distances (mm) of what was found from the truth.
+def _errors(found: Shape, true: Shape, layout: ValveLayout) -> dict[str, float | None]:
+    """How far a valve is found from the truth, and what clinicians would measure wrongly.
 
-    ``surface`` (of the vertices of each surface from the other one), ``points`` (of corresponding
-    vertices) and ``tips``.
+    Returns
+    -------
+    dict
+        Mean distances in mm: ``surface`` (of the vertices of each surface from the other one),
+        ``points`` (of corresponding vertices) and ``tips``. Found minus true: ``annulus_area`` (%
+        of the true one) and ``ap_diameter`` (mm). ``state_right``: 100 where an open orifice is
+        found open and a closed one closed, otherwise 0. None if a shape defies it.
     """
+    (x, tips), (true_x, true_tips) = found, true
     there, back = (
         surface_distance(points, surface, layout.triangles).mean()
-        for points, surface in ((vertices, true_vertices), (true_vertices, vertices))
+        for points, surface in ((x, true_x), (true_x, x))
     )
-    return {
+    errors: dict[str, float | None] = {
         "surface": float(0.5 * (there + back)),
-        "points": float(np.linalg.norm(vertices - true_vertices, axis=1).mean()),
+        "points": float(np.linalg.norm(x - true_x, axis=1).mean()),
         "tips": float(np.linalg.norm(tips - true_tips, axis=1).mean()),
+        **dict.fromkeys(("annulus_area", "ap_diameter", "state_right")),
     }
-
-
-def _differences(
-    vertices: FloatArray,
-    tips: FloatArray,
-    true_vertices: FloatArray,
-    true_tips: FloatArray,
-    layout: ValveLayout,
-) -> dict[str, float | None]:
-    """What clinicians would measure wrongly, found minus true.
-
-    ``annulus_area`` (% of the true one), ``ap_diameter`` (mm), and ``state_right``: 100 where an
-    open orifice is found open and a closed one closed, otherwise 0. None if a shape defies it.
-    """
-    found, true = _measures(vertices, tips, layout), _measures(true_vertices, true_tips, layout)
-    if found is None or true is None:
-        return dict.fromkeys(("annulus_area", "ap_diameter", "state_right"))
-    return {
-        "annulus_area": 100.0 * (found[0] - true[0]) / true[0],
-        "ap_diameter": found[1] - true[1],
-        "state_right": 100.0 * (found[2] == true[2]),
-    }
+    with suppress(GeometryError):
+        (area, diameter, is_open), (true_area, true_diameter, truly_open) = (
+            _measures(*one, layout) for one in (found, true)
+        )
+        errors["annulus_area"] = 100.0 * (area - true_area) / true_area
+        errors["ap_diameter"] = diameter - true_diameter
+        errors["state_right"] = 100.0 * (is_open == truly_open)
+    return errors
 
 
 def _measures(
     vertices: FloatArray, tips: FloatArray, layout: ValveLayout
-) -> tuple[float, float, bool] | None:
+) -> tuple[float, float, bool]:
     """Area (mm²) and anteroposterior diameter (mm) of the annulus, and whether the valve is open.
 
-    None if the shape defies it.
+    Raises
+    ------
+    GeometryError
+        If the shape defies it.
     """
     annulus = vertices[layout.annulus]
-    try:
-        plane = annulus_plane(annulus, tips.mean(axis=0), annulus[layout.column(90.0)])
-        size = measure_annulus(annulus, plane)
-        orifice = orifice_area(vertices, layout.triangles, annulus, plane, PIXEL_MM)
-    except GeometryError:
-        return None
+    plane = annulus_plane(annulus, tips.mean(axis=0), annulus[layout.column(90.0)])
+    size = measure_annulus(annulus, plane)
+    orifice = orifice_area(vertices, layout.triangles, annulus, plane, PIXEL_MM)
     is_open = bool(orifice >= OPEN_SHARE * size.projected_area)
     return size.projected_area, size.anteroposterior_diameter, is_open

@@ -1,14 +1,16 @@
-"""Virtual patients: cases that a simulation wrote, with everything that no estimator is given.
+"""Virtual patients: simulated cases, and what no estimator is given of them.
 
-A virtual patient is closed on another mesh than any estimator's, under a pressure, with chordae and
-seen with errors that its case does not state. What was hidden is returned beside the case and
-belongs in another place than it.
+A virtual patient is closed on another mesh than any estimator's. Its pressure, its chordae and its
+errors differ from what its case states. The hidden values are returned beside the case and belong
+in another place. Nothing here knows how a case is estimated, so that a stored patient depends on
+nothing of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -28,6 +30,7 @@ from mvest.quantities import (
     Factor,
     Length,
     Logarithm,
+    Modulus,
     Place,
     PointsAlong,
     PointsAround,
@@ -35,17 +38,21 @@ from mvest.quantities import (
     PressureError,
     Share,
 )
-from mvest.simulation.world import World
+from mvest.simulation.misspecification import Misspecification
+from mvest.simulation.motion import DrawnValve, held_states
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
+from mvest.valve.anatomy.variation import vary
 from mvest.valve.mesh.structured import structured_mesh
+
+T = TypeVar("T")
 
 REFERENCE, CLOSED = "open", "closed"
 """Names of the first two frames of a virtual patient."""
 
 FITTED, HELD = "fitted", "held"
-"""What the names of further frames begin with, which are fitted or held out."""
+"""Beginnings of the names of further frames, which are fitted or held out."""
 
 GUIDES = (("hex18", 24, 3), ("hex18", 36, 4))
 """Element, columns and rows of the coarser meshes on which a closure is followed."""
@@ -54,18 +61,19 @@ FRAME_INTERVAL = 0.05
 """s between the closed frame and those that follow."""
 
 
+# -- settings -------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """How far what is hidden may lie from what a case states: standard deviations.
+    """Standard deviations of the hidden values from what a case states.
 
     Attributes
     ----------
     pressure, chord_rest_length, chord_stiffness : float
         Relative.
+    shift_mm, turn_degrees : float
+        Of each component of the displacement.
     pressure_offset_mmHg, pressure_each_mmHg : float
         Of the pressures of several fitted frames, see `mvest.closure.frames`; not drawn for one.
-    shift_mm, turn_degrees : float
-        Of each component.
     """
 
     pressure: Logarithm = 0.10
@@ -75,26 +83,6 @@ class Deviations:
     turn_degrees: Angle = 2.0
     pressure_offset_mmHg: PressureError = 5.0
     pressure_each_mmHg: PressureError = 5.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VirtualPatient:
-    """A simulated case, and what it does not say.
-
-    Attributes
-    ----------
-    case : ValveCase
-    values : mapping
-        Parameter -> true value: the moduli in MPa, factors on what the case states, and the
-        displacement of the leaflets as they were seen.
-    positions : mapping
-        Frame -> ``(n, 3)`` mm, where the vertices of the case would have been seen without errors,
-        the displacement included.
-    """
-
-    case: ValveCase
-    values: Mapping[str, float]
-    positions: Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +100,12 @@ class PatientSimulation:
     seen_columns, seen_rows : int
         Vertices of the surface that is seen.
     std_mm, correlation_length_mm : float
-        Error of each coordinate of each vertex in each frame but the first, and over which distance
-        it is alike. Frames are independent.
+        Error of each coordinate of each vertex in each frame but the first, and its correlation
+        length. Frames are independent.
     rough_std_mm : float
-        Of further errors in these frames that are independent, and that the case does not state.
+        Further independent errors in these frames, which the case does not state.
     rest_std_mm : float
-        Error of the open shape from which an estimator takes its model, the ends of the chordae on
-        it included; 0: it is seen exactly.
+        Error of the open shape, ends of the chordae included; 0: it is seen exactly.
     fitted_pressure_mmHg : tuple of float
         In further frames that an estimator is to fit with the closed one.
     fitted_relaxation : tuple of float
@@ -127,8 +114,8 @@ class PatientSimulation:
         The same of the frames that are held out, one after another.
     held_tips : (float, float, float)
         mm, displacement of the papillary tips per unit of relaxation.
-    world : World
-        In what else the valve and how it is seen differ from what the case says.
+    world : Misspecification
+        Further differences from what the case states and an estimator assumes.
     """
 
     element: str = "hex18"
@@ -148,10 +135,10 @@ class PatientSimulation:
     held_pressure_mmHg: tuple[Pressure, ...] = (100.0, 80.0, 60.0)
     held_relaxation: tuple[Share, ...] = (0.15, 0.3, 0.45)
     held_tips: tuple[Place, Place, Place] = (0.0, 0.0, 2.0)
-    world: World = field(default_factory=World)
+    world: Misspecification = field(default_factory=Misspecification)
 
     def __post_init__(self) -> None:
-        for kind in ("fitted", "held"):
+        for kind in (FITTED, HELD):
             pressures = getattr(self, f"{kind}_pressure_mmHg")
             relaxation = getattr(self, f"{kind}_relaxation")
             if len(pressures) != len(relaxation):
@@ -168,34 +155,107 @@ class PatientSimulation:
     @property
     def fitted_frames(self) -> tuple[str, ...]:
         """Names of the frames that are fitted, the closed one first."""
-        return (CLOSED, *(_name(FITTED, pressure) for pressure in self.fitted_pressure_mmHg))
+        return (CLOSED, *(f"{FITTED}_{mmhg:g}_mmHg" for mmhg in self.fitted_pressure_mmHg))
+
+    def held_states(self, valve: Valve) -> dict[str, HeldState]:
+        """The frames after the closed one, fitted with it or held out, on a valve's annulus."""
+        states: dict[str, HeldState] = {}
+        for kind in (FITTED, HELD):
+            pressures = getattr(self, f"{kind}_pressure_mmHg")
+            shares = getattr(self, f"{kind}_relaxation")
+            names = [f"{kind}_{mmhg:g}_mmHg" for mmhg in pressures]
+            held = held_states(valve, pressures, shares, self.held_tips)
+            states |= dict(zip(names, held, strict=True))
+        return states
 
 
-def draw_hidden(
-    moduli: Mapping[str, float],
-    deviations: Deviations,
-    rng: np.random.Generator,
-    fitted: tuple[str, ...] = (CLOSED,),
-) -> dict[str, float]:
-    """True values of all parameters: the moduli as given, everything else drawn.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PatientSettings:
+    """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
 
-    Factors are log-normal, so that they are positive; displacements are normal, and so are errors
-    of the pressures of several ``fitted`` frames.
+    name: str
+    description: str
+    world: str = ""  # the misspecification in words
+    moduli: dict[str, Modulus] = field(default_factory=dict)  # MPa
+    moduli_spread: Factor = 0.0  # SD of the logarithm by which they are drawn about these
+    variation: Factor = 0.0  # size of the random variation of the anatomy; 0: as configured
+    simulation: PatientSimulation = field(default_factory=PatientSimulation)
+    deviations: Deviations = field(default_factory=Deviations)
+    paper_moduli: tuple[Modulus, ...] = ()  # MPa, of the paper's patient
+    paper_distance_mm: tuple[Length, ...] = ()  # generic, personalised
+
+
+# -- drawing --------------------------------------------------------------------------------------
+def draw_patient_values(patient: PatientSettings, rng: np.random.Generator) -> dict[str, float]:
+    """True value of each parameter: moduli in MPa, factors, displacement, errors of pressures.
+
+    Moduli and factors are log-normal, so that they are positive. Displacements are normal, and so
+    are the errors of the pressures of several fitted frames.
     """
+    own, fitted = patient.deviations, patient.simulation.fitted_frames
+    moduli = {
+        name: float(value * np.exp(patient.moduli_spread * rng.standard_normal()))
+        for name, value in sorted(patient.moduli.items())
+    }
     factors = {
-        "pressure_scale": deviations.pressure,
-        "chord_stiffness": deviations.chord_stiffness,
-        "chord_rest_length": deviations.chord_rest_length,
+        "pressure_scale": own.pressure,
+        "chord_stiffness": own.chord_stiffness,
+        "chord_rest_length": own.chord_rest_length,
     }
     drawn = {name: float(np.exp(std * rng.standard_normal())) for name, std in factors.items()}
-    for name in REGISTRATION:
-        std = deviations.shift_mm if name.startswith("shift") else deviations.turn_degrees
-        drawn[name] = float(std * rng.standard_normal())
+    added = {
+        name: own.shift_mm if name.startswith("shift") else own.turn_degrees
+        for name in REGISTRATION
+    }
     if len(fitted) > 1:
-        errors = {OFFSET: deviations.pressure_offset_mmHg}
-        errors |= {f"{ERROR}.{frame}": deviations.pressure_each_mmHg for frame in fitted}
-        drawn |= {name: float(std * rng.standard_normal()) for name, std in errors.items()}
-    return {**{name: float(value) for name, value in moduli.items()}, **drawn}
+        added[OFFSET] = own.pressure_offset_mmHg
+        added |= {f"{ERROR}.{frame}": own.pressure_each_mmHg for frame in fitted}
+    drawn |= {name: float(std * rng.standard_normal()) for name, std in added.items()}
+    return moduli | drawn
+
+
+def first_that_closes(
+    template: Template,
+    variation: float,
+    max_draws: int,
+    rng: np.random.Generator,
+    simulate: Callable[[Template], T],
+) -> tuple[T, int]:
+    """What ``simulate`` makes of the first anatomy that closes, and how many were drawn.
+
+    Raises
+    ------
+    GeometryError
+        If none of ``max_draws`` does.
+    """
+    for draws in range(1, max_draws + 1):
+        drawn = Template(vary(template.parameters, rng, variation)) if variation else template
+        try:
+            return simulate(drawn), draws
+        except GeometryError as error:
+            refused = error
+    raise refused
+
+
+# -- closing --------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualPatient:
+    """A simulated case, and what it does not state.
+
+    Attributes
+    ----------
+    case : ValveCase
+    values : mapping
+        Parameter -> true value: the moduli in MPa, factors on what the case states, and the
+        displacement of the leaflets as they were seen.
+    positions : mapping
+        Frame -> ``(n, 3)`` mm, where the vertices of the case would have been seen without errors,
+        the displacement included.
+    """
+
+    case: ValveCase
+    values: Mapping[str, float]
+    positions: Mapping[str, FloatArray]
 
 
 def simulate_patient(
@@ -215,7 +275,7 @@ def simulate_patient(
         Of the case.
     template : Template
     values : mapping
-        As from :func:`draw_hidden`.
+        As from :func:`draw_patient_values`.
     simulation : PatientSimulation
     mechanics : MechanicsSettings
         Its pressure is what the case states.
@@ -225,96 +285,67 @@ def simulate_patient(
     Raises
     ------
     GeometryError
-        If the valve does not close, or has no equilibrium in a frame that is held out.
+        If the valve does not close, or has no equilibrium in a further frame.
     """
     world, other = simulation.world, rng.spawn(1)[0]
     values = world.values(values, other)
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
     real = Template(world.anatomy(template.parameters, other))
-    contact = real.valve(simulation.contact_columns, simulation.contact_rows)
-    own = world.mechanics(mechanics, values)
-    there = real.valve(simulation.seen_columns, simulation.seen_rows)
+    drawn = DrawnValve(name, real, values, world.mechanics(mechanics, values))
+    there = drawn.sampled(simulation.seen_columns, simulation.seen_rows)
+    shapes = close_patient(drawn, there, simulation)
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
-    shapes = close_patient(name, real, there, contact, values, simulation, own)
     true = {frame: displace(vertices, registration, centre) for frame, vertices in shapes.items()}
     case = _case(name, description, seen, true, simulation, mechanics, rng)
     return VirtualPatient(case, dict(values), {REFERENCE: seen.surface.vertices, **true})
 
 
 def close_patient(
-    name: str,
-    template: Template,
-    seen: Valve,
-    contact: Valve,
-    values: Mapping[str, float],
-    simulation: PatientSimulation,
-    mechanics: MechanicsSettings,
+    drawn: DrawnValve, seen: Valve, simulation: PatientSimulation
 ) -> dict[str, FloatArray]:
     """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
 
-    The first frame is the closed one; those that are fitted with it and held out follow.
-
-    Parameters
-    ----------
-    name : str
-    template : Template
-    seen, contact : Valve
-        Of that template, where it is seen and where contact is sampled.
-    values : mapping
-        The model's parameters are its names, without those of a displacement.
-    simulation : PatientSimulation
-    mechanics : MechanicsSettings
+    The first frame is the closed one; the fitted and the held-out ones follow. ``seen`` is the
+    valve where it is seen.
 
     Raises
     ------
     GeometryError
         If the valve does not close, or has no equilibrium in one of these.
     """
-    model = _model(template, seen, contact, values, simulation, mechanics)
-    states = held_states(simulation, contact)
-    errors = tuple(name for name in values if is_frame_pressure(name))
+    model, values = _model(drawn, seen, simulation), drawn.values
+    states = simulation.held_states(model.contact_valve)
     frames = FramesModel(
         model,
         CLOSED,
         {frame: states[frame] for frame in simulation.fitted_frames[1:]},
-        mechanics.protocol.pressure_mmHg,
-        errors,
+        drawn.mechanics.protocol.pressure_mmHg,
+        tuple(name for name in values if is_frame_pressure(name)),
     )
     m = np.array([values[parameter] for parameter in frames.names])
     at = frames.of_closure(m)
     prediction = model(at)
+    patient = f"virtual patient {drawn.name}"
     if not prediction.converged:
-        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+        raise GeometryError(f"{patient} does not close: {prediction.reason}")
     true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
     for frame, vertices in zip(states, model.held(at, frames.under(m, states)), strict=True):
         if vertices is None:
-            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
+            raise GeometryError(f"{patient} has no equilibrium in the frame {frame}")
         true[frame] = vertices
     return true
 
 
-def _model(
-    template: Template,
-    seen: Valve,
-    contact: Valve,
-    values: Mapping[str, float],
-    simulation: PatientSimulation,
-    mechanics: MechanicsSettings,
-) -> ClosureModel:
+def _model(drawn: DrawnValve, seen: Valve, simulation: PatientSimulation) -> ClosureModel:
     """The model that closes a virtual patient, with the guides that it follows."""
-    # An exponential tissue has its coefficients, which follow from a modulus, and no modulus.
-    exponential = simulation.world.exponential
-    names = tuple(
-        name
-        for name in values
-        if not (
-            name in REGISTRATION
-            or is_frame_pressure(name)
-            or (exponential and name.startswith("E_f."))
-        )
-    )
-    protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
+    not_modelled = {*REGISTRATION, *filter(is_frame_pressure, drawn.values)}
+    if simulation.world.exponential:
+        # Its coefficients follow from a modulus, which is no parameter of its own.
+        not_modelled |= {name for name in drawn.values if name.startswith("E_f.")}
+    protocol = drawn.mechanics.protocol
+    finer = replace(protocol, dt=protocol.dt * simulation.dt_factor)
+    contact = drawn.sampled(simulation.contact_columns, simulation.contact_rows)
     guide = None
     own = (simulation.element, simulation.columns, simulation.rows)
     # Closures are followed on coarser meshes only.
@@ -323,9 +354,9 @@ def _model(
         guide = ClosureModel(
             seen,
             contact,
-            structured_mesh(template, element, columns, rows),
-            replace(mechanics, protocol=protocol),
-            names,
+            structured_mesh(drawn.template, element, columns, rows),
+            replace(drawn.mechanics, protocol=finer),
+            tuple(name for name in drawn.values if name not in not_modelled),
             continuation=True,
             guide=guide,
             # A valve that does not follow its guide has more than one way to close.
@@ -335,32 +366,7 @@ def _model(
     return guide
 
 
-def _name(kind: str, pressure_mmHg: float) -> str:
-    return f"{kind}_{pressure_mmHg:g}_mmHg"
-
-
-def held_states(simulation: PatientSimulation, valve: Valve) -> dict[str, HeldState]:
-    """The frames after the closed one, fitted with it or held out, on the annulus of a valve.
-
-    Tips that move while the valve closes return with the annulus.
-    """
-    start, end = valve.motion.annulus[0], valve.motion.annulus[-1]
-    tips = valve.motion.papillary_tips[-1]
-    back = valve.motion.papillary_tips[0] - tips
-    return {
-        _name(kind, pressure): HeldState(
-            pressure,
-            end + relaxation * (start - end),
-            tips + relaxation * (np.array(simulation.held_tips) + back),
-        )
-        for kind, pressures, relaxations in (
-            (FITTED, simulation.fitted_pressure_mmHg, simulation.fitted_relaxation),
-            (HELD, simulation.held_pressure_mmHg, simulation.held_relaxation),
-        )
-        for pressure, relaxation in zip(pressures, relaxations, strict=True)
-    }
-
-
+# -- seeing ---------------------------------------------------------------------------------------
 def _case(
     name: str,
     description: str,
@@ -371,13 +377,12 @@ def _case(
     rng: np.random.Generator,
 ) -> ValveCase:
     other = rng.spawn(1)[0]
-    surface, chordae = seen.surface, seen.chordae
+    surface, chordae, motion = seen.surface, seen.chordae, seen.motion
     world, length = simulation.world, simulation.correlation_length_mm
-    moved = np.stack(list(true.values()))
-    seen_later = world.noise(simulation.std_mm, surface.vertices, length)(moved, moved, rng)
+    exact, moved = surface.vertices, np.stack(list(true.values()))
+    seen_later = world.noise(simulation.std_mm, exact, length)(moved, moved, rng)
     if simulation.rough_std_mm:
         seen_later = WhiteNoise(simulation.rough_std_mm)(seen_later, moved, rng)
-    exact = surface.vertices
     open_shape = exact + world.open_moves(seen, other)
     if simulation.rest_std_mm:
         rest_error = world.noise(simulation.rest_std_mm, exact, length)
@@ -388,17 +393,16 @@ def _case(
         nearest = cKDTree(exact).query(chordae.insertion)[1]
         moved_ends = (open_shape - exact)[nearest]
         chordae = replace(chordae, insertion=chordae.insertion + moved_ends)
-    motion = seen.motion
     at_annulus, at_tips = world.boundary(motion.annulus[-1], motion.papillary_tips[-1], other)
     seen_later[0] = world.seen(seen_later[0], seen.surface, other)
     states = {
-        REFERENCE: HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips + at_tips),
+        REFERENCE: HeldState(0.0, open_shape[seen.annulus], seen.papillary_tips + at_tips),
         CLOSED: HeldState(
             mechanics.protocol.pressure_mmHg,
             motion.annulus[-1] + at_annulus,
             motion.papillary_tips[-1] + at_tips,
         ),
-        **held_states(simulation, seen),
+        **simulation.held_states(seen),
     }
     end = mechanics.protocol.ramp
     times = (0.0, *(end + k * FRAME_INTERVAL for k in range(len(true))))
@@ -406,17 +410,17 @@ def _case(
     roles |= {REFERENCE: Role.REFERENCE, CLOSED: Role.CLOSED}
     frames = tuple(
         Frame(
-            which,
-            time,
-            roles.get(which, Role.HELD_OUT),
-            states[which].pressure_mmHg,
-            vertices,
-            surface.triangles,
-            surface.region,
-            states[which].annulus,
-            vertices[seen.free_edge],
-            states[which].papillary_tips,
-            True,
+            name=which,
+            time=time,
+            role=roles.get(which, Role.HELD_OUT),
+            pressure_mmHg=states[which].pressure_mmHg,
+            vertices=vertices,
+            triangles=surface.triangles,
+            region=surface.region,
+            annulus=states[which].annulus,
+            free_edge=vertices[seen.free_edge],
+            papillary_tips=states[which].papillary_tips,
+            corresponds=True,
         )
         for which, time, vertices in zip(
             (REFERENCE, *true), times, (surface.vertices, *seen_later), strict=True

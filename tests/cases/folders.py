@@ -6,6 +6,7 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.cases.tissue import LeafletBand
 from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template
 
@@ -27,19 +28,9 @@ def template_case(columns=40, rows=12):
     def frame(name, time, role, pressure, share, corresponds=True):
         x = surface.vertices if share == 0 else closing(surface.vertices, share)
         tips = valve.papillary_tips + np.array([0.0, share / 3, share])
-        return Frame(
-            name,
-            time,
-            role,
-            pressure,
-            x,
-            surface.triangles,
-            surface.region,
-            x[valve.annulus],
-            x[valve.free_edge],
-            tips,
-            corresponds,
-        )
+        loops = x[valve.annulus], x[valve.free_edge]
+        shape = x, surface.triangles, surface.region
+        return Frame(name, time, role, pressure, *shape, *loops, tips, corresponds)
 
     return ValveCase(
         name="template",
@@ -61,23 +52,22 @@ def template_case(columns=40, rows=12):
     )
 
 
-def plain_folder(folder: Path, columns=24, rows=8, suffix=".vtp"):
+def plain_folder(folder: Path, columns=24, rows=8):
     """Write the surfaces of an open and a closed frame and a table of chordae; returns case.yaml.
 
     The fields are as a user would write them: thickness and fibres are left to be derived.
     """
-    valve = Template().valve(columns, rows)
-    surface, chordae = valve.surface, valve.chordae
+    chordae = Template().chordae()
     folder.mkdir(exist_ok=True)
-    for name, x in (("open", surface.vertices), ("closed", closing(surface.vertices))):
-        save_surface(folder / f"{name}{suffix}", x, surface.triangles, surface.region)
-    rows = ["tip,x,y,z,family,rest_length_mm,stiffness_n"]
+    save_frames(folder, columns=columns, rows=rows)
+    table = ["tip,x,y,z,family,rest_length_mm,stiffness_n"]
     for k in range(len(chordae)):
         x, y, z = chordae.insertion[k].tolist()
         family = chordae.family_names[chordae.family[k]]
         length, stiffness = float(chordae.rest_length[k]), float(chordae.axial_stiffness[k])
-        rows.append(f"{chordae.tip[k]},{x!r},{y!r},{z!r},{family},{length!r},{stiffness!r}")
-    (folder / "chordae.csv").write_text("\n".join(rows) + "\n")
+        table.append(f"{chordae.tip[k]},{x!r},{y!r},{z!r},{family},{length!r},{stiffness!r}")
+    (folder / "chordae.csv").write_text("\n".join(table) + "\n")
+    frames = (("open", 0.0, "reference", 0), ("closed", 0.35, "closed", 120.0))
     return {
         "version": 1,
         "name": "plain",
@@ -85,24 +75,29 @@ def plain_folder(folder: Path, columns=24, rows=8, suffix=".vtp"):
         "regions": ["anterior", "posterior"],
         "frames": [
             {
-                "name": "open",
-                "time": 0.0,
-                "role": "reference",
-                "surface": f"open{suffix}",
-                "papillary_tips": [list(tip) for tip in TIPS],
-                "pressure": 0,
-            },
-            {
-                "name": "closed",
-                "time": 0.35,
-                "role": "closed",
-                "surface": f"closed{suffix}",
-                "papillary_tips": [list(tip) for tip in TIPS],
-                "pressure": 120.0,
-            },
+                "name": name, "time": time, "role": role, "surface": f"{name}.vtp",
+                "papillary_tips": [list(tip) for tip in TIPS], "pressure": pressure,
+            }
+            for name, time, role, pressure in frames
         ],
         "chordae": "chordae.csv",
-    }
+    }  # fmt: skip
+
+
+def band_of(case, anterior=0):
+    """The coordinates of a case or of a valve."""
+    surface = case.surface
+    parts = surface.vertices, surface.triangles, surface.region
+    return LeafletBand.of(*parts, case.annulus, case.free_edge, anterior)
+
+
+def save_frames(folder: Path, triangles=None, columns=24, rows=8, names=("open", "closed")):
+    """Write the surfaces of the template, open and closed, perhaps with other triangles."""
+    surface = Template().valve(columns, rows).surface
+    shapes = {"open": surface.vertices, "closed": closing(surface.vertices)}
+    for name in names:
+        faces = surface.triangles if triangles is None else triangles
+        save_surface(folder / f"{name}.vtp", shapes[name], faces, surface.region)
 
 
 def save_surface(file, vertices, triangles, region):

@@ -9,11 +9,11 @@ from experiments.run import main
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.plausibility import doubts
-from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
+from mvest.cases.tissue import CLOSED_DEPTH, assumed_closure, lay_out_chordae
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template
-from tests.cases.folders import plain_folder, save, template_case
+from tests.cases.folders import band_of, plain_folder, save, template_case
 from tests.cases.test_folder import assert_equal
 
 
@@ -28,10 +28,8 @@ def test_an_open_frame_alone_comes_back_as_it_was_written(tmp_path, anatomy):
     assert_equal(back, anatomy, "sha256")
     assert back.closed is None
     assert str(back).splitlines()[2] == "frames: open (reference, -0.333 mmHg)"
-
-
-def test_its_boundary_stays_where_it_is(anatomy):
-    motion = anatomy.valve.motion
+    # Its boundary stays where it is.
+    motion = back.valve.motion
     for positions in (motion.annulus, motion.papillary_tips):
         np.testing.assert_array_equal(positions[0], positions[1])
 
@@ -64,10 +62,7 @@ def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
     assert abs(np.median(ratio) - 1) < 0.1
     assert ratio.min() > 0.75
     # By the slack that the template gives them at a closure that is intended, as this one is.
-    surface, frame = case.surface, case.frames[0]
-    band = LeafletBand.of(
-        surface.vertices, surface.triangles, surface.region, case.annulus, case.free_edge, 0
-    )
+    band, frame = band_of(case), case.frames[0]
     goal = assumed_closure(band, frame.annulus, frame.papillary_tips)
     tips = frame.papillary_tips
     expected = lay_out_chordae(band, tips, goal, tips, ChordLayout()).rest_length
@@ -75,14 +70,7 @@ def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
 
 
 def test_an_assumed_closure_brings_the_edges_together(anatomy):
-    band = LeafletBand.of(
-        anatomy.surface.vertices,
-        anatomy.surface.triangles,
-        anatomy.surface.region,
-        anatomy.annulus,
-        anatomy.free_edge,
-        0,
-    )
+    band = band_of(anatomy)
     frame = anatomy.frames[0]
     closed = assumed_closure(band, frame.annulus, frame.papillary_tips)
     np.testing.assert_allclose(closed[anatomy.annulus], frame.annulus, atol=1e-9)

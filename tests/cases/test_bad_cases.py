@@ -31,39 +31,37 @@ def bad(plain, tmp_path):
     return tmp_path / "case", copy.deepcopy(document)
 
 
-def test_a_seam_within_the_tolerance_is_closed(bad):
-    # A hundred-thousandth of the diagonal (45 mm) is 0.00045 mm.
+def test_the_folder_is_in_order_before_it_is_broken(bad):
     folder, document = bad
+    read_case(save(folder, document))
+    # A hundred-thousandth of the diagonal (45 mm) is 0.00045 mm.
     seam(0.0002)(folder, document)
     assert len(read_case(save(folder, document)).surface.vertices) == 192
-
-
-def test_the_folder_is_in_order_before_it_is_broken(bad):
-    read_case(save(*bad))
 
 
 # --- ways to break it ---------------------------------------------------------------------------
 
 
+DROPPED = object()
+
+
 def put(*path_and_value):
-    """Set a field of the document."""
+    """Set a field of the document, or drop it."""
     *path, last, value = path_and_value
 
     def change(folder, document):
         for key in path:
             document = document[key]
-        document[last] = value
+        if value is DROPPED:
+            del document[last]
+        else:
+            document[last] = value
 
     return change
 
 
 def drop(*path):
-    def change(folder, document):
-        for key in path[:-1]:
-            document = document[key]
-        del document[path[-1]]
-
-    return change
+    return put(*path, DROPPED)
 
 
 def both(*changes):
@@ -108,13 +106,13 @@ def cell(row, column, value):
 
 def text(content, name="case.yaml"):
     def change(folder, document):
-        document.clear()
-        document["text"] = content
+        if name == "case.yaml":
+            document.clear()
+            document["text"] = content
+        else:
+            (folder / name).write_text(content)
 
-    def write(folder, document):
-        (folder / name).write_text(content)
-
-    return change if name == "case.yaml" else write
+    return change
 
 
 def scaled(factor):
@@ -562,34 +560,25 @@ def test_what_is_wrong_is_one_clear_error(bad, change, error, field, message):
     assert len(said) < 1000
 
 
-@pytest.mark.parametrize("name", ["nowhere", "empty"])
-def test_no_case_at_all(tmp_path, name):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"no such folder|no case\.yaml in this folder"):
-        read_case(tmp_path / name)
+def test_no_case_at_all(tmp_path):
+    with pytest.raises(InputError, match=r"no such folder"):
+        read_case(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"no case\.yaml in this folder"):
+        read_case(tmp_path)
 
 
-def test_a_case_that_is_a_link_out_of_its_folder(bad):
-    folder, document = bad
-    save(folder, document)
-    (folder / "case.yaml").rename(folder.parent / "elsewhere.yaml")
-    (folder / "case.yaml").symlink_to(folder.parent / "elsewhere.yaml")
-    with pytest.raises(InputError, match=r"case\.yaml: link: 'case\.yaml' leads out of the folder"):
-        read_case(folder)
-    assert files_of_case(folder) == {}
-
-
-def test_texts_are_no_files(bad):
+def test_only_files_that_the_case_names_within_its_folder_are_hashed(bad):
     folder, document = bad
     (folder.parent / "secret.txt").write_text("secret")
     (folder / "note.txt").write_text("note")
     save(folder, document | {"description": "../secret.txt", "source": "note.txt"})
     assert set(files_of_case(folder)) == {"case.yaml", "open.vtp", "closed.vtp", "chordae.csv"}
     read_case(folder)
-
-
-def test_no_file_outside_the_folder_is_hashed(bad):
-    folder, document = bad
     shutil.copy(folder / "closed.vtp", folder.parent)
     put("frames", 1, "surface", "../closed.vtp")(folder, document)
     assert "../closed.vtp" not in files_of_case(save(folder, document))
+    (folder / "case.yaml").rename(folder.parent / "elsewhere.yaml")
+    (folder / "case.yaml").symlink_to(folder.parent / "elsewhere.yaml")
+    with pytest.raises(InputError, match=r"case\.yaml: link: 'case\.yaml' leads out of the folder"):
+        read_case(folder)
+    assert files_of_case(folder) == {}

@@ -11,7 +11,8 @@ from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template
-from tests.cases.folders import closing, plain_folder, save, save_surface
+from mvest.valve.anatomy.valve import band_grid
+from tests.cases.folders import band_of, plain_folder, save, save_frames
 from tests.closure.test_model import CLOSING, model_of
 
 RADIUS, HEIGHT = 15.0, 12.0
@@ -22,15 +23,9 @@ def cylinder(columns=36, rows=5, begin=20.0, end=160.0):
 
     The anterior leaflet, region 1, lies between the angles begin and end (degrees).
     """
-    i, j = np.meshgrid(np.arange(columns), np.arange(rows))
-    angle = 2 * np.pi * i.ravel() / columns
-    z = -HEIGHT * j.ravel() / (rows - 1)
-    x = np.column_stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), z])
-    i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
-    a, b = j * columns + i, j * columns + (i + 1) % columns
-    c, d = b + columns, a + columns
-    triangles = np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
-    middle = np.tile(360.0 * (i + 0.5) / columns, 2)
+    phi, s, triangles, _ = band_grid(columns, rows)
+    x = np.stack(at_angle(phi, s), axis=1)
+    middle = np.tile(phi[: columns * (rows - 1)] + 180.0 / columns, 2)
     region = ((middle > begin) & (middle < end)).astype(np.int64)
     annulus, free_edge = np.arange(columns), np.arange(columns) + columns * (rows - 1)
     return x, triangles, region, annulus, free_edge
@@ -58,11 +53,10 @@ def test_places_do_not_depend_on_where_the_annulus_begins():
     # On the template the border of the leaflets runs over 15 degrees of harmonic angle, so that for
     # some of these beginnings the angle jumps from 2 pi to 0 along it.
     valve = Template().valve(24, 8)
-    x, t, r = valve.surface.vertices, valve.surface.triangles, valve.surface.region
     phi, s = np.linspace(-180.0, 540.0, 50), np.linspace(0.0, 1.0, 50)
-    expected = LeafletBand.of(x, t, r, valve.annulus, valve.free_edge, 0).position(phi, s)
+    expected = band_of(valve).position(phi, s)
     for roll in range(1, 24):
-        band = LeafletBand.of(x, t, r, np.roll(valve.annulus, roll), valve.free_edge, 0)
+        band = band_of(replace(valve, annulus=np.roll(valve.annulus, roll)))
         np.testing.assert_allclose(band.position(phi, s), expected, atol=1e-8)
 
 
@@ -100,10 +94,6 @@ def test_a_closed_frame_of_another_mesh_gives_the_same_chordae():
     np.testing.assert_array_equal(found.insertion, same.insertion)
     # The finer polygon lies within R (1 - cos 5 deg) = 0.06 mm of the coarser.
     np.testing.assert_allclose(found.rest_length, same.rest_length, atol=0.06)
-
-
-def test_three_tips_are_refused():
-    band = LeafletBand.of(*cylinder(), anterior=1)
     with pytest.raises(InputError, match="3 papillary tips; the layout of chordae needs two"):
         lay_out_chordae(band, np.zeros((3, 3)), band.vertices, np.zeros((3, 3)), SEEN_ON_BAND)
 
@@ -135,10 +125,7 @@ def test_where_a_closed_frame_was_seen_chordae_are_nearly_as_long_as_in_the_valv
     valve = Template().valve(40, 12)
     prediction = replace(model, valve=valve)(np.array([6.23, 2.09]))
     assert prediction.converged
-    surface, tips = valve.surface, valve.motion.papillary_tips
-    band = LeafletBand.of(
-        surface.vertices, surface.triangles, surface.region, valve.annulus, valve.free_edge, 0
-    )
+    band, tips = band_of(valve), valve.motion.papillary_tips
     closed = prediction.y.reshape(2, -1, 3)[1]
     laid_out = lay_out_chordae(band, tips[0], closed, tips[-1], SEEN_ON_BAND)
     own = valve.chordae
@@ -154,11 +141,7 @@ def test_a_case_with_a_closed_frame_lays_chordae_out_by_what_was_seen(tmp_path):
     document = plain_folder(tmp_path, 40, 12)
     del document["chordae"]
     case = read_case(save(tmp_path, document))
-    surface, tips = case.surface, np.asarray(case.frames[0].papillary_tips)
-    band = LeafletBand.of(
-        surface.vertices, surface.triangles, surface.region, case.annulus, case.free_edge, 0
-    )
-    closed = case.frame(Role.CLOSED)
+    band, tips, closed = band_of(case), case.frames[0].papillary_tips, case.frame(Role.CLOSED)
     seen = lay_out_chordae(band, tips, closed.vertices, closed.papillary_tips, SEEN_ON_BAND)
     np.testing.assert_allclose(case.chordae.rest_length, seen.rest_length, rtol=1e-9)
 
@@ -167,10 +150,7 @@ def test_frames_without_correspondence_are_matched(tmp_path):
     document = plain_folder(tmp_path, 40, 12)
     del document["chordae"]
     expected = read_case(save(tmp_path, document))
-    surface = Template().valve(56, 14).surface
-    save_surface(
-        tmp_path / "closed.vtp", closing(surface.vertices), surface.triangles, surface.region
-    )
+    save_frames(tmp_path, columns=56, rows=14, names=["closed"])
     case = read_case(save(tmp_path, document))
     assert not case.frames[1].corresponds
     assert sum("annulus of frame 'closed'" in sentence for sentence in case.derived) == 1

@@ -8,7 +8,7 @@ import pytest
 
 from mvest.cases.case import Role, Uncertainty
 from mvest.cases.folder import read_case
-from mvest.cases.plausibility import RANGES, _plane, doubts, require_plausible
+from mvest.cases.plausibility import _plane, doubts, require_plausible
 from mvest.errors import InputError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "case"
@@ -20,9 +20,8 @@ def case():
 
 
 def with_frame(case, role, **changes):
-    return replace(
-        case, frames=tuple(replace(f, **changes) if f.role is role else f for f in case.frames)
-    )
+    frames = (replace(f, **changes) if f.role is role else f for f in case.frames)
+    return replace(case, frames=tuple(frames))
 
 
 def with_surface(case, **changes):
@@ -34,14 +33,9 @@ def with_surface(case, **changes):
 def moved(case, how):
     """The closed frame with its vertices moved, the curves with them."""
     closed = case.frame(Role.CLOSED)
-    vertices = how(closed.vertices)
-    return with_frame(
-        case,
-        Role.CLOSED,
-        vertices=vertices,
-        annulus=vertices[case.annulus],
-        free_edge=vertices[case.free_edge],
-    )
+    x = how(closed.vertices)
+    loops = {"annulus": x[case.annulus], "free_edge": x[case.free_edge]}
+    return with_frame(case, Role.CLOSED, vertices=x, **loops)
 
 
 def test_the_example_is_in_order(case):
@@ -91,12 +85,8 @@ def thin(case):
     return with_surface(case, thickness=0.1 * case.surface.thickness)
 
 
-def in_kilopascals(case):
-    return with_frame(case, Role.CLOSED, pressure_mmHg=16.0)
-
-
-def low_pressure(case):
-    return with_frame(case, Role.CLOSED, pressure_mmHg=40.0)
+def under(mmhg):
+    return lambda case: with_frame(case, Role.CLOSED, pressure_mmHg=mmhg)
 
 
 def tips_away(case):
@@ -122,8 +112,8 @@ def large_annulus(case):
         (shrunken, "frames.closed.surface", "area of the anterior leaflet", False),
         (shuffled, "frames.closed.surface", "do its vertices correspond?", True),
         (thin, "thickness", "is it in cm?", True),
-        (in_kilopascals, "frames.pressure", "is it in kPa?", True),
-        (low_pressure, "frames.pressure", "is 40 mmHg, expected 60 to 200 mmHg", False),
+        (under(16.0), "frames.pressure", "is it in kPa?", True),
+        (under(40.0), "frames.pressure", "is 40 mmHg, expected 60 to 200 mmHg", False),
         (tips_away, "frames.closed.papillary_tips", "motion of a tip is 20 mm", False),
         (slack_chordae, "frames.closed.papillary_tips", "half of the chordae", False),
         (large_annulus, "frames.closed.annulus", "over that of the reference", False),
@@ -136,17 +126,11 @@ def test_each_mistake_is_named(case, made, field, words, mistake):
 
 
 def test_mistakes_come_first_and_strictness_refuses_all(case):
-    wrong = in_kilopascals(tips_away(case))
+    wrong = under(16.0)(tips_away(case))
     found = doubts(wrong)
     assert [doubt.mistake for doubt in found] == sorted((d.mistake for d in found), reverse=True)
     with pytest.raises(InputError, match=r"is not plausible: .*kPa.*; .*tip"):
         require_plausible(wrong)
-
-
-def test_every_range_is_one_and_says_why():
-    for name, one in RANGES.items():
-        assert one.low < one.high, name
-        assert one.why, name
 
 
 def with_second(case, pressure, rise):
@@ -178,8 +162,6 @@ def test_pressures_in_the_wrong_order_are_named(case):
     # What such errors may do is no mistake.
     smooth = replace(case, uncertainty=Uncertainty(1.0, 10.0))
     assert doubts(with_second(smooth, 80.0, 0.5)) == ()
-
-
-def test_every_pressure_is_looked_at(case):
+    # Every pressure is checked.
     (doubt,) = [d for d in doubts(with_second(case, 10.7, -0.5)) if "kPa" in d.text]
     assert doubt.field == "frames.second.pressure"

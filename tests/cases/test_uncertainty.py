@@ -10,6 +10,7 @@ from mvest.cases.case import ErrorSamples, Role, Uncertainty
 from mvest.cases.folder import read_case, write_case, write_error_samples
 from mvest.errors import InputError
 from tests.cases.folders import plain_folder, save, template_case
+from tests.cases.test_folder import assert_equal
 
 NAMES = ["open", "closed"]
 
@@ -28,34 +29,29 @@ def samples(count=5, frames=2, n=80, tips=2, seed=1):
     )
 
 
-def test_what_a_case_says_of_its_errors_comes_back_as_it_was_written(tmp_path):
-    case = corresponding()
+def test_what_a_case_states_of_its_errors_comes_back_as_it_was_written(tmp_path):
+    case, change = corresponding(), dataclasses.replace
     n = len(case.surface.vertices)
     std = np.random.default_rng(2).uniform(0.2, 1.0, n)
-    told = dataclasses.replace(
-        case, uncertainty=Uncertainty(std, 8.0), error_samples=samples(6, 3, n), chordae_follow=True
-    )
-    back = read_case(write_case(tmp_path / "case", told))
-    np.testing.assert_array_equal(back.uncertainty.std_mm, std)
-    assert back.uncertainty.correlation_length_mm == 8.0
-    np.testing.assert_array_equal(back.error_samples.vertices, told.error_samples.vertices)
-    np.testing.assert_array_equal(back.error_samples.tips, told.error_samples.tips)
-    assert back.error_samples.source is None
-    own = dataclasses.replace(told.error_samples, source=np.array([0, 1, 2, 0, 1, 2]))
-    again = write_case(tmp_path / "again", dataclasses.replace(told, error_samples=own))
-    np.testing.assert_array_equal(read_case(again).error_samples.source, own.source)
-    with pytest.raises(InputError, match=r"source is float64 .* expected integers of shape \(6,\)"):
-        dataclasses.replace(told.error_samples, source=np.zeros(6))
+    own = change(samples(6, 3, n), source=np.array([0, 1, 2, 0, 1, 2]))
+    known = change(case, uncertainty=Uncertainty(std, 8.0), error_samples=own, chordae_follow=True)
+    back = read_case(write_case(tmp_path / "case", known))
+    assert_equal(back.uncertainty, known.uncertainty)
+    assert_equal(back.error_samples, own)
     assert back.chordae_follow
+    independent = change(known, error_samples=samples(6, 3, n))
+    again = read_case(write_case(tmp_path / "again", independent))
+    assert again.error_samples.source is None
     # The samples are part of the case and of its hash.
-    other = dataclasses.replace(told, error_samples=samples(6, 3, n, seed=7))
-    assert read_case(write_case(tmp_path / "other", other)).sha256 != back.sha256
-    # A case that says nothing of this is written as before.
+    assert again.sha256 != back.sha256
+    # A case that states nothing of this is written without it.
     plain = read_case(write_case(tmp_path / "plain", case))
     assert (plain.error_samples, plain.chordae_follow) == (None, False)
     text = (tmp_path / "plain" / "case.yaml").read_text()
     assert "follow" not in text
     assert "error_samples" not in text
+    with pytest.raises(InputError, match=r"source is float64 .* expected integers of shape \(6,\)"):
+        change(own, source=np.zeros(6))
 
 
 def test_chordae_that_are_laid_out_on_reading_follow_the_frames(tmp_path):
@@ -84,43 +80,37 @@ def test_deviations_that_are_none_are_refused(std, message):
 
 
 def test_deviations_and_samples_must_be_of_the_case():
-    case = corresponding()
+    case, change = corresponding(), dataclasses.replace
     n = len(case.surface.vertices)
-    change = dataclasses.replace
-    with pytest.raises(InputError, match=f"std_mm of 3 vertices, expected {n}"):
-        change(case, uncertainty=Uncertainty(np.ones(3)))
-    with pytest.raises(InputError, match="vertices of 2 frames of 80 points, expected 3 of 80"):
-        change(case, error_samples=samples())
-    with pytest.raises(InputError, match="tips of 3 frames of 1 points, expected 3 of 2"):
-        change(case, error_samples=samples(frames=3, tips=1))
-    loose = change(
-        case, frames=(case.frames[0], change(case.frames[1], corresponds=False), case.frames[2])
-    )
-    with pytest.raises(InputError, match="frame 'held' do not correspond"):
-        change(loose, error_samples=samples(frames=3))
-    closed = case.frame(Role.CLOSED)
-    frames = tuple(change(f, corresponds=f is not closed) for f in case.frames)
-    with pytest.raises(InputError, match="closed frame do not correspond; expected one number"):
-        change(case, frames=frames, uncertainty=Uncertainty(np.ones(n)))
+
+    def without(role):
+        """The case with a frame that does not correspond."""
+        frames = (change(f, corresponds=f.role is not role) for f in case.frames)
+        return change(case, frames=tuple(frames))
+
+    for wrong, change_of_it, message in (
+        (case, {"uncertainty": Uncertainty(np.ones(3))}, f"std_mm of 3 vertices, expected {n}"),
+        (case, {"error_samples": samples()}, "vertices of 2 frames of 80 points, expected 3 of 80"),
+        (case, {"error_samples": samples(5, 3, 80, 1)}, "tips of 3 frames of 1 points, expected 3"),
+        (without(Role.HELD_OUT), {"error_samples": samples(5, 3)}, "'held' do not correspond"),
+        (without(Role.CLOSED), {"uncertainty": Uncertainty(np.ones(n))}, "expected one number"),
+    ):
+        with pytest.raises(InputError, match=message):
+            change(wrong, **change_of_it)
+
+
+ERRORS, TIPS = np.zeros((5, 2, 80, 3)), np.zeros((5, 2, 2, 3))
 
 
 @pytest.mark.parametrize(
     ("vertices", "tips", "message"),
     [
-        (
-            np.zeros((5, 2, 80)),
-            np.zeros((5, 2, 2, 3)),
-            r"is float64 of shape \(5, 2, 80\)",
-        ),
-        (np.zeros((5, 2, 80, 3), dtype=int), np.zeros((5, 2, 2, 3)), "int64 of shape"),
-        (np.full((5, 2, 80, 3), 25.0), np.zeros((5, 2, 2, 3)), "at most 20 mm"),
-        (
-            np.zeros((5, 2, 80, 3)),
-            np.full((5, 2, 2, 3), np.nan),
-            "tips has values that are",
-        ),
-        (np.zeros((5, 2, 80, 3)), np.zeros((4, 2, 2, 3)), "expected as many"),
-        (np.zeros((3, 2, 80, 3)), np.zeros((3, 2, 2, 3)), "3 error samples, expected 4 to 500"),
+        (ERRORS[..., 0], TIPS, r"is float64 of shape \(5, 2, 80\)"),
+        (ERRORS.astype(int), TIPS, "int64 of shape"),
+        (ERRORS + 25.0, TIPS, "at most 20 mm"),
+        (ERRORS, TIPS * np.nan, "tips has values that are"),
+        (ERRORS, TIPS[:4], "expected as many"),
+        (ERRORS[:3], TIPS[:3], "3 error samples, expected 4 to 500"),
     ],
 )
 def test_samples_that_are_none_are_refused(vertices, tips, message):
@@ -145,11 +135,7 @@ def test_samples_are_read_from_their_file(tmp_path):
     np.testing.assert_array_equal(case.error_samples.vertices, samples().vertices)
 
 
-GOOD = {
-    "frames": np.array(NAMES),
-    "vertices": np.zeros((5, 2, 80, 3)),
-    "tips": np.zeros((5, 2, 2, 3)),
-}
+GOOD = {"frames": np.array(NAMES), "vertices": ERRORS, "tips": TIPS}
 
 
 @pytest.mark.parametrize(
@@ -167,18 +153,13 @@ def test_a_file_of_other_samples_is_refused(tmp_path, change, message):
         read_case(folder_with(tmp_path, **{**GOOD, **change}))
 
 
-@pytest.mark.parametrize("content", [b"", b"not a file of arrays", b"PK\x03\x04 broken"])
-def test_a_file_without_arrays_is_refused_with_the_field(tmp_path, content):
+def test_a_file_that_holds_no_samples_is_refused_with_the_field(tmp_path):
     folder = folder_with(tmp_path)
-    (tmp_path / "errors.npz").write_bytes(content)
-    with pytest.raises(
-        InputError, match=r"case.yaml: observation.error_samples: errors.npz: cannot"
-    ):
-        read_case(folder)
-
-
-def test_samples_lie_in_the_folder_under_their_extension(tmp_path):
-    folder = folder_with(tmp_path)
+    field = r"case.yaml: observation.error_samples: "
+    for content in (b"", b"not a file of arrays", b"PK\x03\x04 broken"):
+        (tmp_path / "errors.npz").write_bytes(content)
+        with pytest.raises(InputError, match=f"{field}errors.npz: cannot"):
+            read_case(folder)
     document = yaml.safe_load((folder / "case.yaml").read_text())
     for name, message in (("../errors.npz", "leads out"), ("open.vtp", "expected .npz")):
         document["observation"]["error_samples"] = name

@@ -1,5 +1,6 @@
 """Simulated valves in motion: what closes, what is drawn, what is refused, and the file of them."""
 
+import itertools
 import pickle
 import time
 from dataclasses import replace
@@ -17,14 +18,13 @@ from mvest.simulation import imaged_patient as patients
 from mvest.simulation import motion, population, virtual_patient
 from mvest.simulation.imaged_patient import simulate_imaged_patient
 from mvest.simulation.motion import (
-    ClosingFrames,
+    DrawnValve,
     MotionLimits,
     MotionSettings,
     RefusedError,
     check_motion,
     close_in_motion,
     frames_along,
-    with_tip_motion,
 )
 from mvest.simulation.population import (
     PopulationSettings,
@@ -42,44 +42,34 @@ TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2
 MECHANICS = MechanicsSettings(TISSUE, ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04))
 VALUES = {"E_f.anterior": 6.0, "E_f.posterior": 4.0, "pressure_scale": 1.1}
 SMALL = MotionSettings(
-    columns=32,
-    rows=9,
-    mesh_columns=16,
-    mesh_rows=2,
-    contact_columns=60,
-    contact_rows=16,
-    steps=6,
-    frames=5,
-    held_pressure=(0.8, 0.6),
-    held_relaxation=(0.1, 0.3),
-)
+    columns=32, rows=9, mesh_columns=16, mesh_rows=2, contact_columns=60, contact_rows=16, steps=6,
+    frames=5, held_pressure=(0.8, 0.6), held_relaxation=(0.1, 0.3),
+)  # fmt: skip
 TEMPLATE = Template()
 LAYOUT = ValveLayout(32, 9)
 TIP_MOTION = np.array([[0.5, -1.0, 1.5], [0.0, 1.0, 1.0]])
 
 
+def drawn_valve(name, values=VALUES, mechanics=MECHANICS):
+    return DrawnValve(name, TEMPLATE, values, mechanics, TIP_MOTION)
+
+
 @pytest.fixture(scope="module")
 def valve():
     """A valve that is closed in seconds."""
-    return close_in_motion("small", TEMPLATE, VALUES, SMALL, MECHANICS, TIP_MOTION)
+    return close_in_motion(drawn_valve("small"), SMALL)
 
 
-def still(name="still", vertices=None, layout=LAYOUT, frames=2):
+REST = TEMPLATE.valve(LAYOUT.columns, LAYOUT.rows).surface.vertices
+
+
+def still(name="still", vertices=REST, frames=2):
     """A valve that does not move, or in which the later frames are as given."""
-    rest = TEMPLATE.valve(layout.columns, layout.rows).surface.vertices
-    later = rest if vertices is None else vertices
+    shapes = np.stack([REST, *[vertices] * (frames - 1)])
     tips = np.tile(TEMPLATE.papillary_tips, (frames, 1, 1))
-    return MovingValve(
-        name,
-        layout,
-        0.1 * np.arange(frames),
-        np.stack([rest, *[later] * (frames - 1)]),
-        tips,
-        np.ones(layout.size),
-        np.array([10.0, 200.0]),
-        np.array([0.5, 1.0]),
-        np.array([0, 1]),
-    )
+    chordae = np.array([10.0, 200.0]), np.array([0.5, 1.0]), np.array([0, 1])
+    times = 0.1 * np.arange(frames)
+    return MovingValve(name, LAYOUT, times, shapes, tips, np.ones(LAYOUT.size), *chordae)
 
 
 # --- closing ------------------------------------------------------------------------------------
@@ -127,33 +117,27 @@ def test_tips_move_while_the_valve_closes_and_return_with_it(valve):
     assert np.all(np.diff(way, axis=0) <= 0)
 
 
-def test_chordae_are_where_those_of_the_template_are():
+def test_chordae_of_a_motion_are_those_of_the_template(valve):
+    phi, s, _, tip = TEMPLATE.chord_places()
+    assert phi.min() < 0 <= valve.chord_phi.min()
+    assert valve.chord_phi.max() < 360
+    np.testing.assert_allclose(
+        TEMPLATE.position(valve.chord_phi, valve.chord_s), TEMPLATE.position(phi, s), atol=1e-9
+    )
+    np.testing.assert_array_equal(valve.chord_tip, tip)
     # One is absent, so that numbers beyond it shift.
-    parameters = TemplateParameters(chordae=ChordLayout(absent=((250.0, 256.0),)))
-    template = Template(parameters)
-    chordae = template.chordae()
-    phi, s, family, tip = template.chord_places()
+    template = Template(TemplateParameters(chordae=ChordLayout(absent=((250.0, 256.0),))))
+    chordae, (phi, s, family, tip) = template.chordae(), template.chord_places()
     assert len(phi) == len(TEMPLATE.chordae()) - 1
     np.testing.assert_array_equal(template.position(phi, s), chordae.insertion)
     np.testing.assert_array_equal(tip, chordae.tip)
     np.testing.assert_array_equal(family, chordae.family)
 
 
-def test_chordae_of_a_motion_have_angles_of_the_layout(valve):
-    phi, s, _, tip = TEMPLATE.chord_places()
-    assert phi.min() < 0
-    assert valve.chord_phi.min() >= 0
-    assert valve.chord_phi.max() < 360
-    np.testing.assert_allclose(
-        TEMPLATE.position(valve.chord_phi, valve.chord_s), TEMPLATE.position(phi, s), atol=1e-9
-    )
-    np.testing.assert_array_equal(valve.chord_tip, tip)
-
-
 def test_a_valve_that_does_not_close_is_refused(monkeypatch):
     monkeypatch.setattr(motion, "GIVE_UP", {"max_iterations": 1, "max_halvings": 0})
     with pytest.raises(RefusedError, match="simulated valve soft: the closure does not converge"):
-        close_in_motion("soft", TEMPLATE, VALUES, SMALL, MECHANICS)
+        close_in_motion(drawn_valve("soft"), SMALL)
 
 
 def test_frames_are_chosen_evenly_along_the_way():
@@ -168,13 +152,12 @@ def test_frames_are_chosen_evenly_along_the_way():
 
 
 def test_tips_keep_where_they_end():
-    seen = TEMPLATE.valve(16, 3)
-    moved = with_tip_motion(seen, TIP_MOTION)
+    seen, moved = TEMPLATE.valve(16, 3), drawn_valve("moved").sampled(16, 3)
     np.testing.assert_allclose(moved.motion.papillary_tips[-1], seen.papillary_tips)
     np.testing.assert_allclose(moved.motion.papillary_tips[0], seen.papillary_tips + TIP_MOTION)
     np.testing.assert_array_equal(moved.motion.papillary_tips[0], moved.papillary_tips)
     with pytest.raises(InputError, match=r"shape \(3,\), expected \(2, 3\)"):
-        with_tip_motion(seen, np.zeros(3))
+        replace(drawn_valve("moved"), tip_motion=np.zeros(3))
 
 
 @pytest.mark.parametrize(
@@ -183,8 +166,6 @@ def test_tips_keep_where_they_end():
         ({"held_pressure": (0.5,)}, "expected as many"),
         ({"frames": 9}, "frames = 9 to the closed one, expected 2 to 8"),
         ({"frames": 1}, "frames = 1"),
-        ({"duration": 0.0}, "motion duration = 0.0, expected > 0"),
-        ({"tolerance": -1.0}, "motion tolerance"),
     ],
 )
 def test_settings_of_a_motion_are_checked(change, message):
@@ -195,52 +176,30 @@ def test_settings_of_a_motion_are_checked(change, message):
 # --- refusals -----------------------------------------------------------------------------------
 
 
-def refused(limits, words, vertices=None):
-    with pytest.raises(RefusedError, match=f"simulated valve still: .*{words}"):
-        check_motion(still(vertices=vertices), 1, limits)
-
-
-def test_a_closed_valve_passes(valve):
-    check_motion(valve, 4, MotionLimits())
-
-
-def test_a_valve_that_stays_open_leaks():
-    refused(MotionLimits(), "of its orifice open")
-
-
-def test_free_edges_that_do_not_lie_at_each_other_are_apart():
-    refused(MotionLimits(orifice=2.0), "mm apart")
-
-
-def test_a_free_edge_above_the_annulus_flails():
-    rest = still().vertices[0]
-    up = rest * np.array([1, 1, -1.0])
-    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
-    refused(limits, "above the annulus", up)
-    check_motion(still(), 1, limits)
-
-
-def test_a_leaflet_that_is_much_longer_is_stretched():
-    rest = still().vertices[0]
-    refused(MotionLimits(orifice=5.0, edge_gap=50.0), "stretched to 1.70", 1.7 * rest)
-    check_motion(still(vertices=1.5 * rest), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
-
-
-def test_leaflets_that_have_changed_sides_have_crossed():
-    x = still().vertices[0].copy()
-    s = LAYOUT.s[:, None]
-    # Free edges beyond the opposite ones.
-    x[:, 1:2] -= 2.0 * s * (x[:, 1:2] - 1.8)
-    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
-    refused(limits, "pass through each other", x)
+FLAILING = REST * np.array([1, 1, -1.0])
+# Free edges beyond the opposite ones.
+CROSSED = REST - [[0.0, 2.0, 0.0]] * LAYOUT.s[:, None] * (REST - 1.8)
 
 
 @pytest.mark.parametrize(
-    "change", [{"orifice": 0.0}, {"edge_gap": 0.0}, {"stretch": 1.0}, {"crossings": -1}]
+    ("limits", "vertices", "words"),
+    [
+        ({}, REST, "of its orifice open"),
+        ({"orifice": 2.0}, REST, "mm apart"),
+        ({"orifice": 2.0, "edge_gap": 50.0, "stretch": 10.0}, FLAILING, "above the annulus"),
+        ({"orifice": 5.0, "edge_gap": 50.0}, 1.7 * REST, "stretched to 1.70"),
+        ({"orifice": 2.0, "edge_gap": 50.0, "stretch": 10.0}, CROSSED, "pass through each other"),
+    ],
 )
-def test_limits_are_checked(change):
-    with pytest.raises(InputError, match="limits of a motion"):
-        MotionLimits(**change)
+def test_what_no_valve_does_is_refused(limits, vertices, words):
+    with pytest.raises(RefusedError, match=f"simulated valve still: .*{words}"):
+        check_motion(still(vertices=vertices), 1, MotionLimits(**limits))
+
+
+def test_what_a_valve_may_do_passes(valve):
+    check_motion(valve, 4, MotionLimits())
+    check_motion(still(), 1, MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0))
+    check_motion(still(vertices=1.5 * REST), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
 
 
 # --- populations --------------------------------------------------------------------------------
@@ -256,16 +215,19 @@ def closings(monkeypatch):
     """What valves would be closed with; every third of the anatomy ``other`` is refused."""
     calls = []
 
-    def close(name, template, values, settings, mechanics, tip_motion):
-        calls.append((name, template, values, settings, tip_motion))
-        if name.startswith("other") and len(calls) % 3 == 0:
-            raise RefusedError(name, "a test")
-        found = still(name)
+    def close(drawn, settings):
+        calls.append((drawn, settings))
+        if drawn.name.startswith("other") and len(calls) % 3 == 0:
+            raise RefusedError(drawn.name, "a test")
         # Something by which valves can be told apart.
-        return replace(found, vertices=found.vertices * values["E_f.anterior"])
+        return replace(still(drawn.name), vertices=still().vertices * drawn.values["E_f.anterior"])
 
     monkeypatch.setattr(population, "close_in_motion", close)
     return calls
+
+
+def population_of(count, seed, bases=BASES, **settings):
+    return tuple(draw_population(count, seed, bases, PopulationSettings(), MECHANICS, **settings))
 
 
 def same_shape(one, other):
@@ -273,10 +235,7 @@ def same_shape(one, other):
 
 
 def test_a_population_is_drawn_by_its_seed(closings):
-    def draw(seed, count=6):
-        return draw_population(count, seed, BASES, PopulationSettings(), MECHANICS)
-
-    one, same, other = draw(1), draw(1), draw(2)
+    one, same, other = (population_of(6, seed) for seed in (1, 1, 2))
     assert [v.name for v in one] == [v.name for v in same]
     assert sum(v.name.startswith("one") for v in one) == 3
     assert len({v.name for v in (*one, *other)}) == 12
@@ -288,31 +247,26 @@ def test_a_population_is_drawn_by_its_seed(closings):
 
 
 def test_refused_valves_are_drawn_again(closings):
-    seen = []
-    drawn = draw_population(
-        6, 1, BASES, PopulationSettings(), MECHANICS, progress=lambda k, v: seen.append((k, v.name))
-    )
-    assert seen == list(enumerate(v.name for v in drawn))
-    assert len(closings) > 6
-    again = [k for k in range(1, len(closings)) if closings[k][0] == closings[k - 1][0]]
+    assert len(population_of(6, 1)) == 6 < len(closings)
+    valves = [valve for valve, _ in closings]
+    again = [(a, b) for a, b in itertools.pairwise(valves) if a.name == b.name]
     assert again
-    for k in again:
-        assert closings[k][1].parameters != closings[k - 1][1].parameters
-        assert closings[k][2] != closings[k - 1][2]
+    for a, b in again:
+        assert a.template.parameters != b.template.parameters
+        assert a.values != b.values
 
 
 def test_a_valve_that_is_always_refused_is_an_error(monkeypatch):
-    def refuse(name, *_):
-        raise RefusedError(name, "a test")
+    def refuse(drawn, _):
+        raise RefusedError(drawn.name, "a test")
 
     monkeypatch.setattr(population, "close_in_motion", refuse)
     with pytest.raises(GeometryError, match="one_1_000: refused 20 times"):
-        draw_population(1, 1, {"one": BASES["one"]}, PopulationSettings(), MECHANICS)
+        population_of(1, 1, {"one": BASES["one"]})
 
 
-def test_what_is_drawn_spreads_as_it_is_told(closings):
-    settings = PopulationSettings(tip_motion=(1.0, 3.0))
-    draw_population(60, 4, {"one": BASES["one"]}, settings, MECHANICS)
+def test_what_is_drawn_spreads_as_requested(closings):
+    population_of(60, 4, {"one": BASES["one"]})
     assert len(closings) == 60
     for name, median, spread in (
         ("E_f.anterior", 6.23, 0.35),
@@ -320,39 +274,36 @@ def test_what_is_drawn_spreads_as_it_is_told(closings):
         ("pressure_scale", 1.0, 0.12),
         ("chord_rest_length", 1.0, 0.015),
     ):
-        found = np.log([values[name] / median for _, _, values, _, _ in closings])
+        found = np.log([valve.values[name] / median for valve, _ in closings])
         # Four standard errors of a mean, and of a spread.
         assert abs(found.mean()) < 4 * spread / np.sqrt(60)
         assert found.std() == pytest.approx(spread, rel=4 / np.sqrt(120))
-    durations = np.log([motion.duration / 0.35 for _, _, _, motion, _ in closings])
+    durations = np.log([settings.duration / 0.35 for _, settings in closings])
     assert durations.std() == pytest.approx(0.15, rel=4 / np.sqrt(120))
-    reach = np.linalg.norm([tips for *_, tips in closings], axis=2)
+    reach = np.linalg.norm([valve.tip_motion for valve, _ in closings], axis=2)
     assert 1.0 <= reach.min() < 1.3
     assert 2.7 < reach.max() <= 3.0
-    for _, template, _, _, tips in closings:
+    for valve, _ in closings:
         # Open tips are nearer to where their chordae insert.
-        chordae, closed = template.chordae(), template.papillary_tips
+        chordae, closed = valve.template.chordae(), valve.template.papillary_tips
         for k in range(2):
             towards = (chordae.insertion[chordae.tip == k] - closed[k]).mean(axis=0)
-            assert tips[k] @ towards > 0
+            assert valve.tip_motion[k] @ towards > 0
 
 
 def test_processes_change_nothing(monkeypatch):
-    def close(name, template, values, *_):
-        if values["E_f.anterior"] > 7:
-            raise RefusedError(name, "a test")
+    def close(drawn, _):
+        if drawn.values["E_f.anterior"] > 7:
+            raise RefusedError(drawn.name, "a test")
         # The first valve of two is the last to be ready.
-        time.sleep(0.05 * name.endswith("0"))
-        return replace(still(name), vertices=still().vertices * values["E_f.anterior"])
+        time.sleep(0.05 * drawn.name.endswith("0"))
+        return replace(still(drawn.name), vertices=still().vertices * drawn.values["E_f.anterior"])
 
     monkeypatch.setattr(population, "close_in_motion", close)
     config = joblib.parallel_config
     # Threads, as what is replaced here is not replaced in other processes.
     monkeypatch.setattr(joblib, "parallel_config", lambda **_: config(backend="threading"))
-    one, two = (
-        draw_population(8, 3, BASES, PopulationSettings(), MECHANICS, processes=processes)
-        for processes in (1, 2)
-    )
+    one, two = (population_of(8, 3, processes=processes) for processes in (1, 2))
     for a, b in zip(one, two, strict=True):
         assert a.name == b.name
         np.testing.assert_array_equal(a.vertices, b.vertices)
@@ -366,20 +317,13 @@ def test_what_goes_to_another_process_arrives_there(valve):
     assert back.layout == valve.layout
 
 
-@pytest.mark.parametrize(
-    ("count", "bases", "processes"), [(0, BASES, 1), (1, {}, 1), (1, BASES, 0)]
-)
-def test_a_population_of_nothing_is_an_error(count, bases, processes):
-    with pytest.raises(InputError, match="expected at least one of each"):
-        draw_population(count, 1, bases, PopulationSettings(), MECHANICS, processes=processes)
-
-
-@pytest.mark.parametrize(
-    "change", [{"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}, {"moduli_spread": -0.1}]
-)
-def test_settings_of_a_population_are_checked(change):
-    with pytest.raises(InputError, match=f"population {next(iter(change))}"):
-        PopulationSettings(**change)
+def test_settings_of_a_population_are_checked():
+    for count, bases, processes in ((0, BASES, 1), (1, {}, 1), (1, BASES, 0)):
+        with pytest.raises(InputError, match="expected at least one of each"):
+            population_of(count, 1, bases, processes=processes)
+    for change in ({"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}):
+        with pytest.raises(InputError, match=f"population {next(iter(change))}"):
+            PopulationSettings(**change)
 
 
 # --- files --------------------------------------------------------------------------------------
@@ -387,9 +331,8 @@ def test_settings_of_a_population_are_checked(change):
 
 @pytest.fixture
 def drawn():
-    first = replace(still("first"), chord_phi=np.array([1.0]), chord_s=np.ones(1),
-                    chord_tip=np.array([1]))  # fmt: skip
-    return first, still("second", frames=4)
+    one = {"chord_phi": np.array([1.0]), "chord_s": np.ones(1), "chord_tip": np.array([1])}
+    return replace(still("first"), **one), still("second", frames=4)
 
 
 def test_a_population_is_the_same_after_its_file(drawn, tmp_path):
@@ -404,11 +347,6 @@ def test_a_population_is_the_same_after_its_file(drawn, tmp_path):
             np.testing.assert_allclose(getattr(a, part), getattr(b, part), rtol=1e-6)
             assert getattr(b, part).dtype == np.float64
         np.testing.assert_array_equal(a.chord_tip, b.chord_tip)
-
-
-def test_a_file_that_cannot_be_written_is_said(drawn, tmp_path):
-    with pytest.raises(InputError, match="cannot write"):
-        save_population(tmp_path / "none" / "p.npz", drawn)
 
 
 @pytest.mark.parametrize(
@@ -437,14 +375,13 @@ def test_a_file_of_something_else_is_refused(drawn, tmp_path):
     path = tmp_path / "p.npz"
     with pytest.raises(InputError, match="is missing"):
         load_population(path)
-    for content in (b"", b"nothing", pickle.dumps([1, 2])):
+    with pytest.raises(InputError, match="cannot write"):
+        save_population(tmp_path / "none" / "p.npz", drawn)
+    save_population(path, drawn)
+    for content in (b"", b"nothing", pickle.dumps([1, 2]), path.read_bytes()[:2000]):
         path.write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             load_population(path)
-    save_population(path, drawn)
-    path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(InputError, match="cannot be read"):
-        load_population(path)
     np.savez(path, times=np.array([1.0]))
     with pytest.raises(InputError, match="'names' is missing"):
         load_population(path)
@@ -464,42 +401,26 @@ def made(monkeypatch):
     closure = MadeUpClosure(tuple(HIDDEN))
     rest = made_up_closure.VALVE.surface.vertices
 
-    def close(name, template, values, settings, mechanics, tip_motion):
-        assert values == HIDDEN
-        vertices = np.stack([rest * (1 - 0.01 * k) for k in range(4)])
-        tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * tip_motion
-        return ClosingFrames(vertices, tips, closure, np.zeros(1))
-
-    def model(template, seen, contact, values, simulation, mechanics):
-        np.testing.assert_allclose(contact.motion.papillary_tips[0] - TIP_MOTION,
-                                   contact.motion.papillary_tips[1])  # fmt: skip
-        return closure
+    def close(drawn, _):
+        assert drawn.values == HIDDEN
+        tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * drawn.tip_motion
+        return [rest * (1 - 0.01 * k) for k in range(4)], list(tips), closure
 
     monkeypatch.setattr(patients, "closing_frames", close)
-    monkeypatch.setattr(virtual_patient, "_model", model)
+    monkeypatch.setattr(virtual_patient, "_model", lambda *_: closure)
     wide = MotionLimits(2.0, 50.0, 50.0, 10.0, 100_000)
     displaced = dict.fromkeys(REGISTRATION, 3.0)
-    simulation = replace(SIMULATION, contact_columns=32, contact_rows=9)
-    return simulate_imaged_patient(
-        "p", TEMPLATE, {**HIDDEN, **displaced}, simulation, replace(SMALL, limits=wide), MECHANICS,
-        TIP_MOTION,
-    )  # fmt: skip
+    valve = drawn_valve("p", {**HIDDEN, **displaced})
+    return simulate_imaged_patient(valve, SIMULATION, replace(SMALL, limits=wide))
 
 
 def test_an_imaged_patient_is_closed_as_a_patient_and_nowhere_displaced(made):
-    assert made.closed == 3
-    assert made.pressure_mmHg == 100.0
-    assert made.values == HIDDEN
+    assert (made.closed, made.pressure_mmHg, made.values) == (3, 100.0, HIDDEN)
     rest = made_up_closure.VALVE.surface.vertices
-    np.testing.assert_array_equal(made.valve.vertices[0], rest)
-    np.testing.assert_array_equal(made.valve.vertices[1], 0.99 * rest)
     # The formula, not the coarse closed frame.
-    np.testing.assert_allclose(made.valve.vertices[3], made_up_closure.shape(HIDDEN, 100.0))
-    np.testing.assert_array_equal(made.valve.vertices[2], 0.98 * rest)
+    expected = [rest, 0.99 * rest, 0.98 * rest, made_up_closure.shape(HIDDEN, 100.0)]
+    np.testing.assert_allclose(made.valve.vertices[:4], expected)
     assert len(made.valve.vertices) == 5
-
-
-def test_an_imaged_patient_has_moving_tips_and_stated_chordae(made):
     closed = TEMPLATE.papillary_tips
     for frame, share in ((0, 1.0), (1, 2 / 3), (2, 1 / 3), (3, 0.0), (4, 0.2)):
         np.testing.assert_allclose(made.valve.tips[frame], closed + share * TIP_MOTION)
@@ -526,4 +447,4 @@ def test_chord_ratios_are_true_lengths_over_what_they_span_in_the_closed_valve(m
 def test_an_imaged_patient_is_in_equilibrium():
     moving = replace(MECHANICS, protocol=replace(MECHANICS.protocol, equilibrium=False))
     with pytest.raises(InputError, match="equilibrium = False, expected True"):
-        simulate_imaged_patient("p", TEMPLATE, HIDDEN, SIMULATION, SMALL, moving, TIP_MOTION)
+        simulate_imaged_patient(drawn_valve("p", HIDDEN, moving), SIMULATION, SMALL)

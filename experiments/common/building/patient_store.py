@@ -16,12 +16,13 @@ from mvest.problem.stored import Store
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
-from mvest.simulation.drawn_patient import (
+from mvest.simulation.virtual_patient import (
     PatientSettings,
+    VirtualPatient,
     draw_patient_values,
     first_that_closes,
+    simulate_patient,
 )
-from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
 
 HIDDEN, POSITIONS = "hidden.json", "positions.npz"

@@ -129,11 +129,15 @@ class ImagingStore:
         drawn, own = getattr(self.settings, which), self.settings
 
         def draw() -> tuple[MovingValve, ...]:
+            valves = []
             with PartBar(f"valves: {which}", drawn.count, "valve") as bar:
-                return draw_population(
+                for valve in draw_population(
                     drawn.count, drawn.seed, own.bases, own.population, self._mechanics,
-                    processes=own.processes, progress=lambda _number, _valve: bar.step(),
-                )  # fmt: skip
+                    processes=own.processes,
+                ):  # fmt: skip
+                    valves.append(valve)
+                    bar.step()
+            return tuple(valves)
 
         return self._valves(which).get_or_make(draw, save_population)
 

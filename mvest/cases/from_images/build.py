@@ -1,4 +1,4 @@
-"""The frames that are chosen of a sequence, and the case that they tell."""
+"""The frames that are chosen of a sequence, and the case that they make."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
-from mvest.cases.checks import (
+from mvest.cases.band import (
     CLOSING_PRESSURE,
     check_annulus_size,
     check_band,
@@ -18,6 +17,7 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
+from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.from_images.measures import Row, closed_frame
 from mvest.cases.tissue import GENERIC_THICKNESS, SEEN_CLOSURE, Places, lay_out_chordae
 from mvest.errors import GeometryError, InputError
@@ -138,7 +138,7 @@ def case_of_sequence(
     thickness_mm: Mapping[str, float] | None = None,
     error_samples: ErrorSamples | None = None,
 ) -> ValveCase:
-    """The case that a sequence tells.
+    """The case that the two frames of a sequence make.
 
     Thickness and fibres vary over a leaflet as they do in the template: that cannot be seen.
 
@@ -156,7 +156,7 @@ def case_of_sequence(
     Raises
     ------
     InputError, GeometryError
-        A surface is no valve: the message names the frame and says what is wrong.
+        A surface is no valve: the message names the frame and the fault.
     """
     layout = sequence.layout
     derived = list(frames.derived)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.cases.folder import PressureCurve, write_case
+from mvest.cases.folder import pressure_curve, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
 from mvest.cases.from_images.detector_errors import (
     samples_in_world,
@@ -106,6 +106,34 @@ class DetectedValve:
             *(() if self.settings.states_pressure else (NO_PRESSURE,)),
         )
 
+    def details(
+        self, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
+    ) -> dict[str, tuple[Mapping[str, Any], ...]]:
+        """Details for a record (`mvest.personalisation.record`).
+
+        ``image_step`` has one row about volume, frames, model and files beside the report,
+        ``image_frames`` the measures of each frame, ``pictures`` the ``file`` and ``caption`` of
+        each.
+        """
+        volume, frames = self.volume, self.frames
+        about = {
+            "volume": called(volume),
+            "sha256": volume.sha256,
+            "modality": volume.modality.value,
+            "shape": list(volume.frames.shape),
+            "spacing_mm": volume.spacing.tolist(),
+            "open_frame": frames.open,
+            "closed_frame": frames.closed,
+            "confidence": self.valve.frame_confidence.tolist(),
+            "unlike": self.unlike,
+            "model_sha256": self.model.sha256,
+            "trained_on": dict(self.model.trained_on),
+            "sentences": list(self.sentences),
+            "files": list(files),
+        }
+        rows = tuple(dict(row) for row in self.rows)
+        return {"image_step": (about,), "image_frames": rows, "pictures": tuple(pictures)}
+
 
 def called(volume: VolumeSequence) -> str:
     """A volume named by its content: files are often named after a patient."""
@@ -164,7 +192,7 @@ def detect_in_volume(
     pressure: Any = settings.pressure_mmHg
     if settings.pressure_curve is not None:
         table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
-        pressure = PressureCurve(*table.T)
+        pressure = pressure_curve(*table.T)
     elif estimate and pressure is None:
         raise InputError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
@@ -239,52 +267,10 @@ def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
     for frame in (detected.frames.open, detected.frames.closed):
         write_landmarks(images / f"valve_{frame:04d}.mrk.json", detected.valve, frame)
     files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.pvd"]
-    if detected.settings.states_pressure:
-        write_case(case, detected.case)
-        files.append(f"{CASE}/case.yaml")
-    return files
-
-
-def image_step(
-    detected: DetectedValve, files: Sequence[str], pictures: Sequence[Mapping[str, Any]]
-) -> dict[str, tuple[Mapping[str, Any], ...]]:
-    """Details of the image step for a record (`mvest.personalisation.record`).
-
-    Parameters
-    ----------
-    detected : DetectedValve
-    files : sequence of str
-        Files beside the report (`write_detected`).
-    pictures : sequence of mapping
-        ``file`` and ``caption`` of pictures beside it.
-
-    Returns
-    -------
-    dict
-        ``image_step``, one row about volume, frames, model and files; ``image_frames``: the
-        measures of each frame; ``pictures``.
-    """
-    volume, frames = detected.volume, detected.frames
-    about = {
-        "volume": called(volume),
-        "sha256": volume.sha256,
-        "modality": volume.modality.value,
-        "shape": list(volume.frames.shape),
-        "spacing_mm": volume.spacing.tolist(),
-        "open_frame": frames.open,
-        "closed_frame": frames.closed,
-        "confidence": detected.valve.frame_confidence.tolist(),
-        "unlike": detected.unlike,
-        "model_sha256": detected.model.sha256,
-        "trained_on": dict(detected.model.trained_on),
-        "sentences": list(detected.sentences),
-        "files": list(files),
-    }
-    return {
-        "image_step": (about,),
-        "image_frames": tuple(dict(row) for row in detected.rows),
-        "pictures": tuple(pictures),
-    }
+    if not detected.settings.states_pressure:
+        return files
+    write_case(case, detected.case)
+    return [*files, f"{CASE}/case.yaml"]
 
 
 def _model(

@@ -1,15 +1,15 @@
 """Errors of detectors on other valves: what is expected of them, and what they make of a case.
 
-Detectors are drawn to what they were trained on: what they are off by depends on how far from it a
-valve is, and so on what they find. The errors of S valves are regressed on the shapes in which
-these were found, linearly, with a penalty on the square of the coefficients that is chosen by
-leaving each valve out (ridge regression: Hoerl and Kennard, Technometrics 12, 1970; what is left of
-a valve that is left out, r / (1 - h): Allen, Technometrics 16, 1974). As a Gaussian process with a
-linear kernel (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sec. 2.1) it
-also says how much wider the error of one more valve varies about what is expected of it.
+Detectors are biased towards the valves that they were trained on. So their error depends on how far
+a valve is from these, and on the shape that they find. The errors of S valves are regressed
+linearly on the shapes that were found (ridge regression: Hoerl and Kennard, Technometrics 12,
+1970). The penalty is chosen by leaving each valve out; the error of prediction is then r / (1 - h)
+(Allen, Technometrics 16, 1974). As a Gaussian process with a linear kernel (Rasmussen and Williams,
+Gaussian Processes for Machine Learning, 2006, sec. 2.1) it also states how much wider the error of
+one more valve varies about its expectation.
 
-Valves and detectors are nearly alike in a mirror across the middle of the leaflets, so what is even
-in it and what is odd are regressed apart: neither tells of the other.
+Valves and detectors are nearly symmetric about the middle of the leaflets. So the even and the odd
+part of errors and shapes are regressed apart: neither tells of the other.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.stats import t as student_t
 
 from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.build import CaseFrames
-from mvest.cases.from_images.measures import Row, is_open
+from mvest.cases.from_images.measures import Row, finite_or_none, is_open
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -33,7 +33,7 @@ from mvest.typing import FloatArray
 from mvest.valve.measure.clinical import annulus_and_tips
 
 PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
-"""Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
+"""Those tried, over the mean variance of the shapes; at infinity the shape has no effect."""
 
 
 BANDED = (
@@ -47,7 +47,7 @@ BANDED = (
 """Measures that get a band: those of annulus and tips, which need no fine detail of leaflets.
 
 Detected leaflets are smoother than true ones, and differences between the two rougher than either:
-areas of leaflets that are moved by them would say more of the roughness than of the area.
+areas of leaflets that are moved by them would measure the roughness rather than the area.
 """
 
 
@@ -63,17 +63,17 @@ def _points(sequence: ValveSequence, frame: int) -> FloatArray:
 
 
 def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
-    """Errors of leaflets and, after them, tips ``(K, 2, n + 2, 3)`` mm, their shapes checked."""
-    errors, tips = accuracy.samples, accuracy.tip_samples
-    count, n = len(errors), layout.size
+    """Errors of leaflets and, after them, tips ``(S, 2, n + 2, 3)`` mm of two valves or more."""
+    count, n = len(accuracy.samples), layout.size
     if count < 2:
         raise InputError(f"errors of {count} valves, expected two samples or more")
-    if errors.shape != (count, 2, n, 3) or tips.shape != (count, 2, 2, 3):
+    shapes = accuracy.samples.shape, accuracy.tip_samples.shape
+    if shapes != ((count, 2, n, 3), (count, 2, 2, 3)):
         raise InputError(
-            f"errors of shape {errors.shape} and of tips {tips.shape}, expected (samples, 2, {n}, "
-            "3) and (samples, 2, 2, 3)"
+            f"errors of shape {shapes[0]} and of tips {shapes[1]}, expected (samples, 2, {n}, 3) "
+            "and (samples, 2, 2, 3)"
         )
-    return np.concatenate([errors, tips], axis=2)
+    return np.concatenate([accuracy.samples, accuracy.tip_samples], axis=2)
 
 
 def samples_in_world(
@@ -90,23 +90,14 @@ def samples_in_world(
     sequence : ValveSequence
     frames : CaseFrames
     errors : (K, 2, n + 2, 3) mm
-        Of leaflets and, after them, tips: found less true, in the axes of each valve, in its open
-        and its closed frame.
-
-    Raises
-    ------
-    InputError
-        They are not of this layout.
+        As from `without_expected_error`, in the axes of each valve, in its open and closed frame.
     """
-    points, count = sequence.layout.size + 2, len(errors)
-    if errors.shape[1:] != (2, points, 3):
-        raise InputError(f"errors of shape {errors.shape}, expected (samples, 2, {points}, 3)")
     moves = np.concatenate([errors, in_mirror(sequence.layout, errors)])
     which = [int(number != frames.open) for number in frames.in_order]
     axes = np.stack([valve_axes(sequence, number) for number in frames.in_order])
     # Where it may have been is where it was found less the error.
     moves = -np.einsum("fij,kfnj->kfni", axes, moves[:, which])
-    return ErrorSamples(moves[:, :, :-2], moves[:, :, -2:], np.tile(np.arange(count), 2))
+    return ErrorSamples(moves[:, :, :-2], moves[:, :, -2:], np.tile(np.arange(len(errors)), 2))
 
 
 def without_expected_error(
@@ -120,23 +111,26 @@ def without_expected_error(
     -------
     sequence : ValveSequence
     errors : (K, 2, n + 2, 3) mm
-        Of leaflets and, after them, tips, as wide as is stated of a volume of this confidence.
+        Of leaflets and, after them, tips: found less true. They are as wide as is stated of a
+        volume of this confidence.
 
     Raises
     ------
     InputError
         The errors are not of this layout, or of fewer than two valves.
     """
+    numbers = frames.open, frames.closed
+    axes = [valve_axes(sequence, number) for number in numbers]
     shape = np.stack(
         [
-            (_points(sequence, n) - sequence.annulus[n].mean(axis=0)) @ valve_axes(sequence, n)
-            for n in (frames.open, frames.closed)
+            (_points(sequence, number) - sequence.annulus[number].mean(axis=0)) @ own
+            for number, own in zip(numbers, axes, strict=True)
         ]
     )
     expected, samples = _expected_error(sequence.layout, accuracy, shape)
     vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
-    for number in frames.in_order:
-        off = expected[int(number != frames.open)] @ valve_axes(sequence, number).T
+    for number, own, error in zip(numbers, axes, expected, strict=True):
+        off = error @ own.T
         vertices[number] -= off[:-2]
         tips[number] -= off[-2:]
     samples *= accuracy.factor(sequence.confidence)
@@ -177,18 +171,20 @@ def with_bands(
     reach = float(student_t.ppf(0.975, count - 1)) * np.sqrt(1.0 + 1.0 / count)
     banded = []
     for t, row in enumerate(rows):
-        bounds: Row = dict.fromkeys(f"{name}_{end}" for name in BANDED for end in ("low", "high"))
+        again = []
         if row[BANDED[0]] is not None:
-            which, axes = (0 if is_open(row) else 1), valve_axes(sequence, t)
-            moved = _points(sequence, t) - errors[:, which] @ axes.T
-            again = [annulus_and_tips(x[:-2], sequence.layout, x[annulus], x[-2:]) for x in moved]
-            for name in BANDED:
-                values = np.array([one.get(name, np.nan) for one in again], dtype=np.float64)
-                middle, half = values.mean(), reach * values.std(ddof=1)
-                if np.isfinite(half):
-                    bounds[f"{name}_low"] = float(middle - half)
-                    bounds[f"{name}_high"] = float(middle + half)
-        banded.append(dict(row) | bounds)
+            off = errors[:, 0 if is_open(row) else 1] @ valve_axes(sequence, t).T
+            again = [
+                annulus_and_tips(x[:-2], sequence.layout, x[annulus], x[-2:])
+                for x in _points(sequence, t) - off
+            ]
+        bounds: Row = {}
+        for name in BANDED:
+            values = np.array([one.get(name, np.nan) for one in again] or [np.nan] * count)
+            middle, half = values.mean(), reach * values.std(ddof=1)
+            bounds[f"{name}_low"] = finite_or_none(middle - half)
+            bounds[f"{name}_high"] = finite_or_none(middle + half)
+        banded.append(row | bounds)
     return banded
 
 
@@ -250,14 +246,14 @@ def _expected_error(
 ) -> tuple[FloatArray, FloatArray]:
     """`error_at_shape` by the detectors' accuracy in a volume of confidence 1."""
     errors = _errors_of(layout, accuracy)
-    shapes = None
-    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
-        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
+    if accuracy.shapes is None or accuracy.tip_shapes is None:
+        return error_at_shape(layout, errors, np.zeros_like(errors), np.zeros_like(shape))
+    shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
     return error_at_shape(layout, errors, shapes, shape)
 
 
 def error_at_shape(
-    layout: ValveLayout, errors: FloatArray, shapes: FloatArray | None, shape: FloatArray
+    layout: ValveLayout, errors: FloatArray, shapes: FloatArray, shape: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """The error that is expected where a valve is found so, and how it may vary about that.
 
@@ -266,9 +262,8 @@ def error_at_shape(
     layout : ValveLayout
     errors : (S, F, n + 2, 3) mm
         Of leaflets and, after them, papillary tips, of S >= 2 other valves in F frames.
-    shapes : (S, F, n + 2, 3) mm, optional
-        Where these valves were found, in the axes of each. None: not known, and nothing is learned
-        of them.
+    shapes : (S, F, n + 2, 3) mm
+        Where these valves were found, in the axes of each; nothing is learned of equal ones.
     shape : (F, n + 2, 3) mm
         Where the valve was found, in its own axes.
 
@@ -277,10 +272,8 @@ def error_at_shape(
     expected : (F, n + 2, 3) mm
     samples : (S, F, n + 2, 3) mm
         The other valves' errors about what is expected of each, as large as those of one more valve
-        of this shape: without shapes, sqrt((S + 1) / (S - 1)) times those about the mean.
+        of this shape: for equal shapes, sqrt((S + 1) / (S - 1)) times those about the mean.
     """
-    if shapes is None:
-        shapes, shape = np.zeros_like(errors), np.zeros_like(shape)
     expected, samples = np.zeros_like(shape), np.zeros_like(errors)
     for sign in (1.0, -1.0):
         e, z, own = (

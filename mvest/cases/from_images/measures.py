@@ -77,12 +77,12 @@ def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
         row: Row = {
             "frame": t,
             "time_s": float(time),
-            "confidence": _finite(sequence.frame_confidence[t]),
-            "vertex_confidence_mean": _finite(sequence.vertex_confidence[t].mean()),
+            "confidence": finite_or_none(sequence.frame_confidence[t]),
+            "vertex_confidence_mean": finite_or_none(sequence.vertex_confidence[t].mean()),
             "contact_distance_mm": reach,
         }
         measured = _measured(sequence, t, reach)
-        rows.append(row | {name: _finite(measured.get(name)) for name in names})
+        rows.append(row | {name: finite_or_none(measured.get(name)) for name in names})
     return rows
 
 
@@ -98,12 +98,13 @@ def _measured(sequence: ValveSequence, t: int, reach: float) -> Mapping[str, flo
 
 
 def is_open(measures: Mapping[str, float | None]) -> bool:
-    """Whether a valve of these measures is open, or cannot be told to be closed."""
+    """Whether a valve of these measures is open, or not known to be closed."""
     orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
     return orifice is None or area is None or orifice >= OPEN_SHARE * area
 
 
-def _finite(value: Any) -> float | None:
+def finite_or_none(value: Any) -> float | None:
+    """A number, or None for what is none."""
     return float(value) if value is not None and np.isfinite(value) else None
 
 

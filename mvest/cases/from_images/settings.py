@@ -1,4 +1,4 @@
-"""What the file of a volume does not say of the case in it."""
+"""What a case needs that the file of a volume does not state."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ImagedSettings:
     model : str or None
         File of the detection model; None: the one for ultrasound that comes with the package.
     modality : str or None
-        ``ultrasound``, ``ct`` or ``mr``, where the file does not say.
+        ``ultrasound``, ``ct`` or ``mr``, where the file does not state it.
     frame_interval_s : float or None
         Where the file states no times.
     time_unit : str or None

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mvest.cases.band import commissures, directed
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
-from mvest.cases.rims import commissures, directed
 from mvest.cases.schema import CASE_FILE
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mvest.cases.rims import loop_vector_area, two_loops, without_ears
+from mvest.cases.band import loop_vector_area, two_loops, without_ears
 from mvest.cases.tissue import LeafletBand
 from mvest.errors import GeometryError
 from mvest.exchange.surfaces import Surface, merged

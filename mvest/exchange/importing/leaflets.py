@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from mvest.cases.band import LARGEST_THICKNESS
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.checks import LARGEST_THICKNESS
 from mvest.cases.frames import MM_PER
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflet_parts import (

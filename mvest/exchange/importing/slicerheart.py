@@ -12,8 +12,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from mvest.cases.band import two_loops
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.rims import two_loops
 from mvest.cases.tissue import FAMILIES, GENERIC_THICKNESS
 from mvest.errors import InputError
 from mvest.exchange.importing.joining import (

@@ -20,7 +20,7 @@ SMALL = ValveLayout(8, 3)
 POINTS = SMALL.size + 2
 
 
-def world(seed, count, noise, law=0.0):
+def made_up(seed, count, noise, law=0.0):
     """Shapes of five modes and a large mean, and errors that follow them by a law, with noise."""
     rng = np.random.default_rng(seed)
     modes = rng.normal(size=(5, 2, POINTS, 3))
@@ -46,7 +46,7 @@ def test_a_mirror_swaps_sides_and_is_undone_by_itself():
 
 def test_an_error_that_follows_the_shape_is_known_of_one_more_valve():
     # Penalties that are all too large; even and odd mixed up; a mean that is left out or doubled.
-    shapes, errors, _ = world(1, 41, noise=1e-3, law=1.0)
+    shapes, errors, _ = made_up(1, 41, noise=1e-3, law=1.0)
     expected, samples = error_at_shape(SMALL, errors[1:], shapes[1:], shapes[0])
     assert errors[1:].std() > 1.0
     assert np.abs(expected - errors[0]).max() < 0.05
@@ -54,7 +54,7 @@ def test_an_error_that_follows_the_shape_is_known_of_one_more_valve():
 
 
 def test_what_is_stated_covers_the_errors_of_further_valves():
-    shapes, errors, _ = world(3, 60, noise=1.0, law=0.5)
+    shapes, errors, _ = made_up(3, 60, noise=1.0, law=0.5)
     n, own = SMALL.size, slice(0, 40)
     std = (errors[own, :, :n] - errors[own, :, :n].mean(axis=0)).std(axis=(0, 1, 3))
     accuracy = DetectionAccuracy(
@@ -76,12 +76,11 @@ def test_what_is_stated_covers_the_errors_of_further_valves():
 
 
 def test_what_no_shape_tells_varies_about_the_mean_as_one_more_valve_does():
-    shapes, errors, _ = world(2, 7, noise=1.0)
-    for known in (None, np.zeros_like(shapes)):
-        expected, samples = error_at_shape(SMALL, errors, known, shapes[0])
-        np.testing.assert_allclose(expected, errors.mean(axis=0), atol=1e-12)
-        about = errors - errors.mean(axis=0)
-        np.testing.assert_allclose(samples, np.sqrt(8 / 6) * about, atol=1e-12)
+    shapes, errors, _ = made_up(2, 7, noise=1.0)
+    expected, samples = error_at_shape(SMALL, errors, np.zeros_like(shapes), shapes[0])
+    np.testing.assert_allclose(expected, errors.mean(axis=0), atol=1e-12)
+    about = errors - errors.mean(axis=0)
+    np.testing.assert_allclose(samples, np.sqrt(8 / 6) * about, atol=1e-12)
 
 
 @pytest.mark.parametrize("law", [0.0, 0.3, 2.0])
@@ -89,7 +88,7 @@ def test_samples_are_as_wide_as_the_error_of_one_more_valve(law):
     # Residuals that were fitted, taken for errors; a width that the shape does not widen.
     square, stated, plain = [], [], []
     for seed in range(40):
-        shapes, errors, _ = world(seed, 25, noise=1.0, law=law)
+        shapes, errors, _ = made_up(seed, 25, noise=1.0, law=law)
         expected, samples = error_at_shape(SMALL, errors[1:], shapes[1:], shapes[0])
         square.append(((errors[0] - expected) ** 2).mean())
         stated.append((samples**2).mean())
@@ -100,14 +99,14 @@ def test_samples_are_as_wide_as_the_error_of_one_more_valve(law):
 
 
 def test_a_valve_that_is_found_elsewhere_than_all_others_is_less_sure():
-    shapes, errors, _ = world(3, 30, noise=0.3, law=1.0)
+    shapes, errors, _ = made_up(3, 30, noise=0.3, law=1.0)
     near, far = shapes.mean(axis=0), shapes.mean(axis=0) + 5 * (shapes[0] - shapes.mean(axis=0))
     width = [error_at_shape(SMALL, errors, shapes, at)[1].std() for at in (near, far)]
     assert width[1] > 1.3 * width[0]
 
 
 def test_the_expected_error_is_taken_off_in_the_axes_of_the_valve():
-    # Taken off in the world's axes; shapes compared in axes that are not the valve's own.
+    # Taken off in the image's axes; shapes compared in axes that are not the valve's own.
     rng = np.random.default_rng(4)
     seen = sequence(TURN, (3.0, -8.0, 20.0))
     n, factor = LAYOUT.size, 1.2 * np.exp(0.5 * (1.0 - seen.confidence))
@@ -126,15 +125,22 @@ def test_the_expected_error_is_taken_off_in_the_axes_of_the_valve():
         np.ones(n), 9.0, errors[:, :, :n], errors[:, :, n:], (1.2, 0.5),
         shapes=shapes[:, :, :n], tip_shapes=shapes[:, :, n:],
     )  # fmt: skip
-    found, about = without_expected_error(seen, FRAMES, accuracy)
-    for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
-        axes = valve_axes(seen, number)
-        off = (seen.vertices[number] - found.vertices[number]) @ axes
-        np.testing.assert_allclose(off, 1.5 * follows[which, :n], atol=0.05)
-        off = (seen.tips[number] - found.tips[number]) @ axes
-        np.testing.assert_allclose(off, 1.5 * follows[which, n:], atol=0.05)
-    one = replace(accuracy, widening=(1.0, 0.0))
-    _, plain = without_expected_error(seen, FRAMES, one)
-    np.testing.assert_allclose(about, factor * plain)
-    with pytest.raises(InputError, match="errors of shape"):
-        without_expected_error(seen, FRAMES, replace(accuracy, samples=errors[:, :, :5]))
+    mean = replace(accuracy, shapes=None, tip_shapes=None)
+    for known, expected in ((accuracy, 1.5 * follows), (mean, errors.mean(axis=0))):
+        found, about = without_expected_error(seen, FRAMES, known)
+        for number, off in zip((FRAMES.open, FRAMES.closed), expected, strict=True):
+            axes = valve_axes(seen, number)
+            moved = (seen.vertices[number] - found.vertices[number]) @ axes
+            np.testing.assert_allclose(moved, off[:n], atol=0.05)
+            moved = (seen.tips[number] - found.tips[number]) @ axes
+            np.testing.assert_allclose(moved, off[n:], atol=0.05)
+        # Other frames are left as they are.
+        np.testing.assert_array_equal(found.vertices[1], seen.vertices[1])
+        _, plain = without_expected_error(seen, FRAMES, replace(known, widening=(1.0, 0.0)))
+        np.testing.assert_allclose(about, factor * plain)
+    for wrong, message in (
+        (replace(accuracy, samples=errors[:, :, :5]), "errors of shape"),
+        (replace(accuracy, samples=errors[:1, :, :n]), "errors of 1 valves"),
+    ):
+        with pytest.raises(InputError, match=message):
+            without_expected_error(seen, FRAMES, wrong)

@@ -9,15 +9,10 @@ from scipy.spatial.transform import Rotation
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence, choose_frames
-from mvest.cases.from_images.detector_errors import (
-    samples_in_world,
-    valve_axes,
-    without_expected_error,
-)
+from mvest.cases.from_images.detector_errors import samples_in_world, valve_axes
 from mvest.cases.from_images.measures import measure_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
 from mvest.errors import GeometryError, InputError
-from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.valve.anatomy.template import Template
@@ -31,10 +26,7 @@ TEXTS = {
     "simulated": True,
 }  # fmt: skip
 FRAMES = CaseFrames(0, 2, 118.0)
-TURN = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix()
-
-
-HERE = np.eye(3)
+TURN, HERE = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.eye(3)
 
 
 def sequence(turn=HERE, origin=(0.0, 0.0, 0.0)):
@@ -42,16 +34,10 @@ def sequence(turn=HERE, origin=(0.0, 0.0, 0.0)):
     x = valve.surface.vertices
     shapes = np.stack([closing(x, share) for share in (0.0, 0.5, 1.0, 0.9)])
     tips = np.repeat(valve.papillary_tips[None], 4, axis=0)
-    return ValveSequence(
-        LAYOUT,
-        np.array([0.0, 0.04, 0.1, 0.14]),
-        shapes @ turn.T + origin,
-        tips @ turn.T + origin,
-        np.array([0.9, 0.8, 0.85, 0.9]),
-        np.ones((4, LAYOUT.size)),
-        np.linspace(0.4, 0.8, LAYOUT.size),
-        9.0,
-    )
+    times, confidence = np.array([0.0, 0.04, 0.1, 0.14]), np.array([0.9, 0.8, 0.85, 0.9])
+    placed = shapes @ turn.T + origin, tips @ turn.T + origin
+    known = np.ones((4, LAYOUT.size)), np.linspace(0.4, 0.8, LAYOUT.size), 9.0
+    return ValveSequence(LAYOUT, times, *placed, confidence, *known)
 
 
 def test_the_case_is_that_of_the_frames_and_passes_the_checks_of_a_folder(tmp_path):
@@ -78,6 +64,10 @@ def test_the_case_is_that_of_the_frames_and_passes_the_checks_of_a_folder(tmp_pa
     np.testing.assert_allclose((case.chordae.rest_length / spans)[by_closed], slack[by_closed])
     np.testing.assert_array_equal(case.uncertainty.std_mm, sequence().std_mm)
     assert_equal(read_case(write_case(tmp_path / "case", case)), case, "sha256", "derived")
+    # What was seen last may be the open valve.
+    case = case_of_sequence(sequence(), CaseFrames(3, 2, 100.0), TEXTS)
+    assert [frame.role for frame in case.frames] == [Role.CLOSED, Role.REFERENCE]
+    np.testing.assert_array_equal(case.surface.vertices, sequence().vertices[3])
 
 
 def test_a_case_does_not_depend_on_how_the_patient_lies():
@@ -109,29 +99,6 @@ def test_thickness_and_fibres_vary_as_in_the_template():
     assert thicker.surface.thickness[middle] == pytest.approx(2.64)
 
 
-def test_errors_go_with_what_they_are_in_a_mirror():
-    rng = np.random.default_rng(0)
-    errors, tips = rng.standard_normal((4, 2, LAYOUT.size, 3)), rng.standard_normal((4, 2, 2, 3))
-    seen = sequence()
-    found = samples_in_world(seen, FRAMES, np.concatenate([errors, tips], axis=2))
-    np.testing.assert_array_equal(found.source, [0, 1, 2, 3, 0, 1, 2, 3])
-    axes = valve_axes(seen, 2)
-    own, mirrored = found.vertices[:4, 1] @ axes, found.vertices[4:, 1] @ axes
-    np.testing.assert_allclose(own, -errors[:, 1], atol=1e-9)
-    # x runs between the commissures: what was seen at 45 degrees is mirrored to 135.
-    for phi, other in ((45.0, 135.0), (225.0, 315.0), (0.0, 180.0), (90.0, 90.0)):
-        here, there = LAYOUT.vertex(phi, 4), LAYOUT.vertex(other, 4)
-        np.testing.assert_allclose(mirrored[:, there], own[:, here] * [-1, 1, 1], atol=1e-9)
-    tips_found = found.tips[:, 1] @ axes
-    np.testing.assert_allclose(tips_found[4:, 0], tips_found[:4, 1] * [-1, 1, 1], atol=1e-9)
-
-
-def test_what_was_seen_last_may_be_the_open_valve():
-    case = case_of_sequence(sequence(), CaseFrames(3, 2, 100.0), TEXTS)
-    assert [frame.role for frame in case.frames] == [Role.CLOSED, Role.REFERENCE]
-    np.testing.assert_array_equal(case.surface.vertices, sequence().vertices[3])
-
-
 def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
     seen = sequence()
     rows = measure_sequence(seen, 1.3)
@@ -152,56 +119,27 @@ def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
         choose_frames(seen, rows, 120.0, closed=4)
 
 
-def test_axes_are_those_of_a_moving_valve():
-    np.testing.assert_allclose(valve_axes(sequence(), 0), np.eye(3), atol=0.05)
-    turned = valve_axes(sequence(TURN), 0)
-    np.testing.assert_allclose(turned, TURN @ valve_axes(sequence(), 0), atol=1e-9)
-    assert np.linalg.det(turned) == pytest.approx(1.0)
-
-
-def test_errors_become_displacements_back_to_where_it_may_have_been():
-    errors = np.zeros((4, 2, LAYOUT.size, 3))
-    errors[1, 0, :, 2] = 0.7  # found towards the atrium, in the open frame
-    tips = np.zeros((4, 2, 2, 3))
-    tips[2, 1, 0, 0] = 1.5
-    seen = sequence(TURN)
+def test_errors_become_displacements_back_to_where_it_may_have_been_and_so_in_a_mirror():
+    rng, seen = np.random.default_rng(0), sequence(TURN)
+    errors, tips = rng.standard_normal((4, 2, LAYOUT.size, 3)), rng.standard_normal((4, 2, 2, 3))
     found = samples_in_world(seen, FRAMES, np.concatenate([errors, tips], axis=2))
-    assert found.vertices.shape == (8, 2, LAYOUT.size, 3)
-    atrium = valve_axes(seen, 0)[:, 2]
-    np.testing.assert_allclose(found.vertices[1, 0], np.tile(-0.7 * atrium, (LAYOUT.size, 1)))
-    across = valve_axes(seen, 2)[:, 0]
-    np.testing.assert_allclose(found.tips[2, 1, 0], -1.5 * across)
+    np.testing.assert_array_equal(found.source, [0, 1, 2, 3, 0, 1, 2, 3])
+    # Axes are those of a moving valve.
+    np.testing.assert_allclose(valve_axes(sequence(), 0), np.eye(3), atol=0.05)
+    for which, number in enumerate((FRAMES.open, FRAMES.closed)):
+        axes = valve_axes(seen, number)
+        np.testing.assert_allclose(axes, TURN @ valve_axes(sequence(), number), atol=1e-9)
+        own, mirrored = found.vertices[:4, which] @ axes, found.vertices[4:, which] @ axes
+        np.testing.assert_allclose(own, -errors[:, which], atol=1e-9)
+        # x runs between the commissures: what was seen at 45 degrees is mirrored to 135.
+        for phi, other in ((45.0, 135.0), (225.0, 315.0), (0.0, 180.0), (90.0, 90.0)):
+            here, there = LAYOUT.vertex(phi, 4), LAYOUT.vertex(other, 4)
+            np.testing.assert_allclose(mirrored[:, there], own[:, here] * [-1, 1, 1], atol=1e-9)
+        moved = found.tips[:, which] @ axes
+        np.testing.assert_allclose(moved[:4], -tips[:, which], atol=1e-9)
+        np.testing.assert_allclose(moved[4:, 0], moved[:4, 1] * [-1, 1, 1], atol=1e-9)
     case = case_of_sequence(seen, FRAMES, TEXTS, error_samples=found)
     assert case.error_samples is found
-    with pytest.raises(InputError, match="errors of shape"):
-        samples_in_world(seen, FRAMES, errors[:, :, :5])
-
-
-def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
-    # A bias that is left in, taken off twice (valve and samples), or in the world's axes.
-    rng = np.random.default_rng(3)
-    bias, tip_bias = rng.normal(size=(2, LAYOUT.size, 3)), rng.normal(size=(2, 2, 3))
-    spread = rng.normal(size=(6, 2, LAYOUT.size, 3))
-    spread -= spread.mean(axis=0)
-    tip_spread = rng.normal(size=(6, 2, 2, 3))
-    tip_spread -= tip_spread.mean(axis=0)
-    seen = sequence(TURN)
-    accuracy = DetectionAccuracy(np.ones(LAYOUT.size), 9.0, bias + spread, tip_bias + tip_spread)
-    found, errors = without_expected_error(seen, FRAMES, accuracy)
-    for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
-        axes = valve_axes(seen, number)
-        off = (seen.vertices[number] - found.vertices[number]) @ axes
-        np.testing.assert_allclose(off, bias[which], atol=1e-9)
-        off = (seen.tips[number] - found.tips[number]) @ axes
-        np.testing.assert_allclose(off, tip_bias[which], atol=1e-9)
-    about = np.concatenate([spread, tip_spread], axis=2)
-    np.testing.assert_allclose(errors, np.sqrt(7 / 5) * about, atol=1e-9)
-    untouched = set(range(len(seen.times))) - set(FRAMES.in_order)
-    for number in untouched:
-        np.testing.assert_array_equal(found.vertices[number], seen.vertices[number])
-    alone = replace(accuracy, samples=bias[None], tip_samples=tip_bias[None])
-    with pytest.raises(InputError, match="errors of 1 valves"):
-        without_expected_error(seen, FRAMES, alone)
 
 
 def test_vertices_that_were_never_measured_have_no_weight():
@@ -215,30 +153,19 @@ def test_vertices_that_were_never_measured_have_no_weight():
         case_of_sequence(replace(seen, std_mm=np.full(LAYOUT.size, np.nan)), FRAMES, TEXTS)
 
 
-def broken(change, frame=0):
-    seen = sequence()
-    vertices = np.array(seen.vertices)
-    change(vertices[frame])
-    return replace(seen, vertices=vertices)
-
-
-def fold(x):
-    x[LAYOUT.vertex(90.0, 4)] = x[LAYOUT.vertex(270.0, 4)] + [0.0, -4.0, 0.0]
-
-
-def spoil(x):
-    x[5] = np.nan
-
-
 def test_a_surface_that_is_no_valve_is_refused_with_its_frame():
-    with pytest.raises(GeometryError, match="open frame 0: "):
-        case_of_sequence(broken(fold), FRAMES, TEXTS)
-    with pytest.raises(GeometryError, match="closed frame 2: a position is not finite"):
-        case_of_sequence(broken(spoil, 2), FRAMES, TEXTS)
-    seen = sequence()
-    above = replace(seen, tips=seen.tips + np.array([0.0, 0.0, 60.0]))
-    with pytest.raises(GeometryError, match=r"open frame 0: tip 0 .* above the annulus"):
-        case_of_sequence(above, FRAMES, TEXTS)
+    folded, spoilt, above = sequence(), sequence(), sequence()
+    x = folded.vertices[0]
+    x[LAYOUT.vertex(90.0, 4)] = x[LAYOUT.vertex(270.0, 4)] + [0.0, -4.0, 0.0]
+    spoilt.vertices[2, 5] = np.nan
+    above.tips[...] += [0.0, 0.0, 60.0]
+    for seen, message in (
+        (folded, "open frame 0: "),
+        (spoilt, "closed frame 2: a position is not finite"),
+        (above, "open frame 0: tip 0 .* above the annulus"),
+    ):
+        with pytest.raises(GeometryError, match=message):
+            case_of_sequence(seen, FRAMES, TEXTS)
 
 
 def test_frames_and_pressures_that_are_none_are_refused():

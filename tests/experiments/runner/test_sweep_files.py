@@ -21,7 +21,7 @@ from experiments.runner.plugins import register_plugins
 from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
 from mvest.problem.record import EstimateRecord
-from mvest.simulation.drawn_patient import PatientSettings
+from mvest.simulation.virtual_patient import PatientSettings
 from tests.places import CONF
 
 SWEEPS = ("initial_guess", "covariance", "noise", "discrepancy", "filter")

@@ -27,7 +27,7 @@ from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, Verdict
 from mvest.reporting.tables import table
-from mvest.simulation.drawn_patient import PatientSettings
+from mvest.simulation.virtual_patient import PatientSettings
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import a_result
 

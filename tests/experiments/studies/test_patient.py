@@ -18,8 +18,7 @@ from experiments.studies.patient import Settings, check_patient, reveal, run_pat
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.problem.verdict import ONE_STATE
-from mvest.simulation.drawn_patient import PatientSettings
-from mvest.simulation.virtual_patient import VirtualPatient
+from mvest.simulation.virtual_patient import PatientSettings, VirtualPatient
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up_patients import a_result
 from tests.made_up_closure import TRUE, made_up_case, use

@@ -1,12 +1,16 @@
-"""The two edges of a leaflet band, its commissures and ears, and matching one annulus to another.
+"""A band of leaflets: its boundary loops, commissures and ears, and what must hold of it.
 
 All loops run in the direction of their triangles. With normals towards the ventricle in both
-frames, two such loops run alike, so that commissures differ by which region begins there.
+frames, two such loops have the same direction, so that commissures differ by which region begins
+there.
 
 Ears are triangles that lie on an edge of the band with all three corners. Decimation and remeshing
 leave them. The coordinate from annulus to free edge, from which fibres and chordae are laid out,
 does not vary in them. Turning the edge that an ear shares with its neighbour cures it without
 moving a vertex.
+
+Each check raises one error for the first fault: what is wrong and what would be right. The reader
+of a case puts file and field before it.
 """
 
 from __future__ import annotations
@@ -15,14 +19,27 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import pdist
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from mvest.valve.geometry.triangles import directed_edges
+from mvest.valve.geometry.triangles import directed_edges, surface_edges
+
+ANNULUS_DIAMETER = (15.0, 80.0)
+"""mm, largest extent of an annulus between a small child's and the most dilated adult's."""
+CLOSING_PRESSURE = (20.0, 250.0)
+"""mmHg, transmitral pressure on a closed valve."""
+LARGEST_THICKNESS = 5.0
+"""mm."""
+FARTHEST_TIP = 100.0
+"""mm from the centre of the annulus."""
 
 
-class Rims(NamedTuple):
+class Loops(NamedTuple):
     """The two boundary loops of a band, as vertices in the order of the loop."""
 
     annulus: IntArray
@@ -36,13 +53,13 @@ def loop_vector_area(points: FloatArray) -> FloatArray:
     return area
 
 
-def find_rims(
+def find_loops(
     vertices: FloatArray,
     triangles: IntArray,
     tips: FloatArray,
     annulus: IntArray | None = None,
     free_edge: IntArray | None = None,
-) -> Rims:
+) -> Loops:
     """Name the two boundary loops of a band.
 
     The free edge is the loop nearer to the papillary tips (mean distance of its vertices from
@@ -55,29 +72,32 @@ def find_rims(
         is the wider one, as if the tips lay on the atrial side.
     """
     loops = two_loops(vertices, triangles)
-    if annulus is None and free_edge is None:
-        distance = [
-            np.linalg.norm(vertices[loop][:, None] - tips, axis=2).min(axis=1).mean()
-            for loop in loops
-        ]
-        near = int(np.argmin(distance))
-        area = [np.linalg.norm(loop_vector_area(vertices[loop])) for loop in loops]
-        if area[near] > area[1 - near]:
-            raise GeometryError(
-                f"the papillary tips are nearest to the wider edge of the surface (which encloses "
-                f"{area[near]:.0f} mm^2, the other {area[1 - near]:.0f} mm^2), so they seem to lie "
-                f"above the annulus, on the atrial side; correct papillary_tips, or name the "
-                f"annulus if this is right"
-            )
-        return Rims(loops[1 - near], loops[near])
     outer = None if annulus is None else _which("annulus", annulus, loops)
     inner = None if free_edge is None else _which("free_edge", free_edge, loops)
+    if inner is None:
+        inner = _nearer_to_tips(vertices, tips, loops) if outer is None else 1 - outer
+    outer = 1 - inner if outer is None else outer
     if outer == inner:
         raise GeometryError("annulus and free_edge are the same boundary loop; expected both loops")
-    return Rims(
-        loops[1 - inner] if annulus is None and inner is not None else np.asarray(annulus),
-        loops[1 - outer] if free_edge is None and outer is not None else np.asarray(free_edge),
+    return Loops(
+        loops[outer] if annulus is None else np.asarray(annulus),
+        loops[inner] if free_edge is None else np.asarray(free_edge),
     )
+
+
+def _nearer_to_tips(vertices: FloatArray, tips: FloatArray, loops: list[IntArray]) -> int:
+    """Number of the loop that is nearer to the papillary tips and must be the smaller one."""
+    curves = [vertices[loop] for loop in loops]
+    away = [np.linalg.norm(x[:, None] - tips, axis=2).min(axis=1).mean() for x in curves]
+    near, area = int(np.argmin(away)), [np.linalg.norm(loop_vector_area(x)) for x in curves]
+    if area[near] > area[1 - near]:
+        raise GeometryError(
+            f"the papillary tips are nearest to the wider edge of the surface (which encloses "
+            f"{area[near]:.0f} mm^2, the other {area[1 - near]:.0f} mm^2), so they seem to lie "
+            f"above the annulus, on the atrial side; correct papillary_tips, or name the annulus "
+            f"if this is right"
+        )
+    return near
 
 
 def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
@@ -306,3 +326,125 @@ def _turn(
             owner.update(dict.fromkeys(_edges(triangle), t))
         return True
     return False
+
+
+# -- checks ---------------------------------------------------------------------------------------
+def check_band(vertices: FloatArray, triangles: IntArray, *, self_intersections: bool) -> None:
+    """Raise unless a surface is a band: connected, oriented, two boundary loops and no handle.
+
+    Every vertex must belong to a triangle.
+    """
+    check_surface(vertices, triangles, self_intersections=False)
+    unused = np.setdiff1d(np.arange(len(vertices)), triangles)
+    if len(unused):
+        raise GeometryError(
+            f"vertices {unused[:5].tolist()} ({len(unused)} in all) belong to no triangle; remove "
+            "them"
+        )
+    edges = surface_edges(triangles)
+    n = len(vertices)
+    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
+    pieces, label = connected_components(graph, directed=False)
+    if pieces > 1:
+        sizes = np.bincount(label).tolist()
+        raise GeometryError(
+            f"{pieces} pieces that do not touch ({', '.join(map(str, sizes[:5]))} vertices); "
+            "expected one surface round the valve, its parts sharing the vertices of their seams"
+        )
+    # Last, since parts with double vertices along their seams pass through each other there.
+    if self_intersections:
+        check_surface(vertices, triangles)
+    two_loops(vertices, triangles)
+    euler = n - len(edges) + len(triangles)
+    if euler != 0:
+        raise GeometryError(
+            f"Euler number {euler}, expected 0: the surface has {-euler // 2} handles, where "
+            "leaflets that only touch were joined"
+        )
+
+
+def check_annulus_size(annulus: FloatArray) -> None:
+    """Raise where the largest extent (mm) of the annulus is none of a valve."""
+    size = float(pdist(annulus).max())
+    low, high = ANNULUS_DIAMETER
+    if not low <= size <= high:
+        fits = [
+            unit
+            for unit, factor in (("m", 1000.0), ("cm", 10.0), ("mm", 0.1), ("mm", 0.001))
+            if low <= size * factor <= high
+        ]
+        guess = f" (its numbers would fit {fits[0]} instead)" if fits else ""
+        raise GeometryError(
+            f"the annulus is {size:.3g} mm across, expected {low:g} to {high:g} mm: is "
+            f"units.length right?{guess}"
+        )
+
+
+def ventricular_side(annulus: FloatArray, free_edge: FloatArray) -> float:
+    """1 where the vector area of an annulus (in its order) points to the free edge, else -1."""
+    down = free_edge.mean(axis=0) - annulus.mean(axis=0)
+    return 1.0 if down @ loop_vector_area(annulus) > 0 else -1.0
+
+
+def check_tips(annulus: FloatArray, side: float, tips: FloatArray) -> None:
+    """Raise where a papillary tip is not on the ventricular side of the annulus, or far away.
+
+    ``side`` is that of `ventricular_side` in the open frame; the annulus has the same order here.
+    """
+    centre = annulus.mean(axis=0)
+    normal = side * loop_vector_area(annulus)
+    below = (tips - centre) @ (normal / np.linalg.norm(normal))
+    if below.min() <= 0:
+        k = int(np.argmin(below))
+        raise GeometryError(
+            f"tip {k} at {np.round(tips[k], 2).tolist()} mm lies {-below[k]:.1f} mm above the "
+            "annulus, on the atrial side; expected below it, on the side of the free edge"
+        )
+    distance = np.linalg.norm(tips - centre, axis=1)
+    if distance.max() > FARTHEST_TIP:
+        k = int(np.argmax(distance))
+        raise GeometryError(
+            f"tip {k} is {distance[k]:.0f} mm from the centre of the annulus, expected at most "
+            f"{FARTHEST_TIP:g} mm: is it in the same unit and the same axes as the surface?"
+        )
+
+
+def check_normals(
+    vertices: FloatArray, triangles: IntArray, annulus: IntArray, tips: FloatArray
+) -> None:
+    """Raise unless the triangles face the ventricle.
+
+    The annulus runs as the triangles at it do, so its vector area has their side, however the
+    leaflets lie and however wide the orifice is. Edges within the surface are run along both ways.
+    """
+    edges = directed_edges(triangles)
+    start, end = np.moveaxis(vertices[edges[np.isin(edges, annulus).all(axis=1)]], 1, 0)
+    area = np.cross(start, end).sum(axis=0)
+    towards = tips.mean(axis=0) - vertices[annulus].mean(axis=0)
+    if area @ towards <= 0:
+        raise GeometryError(
+            "flipped normals: the triangles face the atrium, expected the ventricle, where the "
+            "papillary tips are; reverse every triangle"
+        )
+
+
+def check_thickness(thickness: FloatArray) -> None:
+    """Raise unless every thickness (mm) is positive and that of a leaflet."""
+    bad = np.flatnonzero(~((thickness > 0) & (thickness <= LARGEST_THICKNESS)))
+    if len(bad):
+        k = int(bad[0])
+        raise GeometryError(
+            f"{thickness[k]:g} mm at vertex {k} ({len(bad)} vertices in all), expected above 0 and "
+            f"at most {LARGEST_THICKNESS:g} mm"
+        )
+
+
+def check_closing_pressure(pressure_mmhg: float, unit: str) -> None:
+    """Raise where the pressure on the closed valve is not one that closes a mitral valve."""
+    low, high = CLOSING_PRESSURE
+    if not low <= pressure_mmhg <= high:
+        other = "kPa" if unit == "mmHg" else "mmHg"
+        raise InputError(
+            f"{pressure_mmhg:g} mmHg on the closed valve, expected {low:g} to {high:g} mmHg: is it "
+            f"in {other} (units.pressure says {unit})? It is positive where it closes the valve"
+        )

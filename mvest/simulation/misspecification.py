@@ -1,9 +1,9 @@
-"""Worlds: in what a simulated valve and how it is seen differ from what its case says.
+"""Misspecifications: how a simulated valve, and how it is seen, differ from what its case states.
 
-An estimator believes its case, and models the rest. A world breaks one of these beliefs, so that
-estimates can be judged where they are not made of the estimator's own words. What a world draws
-comes from a random stream beside that of the patient: in all worlds a seed stands for the same
-valve with the same errors, but for what the world adds.
+An estimator believes its case, and models the rest. A misspecification breaks one of these beliefs,
+so that estimates are judged where the estimator's assumptions do not hold. Its draws come from a
+random stream beside that of the patient. So a seed stands for the same valve with the same errors
+under all of them, apart from what the misspecification adds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.distance import cdist
 
-from mvest.errors import InputError, require_numbers
+from mvest.errors import InputError
 from mvest.mechanics.law.exponential import as_stiff
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
@@ -34,12 +34,12 @@ KERNELS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
 """Correlation by distance over length, beside that of `SpatialCorrelation`."""
 
 ANNULUS_LENGTH_MM = 20.0
-"""Over which errors of the annulus are alike."""
+"""Correlation length of errors of the annulus."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class World:
-    """What is otherwise than a case says and an estimator assumes; by default nothing.
+class Misspecification:
+    """What differs from what a case states and an estimator assumes; by default nothing.
 
     Attributes
     ----------
@@ -47,19 +47,19 @@ class World:
         Of the smooth errors: ``matern`` (of smoothness 3/2, as assumed), ``exponential`` (which is
         rougher) or ``gaussian`` (which is smoother).
     length_factor : float
-        Of the length over which they are alike, against what is stated.
+        On their stated correlation length.
     annulus_mm, tips_mm : float
-        Standard deviation of each coordinate by which the closed annulus is seen off, smoothly, and
-        the papillary tips in all frames alike.
+        Standard deviation of each coordinate of two errors: a smooth one of the closed annulus, and
+        one of the papillary tips that is the same in all frames.
     pressure_off, thickness_off : float
-        Share by which they are off, up or down at random.
+        Relative error, up or down at random.
     missing : float
-        Share of the closed leaflets that was not seen, a patch about a random vertex, and is filled
+        Share of the closed leaflets that was not seen, a patch about a random vertex. It is filled
         in as smoothly as can be.
     outliers : float
         Share of the vertices of the closed leaflets that are seen somewhere else.
     outlier_mm : float
-        Standard deviation of each coordinate by which.
+        Standard deviation of each coordinate of these errors.
     exponential : mapping
         Region -> tissue of the exponential law that takes the place of the linear one, its stresses
         scaled to that one's (see `MechanicsSettings`); empty: the linear law.
@@ -91,10 +91,6 @@ class World:
             raise InputError(
                 f"kernel = {self.kernel!r}, expected one of matern, {', '.join(KERNELS)}"
             )
-        require_numbers(self, "world", "length_factor", "prestretch")
-        sizes = "annulus_mm", "tips_mm", "pressure_off", "thickness_off", "outlier_mm"
-        scales = "leaflet_scale", "frame_scale"
-        require_numbers(self, "world", *sizes, *scales, least=0)
         for name in ("missing", "outliers"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)}, expected a share below 1")
@@ -112,12 +108,10 @@ class World:
         if not self.thickness_off:
             return parameters
         factor, leaflets = _off(self.thickness_off, rng), parameters.leaflets
-        anterior, posterior = (
-            replace(leaflet, thickness=factor * leaflet.thickness)
-            for leaflet in (leaflets.anterior, leaflets.posterior)
-        )
-        return replace(
-            parameters, leaflets=replace(leaflets, anterior=anterior, posterior=posterior)
+        names = "anterior", "posterior"
+        thickness = {name: factor * getattr(leaflets, name).thickness for name in names}
+        return parameters.changed(
+            {f"leaflets.{name}.thickness": mm for name, mm in thickness.items()}
         )
 
     def mechanics(
@@ -133,30 +127,22 @@ class World:
         InputError
             If a region has no exponential tissue.
         """
+        tissue = dict(mechanics.tissue)
         if self.prestretch != 1.0:
-            longer = {
-                r: replace(t, prestretch=self.prestretch) for r, t in mechanics.tissue.items()
-            }
-            mechanics = replace(mechanics, tissue=longer)
-        if not self.exponential:
-            return mechanics
-        if set(self.exponential) != set(mechanics.tissue):
-            raise InputError(
-                f"exponential tissue of {', '.join(self.exponential)}, expected of "
-                f"{', '.join(mechanics.tissue)}"
-            )
-        tissue = {
-            region: replace(
-                linear,
-                law="exponential",
-                exponential=as_stiff(self.exponential[region], linear, values[f"E_f.{region}"]),
-            )
-            for region, linear in mechanics.tissue.items()
-        }
-        return replace(mechanics, tissue=tissue)
+            tissue = {r: replace(own, prestretch=self.prestretch) for r, own in tissue.items()}
+        if self.exponential:
+            if set(self.exponential) != set(tissue):
+                raise InputError(
+                    f"exponential tissue of {', '.join(self.exponential)}, expected of "
+                    f"{', '.join(tissue)}"
+                )
+            for r, linear in tissue.items():
+                stiff = as_stiff(self.exponential[r], linear, values[f"E_f.{r}"])
+                tissue[r] = replace(linear, law="exponential", exponential=stiff)
+        return mechanics if tissue == mechanics.tissue else replace(mechanics, tissue=tissue)
 
     def noise(self, std: float, points: FloatArray, length: float) -> ObservationError:
-        """Smooth errors of standard deviation ``std`` mm, stated to be alike over ``length`` mm.
+        """Smooth errors of standard deviation ``std`` mm, of the stated correlation length.
 
         Parameters
         ----------
@@ -164,11 +150,20 @@ class World:
         points : (n, 3) mm
             Vertices at rest.
         length : float
+            mm.
         """
+        length *= self.length_factor
         if self.kernel == "matern":
-            correlation = SpatialCorrelation(points, self.length_factor * length)
-            return CorrelatedNoise(std, correlation)
-        return _SmoothNoise(std, _factor(self.kernel, points, self.length_factor * length))
+            return CorrelatedNoise(std, SpatialCorrelation(points, length))
+        # Such a correlation may be all but singular: its symmetric factor.
+        w, V = np.linalg.eigh(KERNELS[self.kernel](cdist(points, points) / length))
+        factor = (V * np.sqrt(np.maximum(w, 0.0))) @ V.T
+
+        def smooth(seen: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
+            white = rng.standard_normal(seen.shape)
+            return np.asarray(seen + std * np.einsum("ij,fjk->fik", factor, white))
+
+        return smooth
 
     def open_moves(self, valve: Valve, rng: np.random.Generator) -> FloatArray:
         """Displacements ``(n, 3)`` mm of the open leaflets as seen, by the errors of their size.
@@ -219,26 +214,6 @@ class World:
             moves = _filled(vertices - surface.vertices, hidden, surface.triangles)
             vertices[hidden] = surface.vertices[hidden] + moves[hidden]
         return vertices
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _SmoothNoise:
-    """Normal noise with a factor ``(n, n)`` of its correlation; see `CorrelatedNoise`."""
-
-    std: float
-    factor: FloatArray
-
-    def __call__(
-        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
-    ) -> FloatArray:
-        white = rng.standard_normal(seen.shape)
-        return np.asarray(seen + self.std * np.einsum("ij,fjk->fik", self.factor, white))
-
-
-def _factor(kernel: str, points: FloatArray, length: float) -> FloatArray:
-    """Symmetric factor ``(n, n)`` of a correlation, which may be all but singular."""
-    w, V = np.linalg.eigh(KERNELS[kernel](cdist(points, points) / length))
-    return np.asarray((V * np.sqrt(np.maximum(w, 0.0))) @ V.T)
 
 
 def _off(share: float, rng: np.random.Generator) -> float:
