@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from mvest.cache import Counts, Entry, get_or_make, prune
+from experiments.common.building import closure
+from mvest.cache import Counts, Entry, code_digest, get_or_make, prune, source_key
 from mvest.errors import InputError, MeshingError
+from mvest.simulation.population import draw_population
 
 
 def read(path: Path) -> str:
@@ -279,3 +281,41 @@ def test_a_store_is_pruned_to_its_size_from_what_was_used_last(tmp_path, capsys)
     assert (tmp_path / "of-others").exists()
     prune(tmp_path, "kept-*", 1e-6)
     assert entries[1].path.exists()  # the last one used stays, however large
+
+
+# -- keys of code ---------------------------------------------------------------------------------
+
+
+def edited(place):
+    place.write_text("SCALE = 3.0")
+
+
+def renamed(place):
+    place.rename(place.with_name("other.py"))
+
+
+def another(place):
+    place.with_name("another.py").touch()
+
+
+def data(place):
+    place.with_name("table.csv").touch()
+
+
+@pytest.mark.parametrize("change", [edited, renamed, another, data])
+def test_every_change_of_code_changes_its_digest(tmp_path, change):
+    place = tmp_path / "package" / "room" / "units.py"
+    place.parent.mkdir(parents=True)
+    place.write_text("SCALE = 2.0")
+    before = code_digest(tmp_path)
+    change(place)
+    # A process has the code with which it began.
+    assert code_digest(tmp_path) == before
+    code_digest.cache_clear()
+    assert (code_digest(tmp_path) == before) is (change is data)
+
+
+def test_a_key_covers_mvest_and_the_package_of_the_maker():
+    assert source_key(draw_population) == source_key()
+    assert source_key(closure.closure_model) == source_key(closure, draw_population)
+    assert source_key(closure) != source_key()
