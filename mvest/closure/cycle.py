@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.closure.model import ClosureModel
+from mvest.closure.model import ClosureModel, failure_of
 from mvest.errors import InputError, MaterialError, require_numbers
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
@@ -200,7 +200,7 @@ class CycleModel:
         """
         simulation = self.run(m, sensitivities=False)
         if not simulation.converged:
-            raise InputError(f"no cycle with the parameters {m}: {_failure(simulation)}")
+            raise InputError(f"no cycle with the parameters {m}: {failure_of(simulation)}")
         at = self.protocol.frame_steps
         return np.stack([self.closure.observed(simulation.frames[k]) for k in at])
 
@@ -214,7 +214,7 @@ class CycleModel:
         except MaterialError as error:
             return Prediction.failed(str(error))
         if not simulation.converged:
-            return Prediction.failed(_failure(simulation))
+            return Prediction.failed(failure_of(simulation))
         observed, at = self.closure.observed, self.protocol.frame_steps
         y = np.concatenate([observed(simulation.frames[k]).ravel() for k in at])
         columns = [
@@ -316,7 +316,3 @@ def _followed(model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], st
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _failure(simulation: Simulation) -> str:
-    return f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
