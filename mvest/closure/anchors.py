@@ -164,6 +164,7 @@ def cached_state(
         return ClosedState(at, positions, slopes=slopes)
 
     def write(path: Path, made: ClosedState) -> None:
+        assert made.slopes is not None
         np.savez(path, positions=made.positions, slopes=made.slopes)
 
     # A valve that does not close is cached without positions.

@@ -318,9 +318,12 @@ class ClosureModel:
                 soon = replace(newton, max_iterations=min(newton.max_iterations, CONTINUED))
             expected = self._coordinates.expected_move(self._closed, m)
             for move in (None,) if expected is None else (expected, None):
-                start = self._closed.positions
                 simulation = run(
-                    steps[-1:], start, newton=soon, initial_move=move, initial_time=end
+                    steps[-1:],
+                    self._closed.positions,
+                    newton=soon,
+                    initial_move=move,
+                    initial_time=end,
                 )
                 if simulation.converged:
                     break
