@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar
@@ -27,14 +26,6 @@ T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, LookupError, TypeError)
 """What readers raise for a file that a broken disk or a user has changed."""
-
-
-@dataclass(slots=True)
-class Counts:
-    """How often an entry was read (``hits``) and made (``misses``)."""
-
-    hits: int = 0
-    misses: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +40,11 @@ class Entry(Generic[T]):
         Reads a path; refuses what is damaged.
     remake : bool
         Whether a damaged entry is made again. One that cannot be reproduced is refused instead.
-    counts : Counts
     """
 
     path: Path
     read: Callable[[Path], T]
     remake: bool = True
-    counts: Counts = field(default_factory=Counts)
 
     def found(self) -> T | None:
         """The cached value; None if there is none, or a damaged one that can be made again."""
@@ -65,14 +54,11 @@ class Entry(Generic[T]):
             # What cannot be made again holds its digest itself, which its reader checks.
             if self.remake and self._digest(self.path) != self.seal.read_text(encoding="utf-8"):
                 return None
-            value = self.read(self.path)
+            return self.read(self.path)
         except DAMAGE:
             if not self.remake:
                 raise
             return None
-        with suppress(OSError):  # a read-only cache
-            os.utime(self.path)
-        return value
 
     @property
     def seal(self) -> Path:
@@ -162,42 +148,7 @@ def get_or_make(
                 print(f"note: {entry.path} is damaged and is made again", file=sys.stderr)
         for k, value in zip(left, make(left) if left else (), strict=True):
             values[k] = entries[k].keep(value, write) if keep(value) else value
-            entries[k].counts.misses += 1
-    for k in set(range(len(entries))) - set(left):
-        entries[k].counts.hits += 1
     return values
-
-
-def prune(folder: Path, pattern: str, largest_mb: float) -> None:
-    """Remove the least recently used files of a cache that has grown beyond a size.
-
-    Parameters
-    ----------
-    folder : Path
-    pattern : str
-        Of the names of the entries, which are files.
-    largest_mb : float
-        Size in 10^6 bytes; a larger cache is reduced to nine tenths of it.
-    """
-    used = []
-    for path in folder.glob(pattern):
-        with suppress(OSError):  # removed meanwhile
-            about = path.stat()
-            used.append((about.st_mtime_ns, about.st_size, path))
-    size, removed = sum(bytes_ for _, bytes_, _ in used), 0
-    if size <= 1e6 * largest_mb:
-        return
-    for _, bytes_, path in sorted(used)[:-1]:
-        if size <= 0.9e6 * largest_mb:
-            break
-        for part in (path, Entry(path, Path.read_bytes).seal):
-            part.unlink(missing_ok=True)
-        size, removed = size - bytes_, removed + 1
-    print(
-        f"note: {folder} holds more than {largest_mb:g} MB; of its entries {removed} were removed "
-        "that were not used for longest",
-        file=sys.stderr,
-    )
 
 
 @functools.cache

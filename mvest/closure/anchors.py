@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.cache import Entry, prune
+from mvest.cache import Entry
 from mvest.errors import InputError
 from mvest.mechanics.parameters import Parameter, is_positive
 from mvest.mechanics.settings import MechanicsSettings
@@ -33,10 +33,6 @@ that is nearly all exponential, and a leaflet moves by no more than with its mod
 SPACING = 0.4
 """Spacing of the lattice, in the logarithm of each parameter (of a coefficient of a field: times
 its standard deviation of log E_f)."""
-
-LARGEST_MB = 1000.0
-"""Size of the cache, 10^6 bytes, beyond which the least recently used states are removed. One state
-takes 0.2 MB on the default mesh with two parameters."""
 
 DIGITS = 32
 """Length of a file's name."""
@@ -169,10 +165,7 @@ def cached_state(
 
     # A valve that does not close is cached without positions.
     none = ClosedState(at, np.zeros((0, 3)), slopes=np.zeros((0, 0, 3)))
-    entry = Entry(file, read)
-    state = entry.get_or_make(lambda: make() or none, write)
-    if entry.counts.misses:
-        prune(folder, "closed-*.npz", LARGEST_MB)
+    state = Entry(file, read).get_or_make(lambda: make() or none, write)
     return state if len(state.positions) else None
 
 

@@ -116,7 +116,7 @@ _Loader.yaml_constructors = {
 }
 for _kind, _pattern in (
     ("int", r"[-+]?(?:0|[1-9][0-9]*)$"),
-    ("float", r"[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?$"),
+    ("float", r"(?:[-+]?[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?$"),
 ):
     _Loader.add_implicit_resolver(_TAG + _kind, re.compile(_pattern), list("-+.0123456789"))
 for _kind in ("str", "int", "float"):

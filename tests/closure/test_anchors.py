@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import mvest.cache
-from mvest.closure import anchors
 from mvest.closure.anchors import SPACING, Coordinates, content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
@@ -229,27 +228,6 @@ def test_processes_share_anchors(tmp_path):
     for m, prediction in zip(values, shared, strict=True):
         plain = replace(model.fresh(), anchors=None)(m)
         np.testing.assert_allclose(prediction.y, plain.y, rtol=0, atol=1e-9)
-
-
-def test_the_states_that_were_not_used_for_longest_make_room(
-    tmp_path, anchored, capsys, monkeypatch
-):
-    def close(m):
-        gentle(tmp_path).close(m)
-
-    close(NEAR)
-    monkeypatch.setattr(anchors, "LARGEST_MB", 2.5e-6 * files(tmp_path)[0].stat().st_size)
-    close(OTHER)
-    close(NEAR)  # used again: now the other one goes first
-    assert not capsys.readouterr().err
-    close(2.0 * NEAR)
-    assert len(files(tmp_path)) == 2
-    assert f"{tmp_path} holds more than" in capsys.readouterr().err
-    anchored.clear()
-    close(NEAR)
-    assert not anchored
-    close(OTHER)
-    assert len(anchored) == 1
 
 
 def test_a_digest_tells_values_apart_and_nothing_else():

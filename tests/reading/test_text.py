@@ -110,7 +110,7 @@ def test_json_that_is_read(tmp_path):
 
 @pytest.mark.parametrize(
     "value",
-    ["9223372036854775808", "1" + "0" * 400, "1.0e+300", "1e999",
+    ["9223372036854775808", "1" + "0" * 400, "1.0e+300", "1.0e+999",
      '"a\\uD800"', '"\\0"', '"\\e[2J"', '"' + "a" * 20_001 + '"', "!!python/object:os.system a"],
 )  # fmt: skip
 def test_a_value_of_yaml_that_is_refused(tmp_path, value):
@@ -128,10 +128,10 @@ def test_a_value_of_yaml_that_is_refused(tmp_path, value):
 def test_plain_values_of_yaml_are_as_another_reader_has_them(tmp_path):
     text = (
         "a: 1\nb: -2.5\nc: 1.0e-3\nd: 1e-3\ne: yes\nf: ~\ng: [0, [x, {y: 1}]]\nh: '0x10'\n"
-        "1: one\ni: |\n  two\n  lines\nj: ''\nk:\nl: \"1_0\"\nm: 0\nn: -0.5e-3\no: true\n"
+        "1: one\ni: |\n  two\n  lines\nj: ''\nk:\nl: \"1_0\"\nm: 0\nn: +.5\no: true\n"
     )
     (tmp_path / "a.yaml").write_text(text)
-    assert read_yaml(tmp_path / "a.yaml") == yaml.safe_load(text) | {"d": 0.001}
+    assert read_yaml(tmp_path / "a.yaml") == yaml.safe_load(text)
     odd = [
         "0xfff",
         "1:1:1:1",
