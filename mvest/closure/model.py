@@ -110,8 +110,6 @@ class ClosureModel:
         closure that would start from the open valve is continued from one of them.
     perturbation : (n, 3) mm, optional
         Initial displacement of the nodes of the open valve.
-    closures : int
-        How many closed states have been sought, intermediate ones included, anchors not.
     """
 
     valve: Valve
@@ -130,7 +128,6 @@ class ClosureModel:
     anchors: Path | None = None
     perturbation: FloatArray | None = None
 
-    closures: int = field(default=0, init=False)
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
 
@@ -271,28 +268,22 @@ class ClosureModel:
             If a modulus is inadmissible.
         """
         if every_frame:
-            return self._counted(m, sensitivities, every_frame=True)
+            return self._close(m, sensitivities, every_frame=True)
         anchored = self._begin_at_anchor(m)
         linear = self._unstiffened(m)
         if linear is not None:
-            self._counted(linear)
+            self._close(linear)
         for between in self._way_to(m):
-            result = self._counted(between)
+            result = self._close(between)
             if not result.simulation.converged:
                 break
         else:
-            result = self._counted(m, sensitivities)
+            result = self._close(m, sensitivities)
         if anchored and not result.simulation.converged:
-            # As if nothing had been kept.
+            # As if nothing had been cached.
             self.restart(None)
-            result = self._counted(m, sensitivities)
+            result = self._close(m, sensitivities)
         return result
-
-    def _counted(
-        self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False
-    ) -> ClosureResult:
-        self.closures += 1
-        return self._close(m, sensitivities, every_frame=every_frame)
 
     def _close(
         self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False

@@ -44,12 +44,11 @@ from mvest.estimation.noise import (
 from mvest.estimation.prediction import (
     ObservationModel,
     Prediction,
-    predict,
     read_only,
     require_finite,
 )
 from mvest.observation.errors import SpatialCorrelation
-from mvest.observation.vertices import FRAMES, scales
+from mvest.observation.vertices import FRAMES, observed_frames, require_frames, scales
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve, lumped_areas
 from mvest.valve.geometry.moving_distance import (
@@ -139,8 +138,6 @@ class PredictedSurface:
 
     Attributes
     ----------
-    n_vertices : int
-        Vertices n that the model predicts in each frame.
     triangles : (m, 3)
         Of the drawn vertices; their normals point to one side throughout.
     region : (m,)
@@ -153,7 +150,6 @@ class PredictedSurface:
         Drawn vertices in loop order; None if the curve is not to be compared.
     """
 
-    n_vertices: int
     triangles: IntArray
     region: IntArray
     weights: csr_array
@@ -174,7 +170,7 @@ class PredictedSurface:
         loops = () if free_edge is None else (free_edge,)
         fine = refined(rest, triangles, edge_length, loops)
         edge = fine.loops[0] if loops else None
-        return cls(len(rest), fine.triangles, region[fine.parent], fine.weights, width, edge)
+        return cls(fine.triangles, region[fine.parent], fine.weights, width, edge)
 
     @classmethod
     def of_valve(cls, valve: Valve, edge_length: float, width: float) -> PredictedSurface:
@@ -183,6 +179,11 @@ class PredictedSurface:
         return cls.refined(
             own.vertices, own.triangles, own.region, valve.free_edge, edge_length, width
         )
+
+    @property
+    def size(self) -> int:
+        """Vertices n that the model predicts in each frame."""
+        return int(self.weights.shape[1])
 
     def drawn(self, predicted: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
         """The drawn vertices, or some of them, of values of the predicted ones ``(n, ...)``."""
@@ -240,8 +241,7 @@ class SurfaceObservation:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seen", tuple(self.seen))
-        if len(set(self.frames)) != len(self.frames):
-            raise InputError(f"observed frames {list(self.frames)}, expected different ones")
+        require_frames(self.frames, self.predicted)
         if not any(len(seen.points) or seen.free_edge is not None for seen in self.seen):
             raise InputError("nothing is seen: no frame has a point or a curve")
         require_numbers(self, "observation", "std_mm")
@@ -274,36 +274,27 @@ class SurfaceObservation:
         ----------
         model : ObservationModel
             Predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
-
-        Raises
-        ------
-        InputError
-            If the model does not predict a frame that was seen.
         """
-        unknown = set(self.frames) - set(self.predicted)
-        if unknown:
-            raise InputError(f"observed frames {sorted(unknown)}, predicted {list(self.predicted)}")
-        chosen = [self.predicted.index(frame) for frame in self.frames]
-        shape = (len(self.predicted), self.surface.n_vertices, 3)
+        observed, n = observed_frames(model, self.frames, None, self.predicted), self.surface.size
 
         def distances(m: FloatArray) -> Prediction:
-            prediction = predict(model, m)
+            prediction = observed(m)
             if not prediction.converged:
                 return prediction
-            if prediction.y.size != np.prod(shape):
+            if prediction.y.size != 3 * n * len(self.frames):
                 raise InputError(
-                    f"the model predicts {prediction.y.size} coordinates; expected 3 of each of "
-                    f"{shape[1]} vertices in each of the frames {', '.join(self.predicted)}"
+                    f"the model predicts {prediction.y.size} coordinates of the frames "
+                    f"{', '.join(self.frames)}; expected 3 of each of {n} vertices in each"
                 )
-            whole = prediction.y.reshape(shape)[chosen]
-            motion = prediction.jacobian.reshape(*shape, prediction.jacobian.shape[1])[chosen]
+            whole = prediction.y.reshape(len(self.frames), n, 3)
+            motion = prediction.jacobian.reshape(*whole.shape, -1)
             parts = [
                 part
                 for seen, vertices, moved in zip(self.seen, whole, motion, strict=True)
                 for part in _of_frame(self, seen, vertices, moved)
             ]
             y, jacobian = (np.concatenate(column) for column in zip(*parts, strict=True))
-            return replace(prediction, y=y, jacobian=jacobian, aux=whole)
+            return replace(prediction, y=y, jacobian=jacobian)
 
         return distances
 

@@ -84,13 +84,13 @@ def test_a_closure_begins_with_linear_tissue_and_ends_where_any_other_does():
     direct = mixed(GENTLE, **SMALL)
     ends = direct.close(AT).simulation
     model = mixed(GENTLE, continuation=True, **SMALL)
-    begun, closing = [], model._counted
+    begun, closing = [], model._close
 
     def followed(m, *given, **more):
         begun.append(m[2])
         return closing(m, *given, **more)
 
-    model._counted = followed
+    model._close = followed
     found = model.close(AT).simulation
     assert begun[0] == 0.0
     assert begun[-1] == AT[2]

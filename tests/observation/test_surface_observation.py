@@ -432,7 +432,7 @@ def test_an_observation_that_cannot_be_is_refused(frame: dict, settings: dict, w
     with pytest.raises(InputError, match="surface has none"):
         SurfaceObservation((seen(np.zeros((3, 3)), free_edge=SQUARE),), bare, 1.0)
     frames = (seen(np.zeros((3, 3))),) * 2
-    with pytest.raises(InputError, match="different"):
+    with pytest.raises(InputError, match="observed frames"):
         SurfaceObservation(frames, surface, 1.0)
 
 
