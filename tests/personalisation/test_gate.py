@@ -54,8 +54,8 @@ def test_the_verdict_comes_first_and_then_what_it_fails_by():
         GateRow("time step / 2", float("nan"), float("nan"), False, "it buckled"),
         GateRow("ramp / 3", 0.04, 0.7, False, "converged"),
     )
-    jumping = Path("E_f", (), 0.01, 0.1, 3, "a jump of 0.3 mm")
-    paths = (jumping, Path("E_f.anterior", (), 0.01, 0.1, 3, ""))
+    jumping = Path("E_f", (), 3, "a jump of 0.3 mm")
+    paths = (jumping, Path("E_f.anterior", (), 3, ""))
     first, *others = gate_lines(GateReport(rows, paths, None, False))
     assert "gate NOT passed" in first
     assert "2 variations, 0.7 mm at most" in first
