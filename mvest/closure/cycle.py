@@ -201,8 +201,11 @@ class CycleModel:
         simulation = self.run(m, sensitivities=False)
         if not simulation.converged:
             raise InputError(f"no cycle with the parameters {m}: {failure_of(simulation)}")
-        at = self.protocol.frame_steps
-        return np.stack([self.closure.observed(simulation.frames[k]) for k in at])
+        return self._seen(simulation.frames)
+
+    def _seen(self, steps: FloatArray) -> FloatArray:
+        """Observed vertices ``(f, n, 3)`` in the observed frames, of nodal values of all steps."""
+        return np.stack([self.closure.observed(steps[k]) for k in self.protocol.frame_steps])
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """All frames, one after another, and their Jacobian.
@@ -215,13 +218,9 @@ class CycleModel:
             return Prediction.failed(str(error))
         if not simulation.converged:
             return Prediction.failed(failure_of(simulation))
-        observed, at = self.closure.observed, self.protocol.frame_steps
-        y = np.concatenate([observed(simulation.frames[k]).ravel() for k in at])
-        columns = [
-            np.concatenate([observed(simulation.sensitivities[k, i]).ravel() for k in at])
-            for i in range(len(self.names))
-        ]
-        return Prediction(y, np.stack(columns, axis=-1))
+        moved = np.moveaxis(simulation.sensitivities, 1, 0)
+        columns = [self._seen(by_one).ravel() for by_one in moved]
+        return Prediction(self._seen(simulation.frames).ravel(), np.stack(columns, axis=-1))
 
 
 def compare_time_steps(

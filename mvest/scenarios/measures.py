@@ -23,7 +23,7 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.thickening import thicken
-from mvest.valve.measure.annulus import annulus_plane, measure_annulus
+from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.clinical import tenting
 from mvest.valve.measure.coaptation import (
     coaptation_area,
@@ -68,14 +68,12 @@ def measure_steps(
     closed_surface = thicken(surface, normals)
     faces = embed(model.mesh, closed_surface.vertices)
     loading = boundary_loading(system, valve, model.contact_valve, model.settings)
-    first = np.unique(surface.triangles[surface.region == 0])
     one, other = (surface.triangles[surface.region == k] for k in (0, 1))
     measures = []
     for time, x in zip(simulation.times, simulation.frames, strict=True):
         middle, outer = model.observed(x), faces(x)
         annulus = middle[valve.annulus]
-        anterior = middle[np.intersect1d(valve.annulus, first)].mean(axis=0)
-        plane = annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior)
+        plane = plane_of(valve, annulus)
         loads = loading(time)
         strain, force = _chordae(system, x, loads.tips)
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
