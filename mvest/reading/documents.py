@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pydantic_core
 import yaml
 from pydantic import BaseModel, ValidationError
 
@@ -66,10 +65,11 @@ def parse_json(content: bytes | str, where: str) -> Any:
     """
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
-        data = pydantic_core.from_json(text, allow_inf_nan=False)
-        json.dumps(data, allow_nan=False)  # 1e999 is read as an infinity
+        data = json.loads(text)
+        # Python reads NaN, 1e999 and halves of surrogate pairs, but does not write them.
+        json.dumps(data, ensure_ascii=False, allow_nan=False).encode()
         return data
-    except ValueError as fault:
+    except (ValueError, RecursionError) as fault:
         raise InputError(f"{where} is not JSON: {one_line(fault, 120)}") from fault
 
 
