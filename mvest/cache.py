@@ -3,43 +3,29 @@
 Beside each entry lies its digest, ``.NAME.sha256``. An entry without it, or that does not match it,
 was not written under this name as it is; it is made again, even if its reader accepts it.
 
-The key of a maker is a hash of its module and of all modules that this one imports. Imports are
-followed through `mvest` and the packages that join it by :meth:`Sources.include`, also imports
-within functions, but not those for type checking, nor names that `mvest` itself loads on first use.
-A text that names a module, or a Python file beside the module, counts as an import. Comments,
-docstrings and layout do not count, nor do the packages above an imported module. Files of data and
-settings are not code: callers describe them.
+Any change of the code of `mvest` makes all entries anew; for a maker outside `mvest` its own
+package counts as well. Files of data and settings are not code: callers describe them.
 """
 
 from __future__ import annotations
 
-import ast
+import functools
 import hashlib
-import os
-import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
-from mvest.errors import InputError, cannot_write
+from mvest.errors import cannot_write
 from mvest.files import remove_parts, sha256_of, write_atomically
 
 T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, LookupError, TypeError)
 """What readers raise for a file that a broken disk or a user has changed."""
-
-
-@dataclass(slots=True)
-class Counts:
-    """How often an entry was read (``hits``) and made (``misses``)."""
-
-    hits: int = 0
-    misses: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +40,11 @@ class Entry(Generic[T]):
         Reads a path; refuses what is damaged.
     remake : bool
         Whether a damaged entry is made again. One that cannot be reproduced is refused instead.
-    counts : Counts
     """
 
     path: Path
     read: Callable[[Path], T]
     remake: bool = True
-    counts: Counts = field(default_factory=Counts)
 
     def found(self) -> T | None:
         """The cached value; None if there is none, or a damaged one that can be made again."""
@@ -70,14 +54,11 @@ class Entry(Generic[T]):
             # What cannot be made again holds its digest itself, which its reader checks.
             if self.remake and self._digest(self.path) != self.seal.read_text(encoding="utf-8"):
                 return None
-            value = self.read(self.path)
+            return self.read(self.path)
         except DAMAGE:
             if not self.remake:
                 raise
             return None
-        with suppress(OSError):  # a read-only cache
-            os.utime(self.path)
-        return value
 
     @property
     def seal(self) -> Path:
@@ -167,134 +148,27 @@ def get_or_make(
                 print(f"note: {entry.path} is damaged and is made again", file=sys.stderr)
         for k, value in zip(left, make(left) if left else (), strict=True):
             values[k] = entries[k].keep(value, write) if keep(value) else value
-            entries[k].counts.misses += 1
-    for k in set(range(len(entries))) - set(left):
-        entries[k].counts.hits += 1
     return values
 
 
-def prune(folder: Path, pattern: str, largest_mb: float) -> None:
-    """Remove the least recently used files of a cache that has grown beyond a size.
-
-    Parameters
-    ----------
-    folder : Path
-    pattern : str
-        Of the names of the entries, which are files.
-    largest_mb : float
-        Size in 10^6 bytes; a larger cache is reduced to nine tenths of it.
-    """
-    used = []
-    for path in folder.glob(pattern):
-        with suppress(OSError):  # removed meanwhile
-            about = path.stat()
-            used.append((about.st_mtime_ns, about.st_size, path))
-    size, removed = sum(bytes_ for _, bytes_, _ in used), 0
-    if size <= 1e6 * largest_mb:
-        return
-    for _, bytes_, path in sorted(used)[:-1]:
-        if size <= 0.9e6 * largest_mb:
-            break
-        for part in (path, Entry(path, Path.read_bytes).seal):
-            part.unlink(missing_ok=True)
-        size, removed = size - bytes_, removed + 1
-    print(
-        f"note: {folder} holds more than {largest_mb:g} MB; of its entries {removed} were removed "
-        "that were not used for longest",
-        file=sys.stderr,
-    )
-
-
-class Sources:
-    """The code of some packages, as it is when it is first read: that of this process.
-
-    Parameters
-    ----------
-    **folders : Path
-        Of each package.
-    """
-
-    def __init__(self, **folders: Path) -> None:
-        self._folders: dict[str, Path] = {}
-        self.include(**folders)
-
-    def include(self, **folders: Path) -> None:
-        """Follow imports into further packages."""
-        self._folders |= folders
-        # What was read before might name modules of theirs.
-        self._modules: dict[str, tuple[str, list[str]]] = {}
-
-    def key(self, *modules: str) -> str:
-        """Hash of modules and of all that they import; InputError for a foreign module."""
-        reached = sorted((name, self._modules[name][0]) for name in self.reached(*modules))
-        return hashlib.sha256(repr(reached).encode()).hexdigest()
-
-    def reached(self, *modules: str) -> set[str]:
-        """Names of modules and of all that they import."""
-        found, left = set[str](), list(modules)
-        while left:
-            name = left.pop()
-            if name not in found:
-                found.add(name)
-                if name not in self._modules:
-                    self._modules[name] = self._read(name)
-                left += self._modules[name][1]
-        return found
-
-    def _read(self, name: str) -> tuple[str, list[str]]:
-        """A module's code without its docstrings and comments, and the modules that it names."""
-        path = self._path(name)
-        if path is None:
-            raise InputError(f"{name} is no module of {' or '.join(self._folders)}")
-        code = _without_texts(path.read_bytes())
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        named = re.findall(r"'(\w+(?:\.\w+)+)'", code)
-        named += [f"{package}.{text[:-3]}" for text in named if text.endswith(".py")]
-        for line in re.findall(r"^\s*import (.+)", code, re.MULTILINE):
-            named += re.findall(r"[\w.]+", line)
-        for base, items in re.findall(r"^\s*from ([\w.]+) import (.+)", code, re.MULTILINE):
-            named += [base, *(f"{base}.{item}" for item in re.findall(r"\w+", items))]
-        return code, [module for module in named if self._path(module)]
-
-    def _path(self, name: str) -> Path | None:
-        """The file of a module; None if it is none of these packages."""
-        top, *rest = name.split(".")
-        if top not in self._folders:
-            return None
-        place = self._folders[top].joinpath(*rest)
-        files = (place / "__init__.py", place.with_suffix(".py"))
-        return next((file for file in files if file.is_file()), None)
-
-
-def _without_texts(source: bytes) -> str:
-    """Code without comments, docstrings, layout and imports for type checking."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        body: Any = getattr(node, "body", None)
-        if isinstance(body, list):
-            left = [part for part in body if not _is_silent(part)]
-            node.body = left or [ast.Pass()]  # type: ignore[attr-defined]
-    return ast.unparse(tree)
-
-
-def _is_silent(node: ast.stmt) -> bool:
-    if isinstance(node, ast.If):
-        return "TYPE_CHECKING" in ast.unparse(node.test)
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-
-
-SOURCES = Sources(mvest=Path(__file__).parent)
+@functools.cache
+def code_digest(folder: Path) -> str:
+    """SHA-256 of all Python files below a folder, as they are when this is first called."""
+    digest = hashlib.sha256()
+    for file in sorted(folder.rglob("*.py")):
+        digest.update(f"{file.relative_to(folder).as_posix()} {sha256_of(file)} ".encode())
+    return digest.hexdigest()
 
 
 def source_key(*made_by: Any) -> str:
-    """Key of the code of modules, and of the modules of functions or classes.
+    """Key of all code of `mvest`, and of the packages that makers are of.
 
-    Raises
-    ------
-    InputError
-        If one of them is of another package.
+    Parameters
+    ----------
+    *made_by
+        Modules, functions or classes.
     """
-    names = (
-        made.__name__ if isinstance(made, ModuleType) else str(made.__module__) for made in made_by
-    )
-    return SOURCES.key(*names)
+    names = (made.__name__ if isinstance(made, ModuleType) else made.__module__ for made in made_by)
+    packages = sorted({"mvest", *(str(name).partition(".")[0] for name in names)})
+    folders = (Path(str(sys.modules[package].__file__)).parent for package in packages)
+    return hashlib.sha256(" ".join(map(code_digest, folders)).encode()).hexdigest()

@@ -129,21 +129,9 @@ def _lagrange(order: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def _triangle6(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Six-node triangle: values ``(q, 6)`` and derivatives ``(q, 6, 2)``."""
-    z = 1 - x - y
-    value = np.stack(
-        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z],
-        axis=-1,
-    )
-    o = np.zeros_like(x)
-    d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
-    d_y = np.stack([1 - 4 * z, o, 4 * y - 1, -4 * x, 4 * x, 4 * (z - y)], axis=-1)
-    return value, np.stack([d_x, d_y], axis=-1)
-
-
-def _no_modes(xi: FloatArray) -> FloatArray:
-    return np.zeros((xi.shape[0], 0))
+def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
+    points, weights = np.polynomial.legendre.leggauss(n)
+    return np.asarray(points), np.asarray(weights)
 
 
 def _simplex(xi: FloatArray) -> FloatArray:
@@ -153,17 +141,117 @@ def _simplex(xi: FloatArray) -> FloatArray:
     return np.asarray(positive / np.maximum(total, 1.0))
 
 
-def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
-    points, weights = np.polynomial.legendre.leggauss(n)
-    return np.asarray(points), np.asarray(weights)
+# -- the plane of layered elements, and their faces -----------------------------------------------
+Factors = tuple[FloatArray, ...]
+"""Arrays ``(q, ...)`` whose product is a shape function."""
 
 
-# Degree-4 rule with six points on the unit triangle (Strang and Fix 1973; weights sum to 1/2).
-_A, _B = 0.445948490915965, 0.091576213509771
-_TRIANGLE_POINTS = np.array(
-    [[_A, _A], [1 - 2 * _A, _A], [_A, 1 - 2 * _A], [_B, _B], [1 - 2 * _B, _B], [_B, 1 - 2 * _B]]
-)
-_TRIANGLE_WEIGHTS = 0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Plane:
+    """A quadratic element of the plane.
+
+    Attributes
+    ----------
+    face : str
+    nodes : (n, 2)
+    tables : callable
+        Coordinates -> factors of the shape functions, and of their two derivatives.
+    product : str
+        The factors' subscripts, and those of their product, for `numpy.einsum`.
+    points, weights : (q, 2), (q,)
+        Quadrature.
+    modes : callable
+        ``(q, 2) -> (q, m)``, what zeta is multiplied by in the enhanced modes.
+    outside, inside : callable
+        As those of `Element`.
+    centre : (2,)
+    corners : (m, 3)
+        As those of `Face`.
+    """
+
+    face: str
+    nodes: FloatArray
+    tables: Callable[[FloatArray], tuple[Factors, tuple[Factors, Factors]]]
+    product: tuple[str, str]
+    points: FloatArray
+    weights: FloatArray
+    modes: Evaluate
+    outside: Evaluate
+    inside: Evaluate
+    centre: tuple[float, float]
+    corners: IntArray
+
+    def as_face(self) -> Face:
+        """The face with its tables at the points of quadrature."""
+        factors, slopes = self.tables(self.points)
+        rule, q = f"{self.product[0]}->q{self.product[1]}", len(self.points)
+        shape, *by = (np.einsum(rule, *one).reshape(q, -1) for one in (factors, *slopes))
+        gradient = np.stack(by, axis=-1)
+        return Face(self.face, len(self.nodes), shape, gradient, self.weights, self.corners)
+
+
+def _square_tables(xi: FloatArray) -> tuple[Factors, tuple[Factors, Factors]]:
+    (a, da), (b, db) = _lagrange(2, xi[:, 0]), _lagrange(2, xi[:, 1])
+    return (b, a), ((b, da), (db, a))
+
+
+def _triangle_tables(xi: FloatArray) -> tuple[Factors, tuple[Factors, Factors]]:
+    """Of the six-node triangle."""
+    x, y = xi[:, 0], xi[:, 1]
+    z, o = 1 - x - y, np.zeros_like(x)
+    value = np.stack(
+        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z],
+        axis=-1,
+    )
+    d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
+    d_y = np.stack([1 - 4 * z, o, 4 * y - 1, -4 * x, 4 * x, 4 * (z - y)], axis=-1)
+    return (value,), ((d_x,), (d_y,))
+
+
+def _square() -> _Plane:
+    g, w = _gauss(3)
+    quads = [3 * j + i for j in (0, 1) for i in (0, 1)]
+    return _Plane(
+        face="quad9",
+        nodes=np.array([[x, y] for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)]),
+        tables=_square_tables,
+        product=("qj,qi", "ji"),
+        points=np.column_stack([np.tile(g, 3), np.repeat(g, 3)]),
+        weights=np.tile(w, 3) * np.repeat(w, 3),
+        modes=lambda xi: np.column_stack([np.ones(len(xi)), xi, xi[:, 0] * xi[:, 1]]),
+        outside=lambda xi: np.max(np.abs(xi), axis=1) - 1.0,
+        inside=lambda xi: np.clip(xi, -1.0, 1.0),
+        centre=(0.0, 0.0),
+        corners=np.array([t for n in quads for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])]),
+    )
+
+
+def _triangle() -> _Plane:
+    # Degree-4 rule with six points (Strang and Fix 1973; weights sum to 1/2).
+    a, b = 0.445948490915965, 0.091576213509771
+    inner = [[a, a], [1 - 2 * a, a], [a, 1 - 2 * a]]
+    outer = [[b, b], [1 - 2 * b, b], [b, 1 - 2 * b]]
+    return _Plane(
+        face="tri6",
+        nodes=np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]),
+        tables=_triangle_tables,
+        product=("qa", "a"),
+        points=np.array(inner + outer),
+        weights=0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3),
+        modes=lambda xi: np.column_stack([np.ones(len(xi)), xi - 1.0 / 3.0]),
+        outside=lambda xi: np.max([-xi[:, 0], -xi[:, 1], xi.sum(axis=1) - 1], axis=0),
+        inside=_simplex,
+        centre=(1 / 3, 1 / 3),
+        corners=np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+    )
+
+
+SQUARE, TRIANGLE = _square(), _triangle()
+
+
+# -- elements -------------------------------------------------------------------------------------
+def _no_modes(xi: FloatArray) -> FloatArray:
+    return np.zeros((xi.shape[0], 0))
 
 
 def _reduced(xi: FloatArray, weights: FloatArray) -> FloatArray:
@@ -181,94 +269,39 @@ def _reduced(xi: FloatArray, weights: FloatArray) -> FloatArray:
     return np.stack([first, second, all_of_it, second, first, first @ second])
 
 
-def _brick(name: str, thickness_order: int, *, thin: bool = False) -> Element:
+def _layered(name: str, plane: _Plane, order: int, *, thin: bool = False) -> Element:
+    """Plane times thickness, in which it is of an order."""
+    rule = f"qk,{plane.product[0]}->qk{plane.product[1]}"
+
+    def product(*factors: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum(rule, *factors).reshape(len(factors[0]), -1))
+
     def shape(xi: FloatArray) -> FloatArray:
-        a, _ = _lagrange(2, xi[:, 0])
-        b, _ = _lagrange(2, xi[:, 1])
-        c, _ = _lagrange(thickness_order, xi[:, 2])
-        return np.einsum("qk,qj,qi->qkji", c, b, a).reshape(xi.shape[0], -1)
+        return product(_lagrange(order, xi[:, 2])[0], *plane.tables(xi)[0])
 
     def gradient(xi: FloatArray) -> FloatArray:
-        a, da = _lagrange(2, xi[:, 0])
-        b, db = _lagrange(2, xi[:, 1])
-        c, dc = _lagrange(thickness_order, xi[:, 2])
-        parts = [(c, b, da), (c, db, a), (dc, b, a)]
-        return np.stack(
-            [np.einsum("qk,qj,qi->qkji", *p).reshape(xi.shape[0], -1) for p in parts], axis=-1
-        )
+        (c, dc), (factors, (by_x, by_y)) = _lagrange(order, xi[:, 2]), plane.tables(xi)
+        return np.stack([product(c, *by_x), product(c, *by_y), product(dc, *factors)], axis=-1)
 
-    def modes(xi: FloatArray) -> FloatArray:
-        one = np.ones(xi.shape[0])
-        plane = np.stack([one, xi[:, 0], xi[:, 1], xi[:, 0] * xi[:, 1]], axis=-1)
-        return xi[:, 2:3] * plane
+    def with_zeta(values: FloatArray, zetas: FloatArray) -> FloatArray:
+        return np.column_stack([np.tile(values, (len(zetas), 1)), np.repeat(zetas, len(values))])
 
-    g3, w3 = _gauss(3)
-    g2, w2 = _gauss(2)
-    points = np.array([[x, y, z] for z in g2 for y in g3 for x in g3])
-    weights = np.array([wx * wy * wz for wz in w2 for wy in w3 for wx in w3])
-    zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
-    nodes = np.array([[x, y, z] for z in zetas for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)])
+    (g, w), n = _gauss(2), len(plane.nodes)
     return Element(
         name=name,
-        n_nodes=len(nodes),
+        n_nodes=n * (order + 1),
         shape=shape,
         gradient=gradient,
-        points=points,
-        weights=weights,
-        enhanced=modes if thickness_order == 1 else _no_modes,
-        node_coordinates=nodes,
-        outside=lambda xi: np.max(np.abs(xi), axis=1) - 1.0,
-        inside=lambda xi: np.clip(xi, -1.0, 1.0),
-        face="quad9",
-        centre=np.zeros((1, 3)),
-        top_face=np.arange(9) + 9 * (len(zetas) - 1),
+        points=with_zeta(plane.points, g),
+        weights=(plane.weights * w[:, None]).ravel(),
+        enhanced=(lambda xi: xi[:, 2:3] * plane.modes(xi[:, :2])) if order == 1 else _no_modes,
+        node_coordinates=with_zeta(plane.nodes, np.linspace(-1.0, 1.0, order + 1)),
+        outside=lambda xi: np.maximum(plane.outside(xi[:, :2]), np.abs(xi[:, 2]) - 1),
+        inside=lambda xi: np.column_stack([plane.inside(xi[:, :2]), np.clip(xi[:, 2], -1.0, 1.0)]),
+        face=plane.face,
+        centre=np.array([[*plane.centre, 0.0]]),
+        top_face=np.arange(n) + n * order,
         sampling=_reduced if thin else None,
-    )
-
-
-def _wedge(name: str, thickness_order: int) -> Element:
-    def shape(xi: FloatArray) -> FloatArray:
-        t, _ = _triangle6(xi[:, 0], xi[:, 1])
-        c, _ = _lagrange(thickness_order, xi[:, 2])
-        return np.einsum("qk,qa->qka", c, t).reshape(xi.shape[0], -1)
-
-    def gradient(xi: FloatArray) -> FloatArray:
-        t, dt = _triangle6(xi[:, 0], xi[:, 1])
-        c, dc = _lagrange(thickness_order, xi[:, 2])
-        parts = [(c, dt[:, :, 0]), (c, dt[:, :, 1]), (dc, t)]
-        return np.stack(
-            [np.einsum("qk,qa->qka", *p).reshape(xi.shape[0], -1) for p in parts], axis=-1
-        )
-
-    def modes(xi: FloatArray) -> FloatArray:
-        third = 1.0 / 3.0
-        plane = np.stack([np.ones(xi.shape[0]), xi[:, 0] - third, xi[:, 1] - third], axis=-1)
-        return xi[:, 2:3] * plane
-
-    g2, w2 = _gauss(2)
-    points = np.array([[*t, z] for z in g2 for t in _TRIANGLE_POINTS])
-    weights = np.array([wt * wz for wz in w2 for wt in _TRIANGLE_WEIGHTS])
-    zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
-    plane_nodes = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
-    nodes = np.array([[*p, z] for z in zetas for p in plane_nodes], dtype=np.float64)
-    return Element(
-        name=name,
-        n_nodes=len(nodes),
-        shape=shape,
-        gradient=gradient,
-        points=points,
-        weights=weights,
-        enhanced=modes if thickness_order == 1 else _no_modes,
-        node_coordinates=nodes,
-        outside=lambda xi: np.max(
-            np.stack([-xi[:, 0], -xi[:, 1], xi[:, 0] + xi[:, 1] - 1, np.abs(xi[:, 2]) - 1]), axis=0
-        ),
-        inside=lambda xi: np.column_stack(
-            [_simplex(xi[:, :2]), np.clip(xi[:, 2], -1.0, 1.0)],
-        ),
-        face="tri6",
-        centre=np.array([[1 / 3, 1 / 3, 0.0]]),
-        top_face=np.arange(6) + 6 * (len(zetas) - 1),
     )
 
 
@@ -296,17 +329,14 @@ def _tetrahedron(name: str, order: int) -> Element:
         )
         return np.concatenate([(4 * b[:, :, None] - 1) * corner, middle], axis=1)
 
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    if order == 1:
-        points, weights, nodes = np.full((1, 3), 0.25), np.array([1 / 6]), corners
-    else:
-        a, b = (
-            0.585410196624969,
-            0.138196601125011,
-        )  # degree 2, four points (Hammer and Stroud 1956)
+    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    points, weights = np.full((1, 3), 0.25), np.array([1 / 6])
+    if order == 2:
+        # Degree 2, four points (Hammer and Stroud 1956).
+        a, b = 0.585410196624969, 0.138196601125011
         points = np.array([[b, b, b], [a, b, b], [b, a, b], [b, b, a]])
         weights = np.full(4, 1 / 24)
-        nodes = np.vstack([corners, 0.5 * (corners[edges[:, 0]] + corners[edges[:, 1]])])
+        nodes = np.vstack([nodes, 0.5 * (nodes[edges[:, 0]] + nodes[edges[:, 1]])])
     return Element(
         name=name,
         n_nodes=len(nodes),
@@ -323,66 +353,25 @@ def _tetrahedron(name: str, order: int) -> Element:
     )
 
 
-def _faces() -> dict[str, Face]:
-    g3, w3 = _gauss(3)
-    x = np.tile(g3, 3)
-    y = np.repeat(g3, 3)
-    a, da = _lagrange(2, x)
-    b, db = _lagrange(2, y)
-    quad9 = Face(
-        "quad9",
-        9,
-        np.einsum("qj,qi->qji", b, a).reshape(9, 9),
-        np.stack(
-            [
-                np.einsum("qj,qi->qji", b, da).reshape(9, 9),
-                np.einsum("qj,qi->qji", db, a).reshape(9, 9),
-            ],
-            axis=-1,
-        ),
-        np.tile(w3, 3) * np.repeat(w3, 3),
-        np.array(
-            [
-                t
-                for j in (0, 1)
-                for i in (0, 1)
-                for n in [i + 3 * j]
-                for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])
-            ]
-        ),
-    )
-    value, derivative = _triangle6(_TRIANGLE_POINTS[:, 0], _TRIANGLE_POINTS[:, 1])
-    tri6 = Face(
-        "tri6",
-        6,
-        value,
-        derivative,
-        _TRIANGLE_WEIGHTS,
-        np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
-    )
-    third = np.full((1, 3), 1 / 3)
-    tri3 = Face(
-        "tri3",
-        3,
-        third,
-        np.array([[[-1.0, -1], [1, 0], [0, 1]]]),
-        np.array([0.5]),
-        np.array([[0, 1, 2]]),
-    )
-    return {f.name: f for f in (quad9, tri6, tri3)}
-
-
-FACES: dict[str, Face] = _faces()
-ELEMENTS: dict[str, Element] = {
+_TRI3 = Face(
+    "tri3",
+    3,
+    np.full((1, 3), 1 / 3),
+    np.array([[[-1.0, -1], [1, 0], [0, 1]]]),
+    np.array([0.5]),
+    np.array([[0, 1, 2]]),
+)
+FACES = {face.name: face for face in (SQUARE.as_face(), TRIANGLE.as_face(), _TRI3)}
+ELEMENTS = {
     e.name: e
     for e in (
         _tetrahedron("tet4", 1),
         _tetrahedron("tet10", 2),
-        _brick("hex18", 1),
-        _brick("hex18_thin", 1, thin=True),
-        _brick("hex27", 2),
-        _wedge("wedge12", 1),
-        _wedge("wedge18", 2),
+        _layered("hex18", SQUARE, 1),
+        _layered("hex18_thin", SQUARE, 1, thin=True),
+        _layered("hex27", SQUARE, 2),
+        _layered("wedge12", TRIANGLE, 1),
+        _layered("wedge18", TRIANGLE, 2),
     )
 }
 

@@ -1,7 +1,6 @@
 """Entries of a store: made once, whole, in the order in which they are asked for."""
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -11,8 +10,10 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from mvest.cache import Counts, Entry, get_or_make, prune
+from experiments.common.building import closure
+from mvest.cache import Entry, code_digest, get_or_make, source_key
 from mvest.errors import InputError, MeshingError
+from mvest.simulation.population import draw_population
 
 
 def read(path: Path) -> str:
@@ -41,12 +42,11 @@ def made(value):
 
 @pytest.mark.parametrize("how", [write, write_folder])
 def test_what_is_kept_is_not_made_again(tmp_path, how):
-    make, counts = made("a"), Counts()
+    make = made("a")
     for _ in range(3):
-        entry = Entry(tmp_path / "below" / "entry", read, counts=counts)
+        entry = Entry(tmp_path / "below" / "entry", read)
         assert entry.get_or_make(make, how) == "a"
     assert make.calls == 1
-    assert counts == Counts(hits=2, misses=1)
 
 
 def test_who_makes_it_is_given_what_others_will_read(tmp_path):
@@ -262,20 +262,39 @@ def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):
         Entry(tmp_path / "file" / "entry", read).get_or_make(made("a"), write)
 
 
-def test_a_store_is_pruned_to_its_size_from_what_was_used_last(tmp_path, capsys):
-    entries = [Entry(tmp_path / f"kept-{k}", read) for k in range(6)]
-    for k, entry in enumerate(entries):
-        entry.get_or_make(made("a" * 998), write)  # 1000 bytes with its quotes
-        os.utime(entry.path, (k, k))
-    (tmp_path / "of-others").write_bytes(b"x" * 10_000)
-    prune(tmp_path, "kept-*", 0.006)
-    assert not capsys.readouterr().err
-    assert entries[1].found()  # is used now
-    prune(tmp_path, "kept-*", 0.0045)
-    assert [entry.path.exists() for entry in entries] == [False, True, False, True, True, True]
-    assert "of its entries 2 were removed" in capsys.readouterr().err
-    assert not entries[0].seal.exists()
-    assert entries[1].seal.exists()
-    assert (tmp_path / "of-others").exists()
-    prune(tmp_path, "kept-*", 1e-6)
-    assert entries[1].path.exists()  # the last one used stays, however large
+# -- keys of code ---------------------------------------------------------------------------------
+
+
+def edited(place):
+    place.write_text("SCALE = 3.0")
+
+
+def renamed(place):
+    place.rename(place.with_name("other.py"))
+
+
+def another(place):
+    place.with_name("another.py").touch()
+
+
+def data(place):
+    place.with_name("table.csv").touch()
+
+
+@pytest.mark.parametrize("change", [edited, renamed, another, data])
+def test_every_change_of_code_changes_its_digest(tmp_path, change):
+    place = tmp_path / "package" / "room" / "units.py"
+    place.parent.mkdir(parents=True)
+    place.write_text("SCALE = 2.0")
+    before = code_digest(tmp_path)
+    change(place)
+    # A process has the code with which it began.
+    assert code_digest(tmp_path) == before
+    code_digest.cache_clear()
+    assert (code_digest(tmp_path) == before) is (change is data)
+
+
+def test_a_key_covers_mvest_and_the_package_of_the_maker():
+    assert source_key(draw_population) == source_key()
+    assert source_key(closure.closure_model) == source_key(closure, draw_population)
+    assert source_key(closure) != source_key()

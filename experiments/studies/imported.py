@@ -269,7 +269,7 @@ def _donor(job: Job[Settings]) -> Result:
         # A start is met again by rounding of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)
-        row = {"closure": "generic", "ended": generic.reason, "predictions": 1, "equilibria": 1}
+        row = {"closure": "generic", "ended": generic.reason, "predictions": 1}
         if generic.converged:
             shapes["generic"] = generic.y.reshape(2, -1, 3)[1]
             row |= valve.distances(shapes["generic"])
@@ -277,14 +277,13 @@ def _donor(job: Job[Settings]) -> Result:
         for k, start in enumerate(starts):
             # Each goes on from the generic closed valve.
             model = copy(first)
-            model.closures = 0
             model_ = Remembered(model, known.runs, known.rtol)
             own = replace(filter_, start=tuple(map(float, start)))
             tissue = valve.settings.tissue
             problem = Problem(parameters, model_, prior, own, transform, tissue)
             found = estimate(problem, seen, on_iterate=bar.iterate)
             record = record_of(found, case=f"fitted, start {k + 1}", simulated=True)
-            row = {"closure": record.case, "ended": record.reason, "equilibria": model.closures}
+            row = {"closure": record.case, "ended": record.reason}
             row |= {"iterations": record.iterations, "predictions": record.forward_solves}
             if found.fitted is not None:
                 shapes.setdefault("fitted", found.fitted[-1])

@@ -1,15 +1,12 @@
-"""Closed states that are kept: where closures of one valve begin that have none nearer.
+"""Cached closed states from which closures of one valve begin if none is nearer.
 
-They lie on a lattice in coordinates in which closed states change evenly with the parameters:
-their logarithms.
-
-Most of a closure from the open valve is the way to its first contact, and it is much the same for
-all moduli. So the closed state, with its derivatives, is kept at the points of a lattice of the
-parameters' logarithms, made once by whoever comes first, from the open valve. Which point a closure
-begins at follows from its own parameters and from nothing else: what it gives does not depend on
-what was closed before, by itself or by others, nor on whether the state was there or had to be
-made. The closed state is the one that would have been found from the open valve, as far as there is
-one only, which the gate (:mod:`mvest.closure.robustness`) examines.
+Most of the time of a closure from the open valve goes into the way to first contact, which is much
+the same for all moduli. So closed states and their derivatives are cached at the points of a
+lattice in coordinates in which closed states change evenly: the logarithms of the parameters. Each
+is made once, from the open valve, by the first process that needs it. The point at which a closure
+begins follows from its parameters alone, so its result does not depend on what was closed before,
+nor on whether the state was cached. The closed state is the one that would be found from the open
+valve as long as there is only one, which the gate (:mod:`mvest.closure.robustness`) examines.
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.cache import Entry, prune
+from mvest.cache import Entry
 from mvest.errors import InputError
 from mvest.mechanics.parameters import Parameter, is_positive
 from mvest.mechanics.settings import MechanicsSettings
@@ -30,22 +27,51 @@ from mvest.reading.npz import read_npz
 from mvest.typing import BoolArray, FloatArray
 
 STIFFENED = 0.5
-"""What log(1 + stiffening) is multiplied by: with five steps of 0.2 a tissue that hardly stiffens
-becomes one that is nearly all exponential, and a leaflet moves by no more than with its modulus."""
+"""Factor on log(1 + stiffening): with five steps of 0.2 a tissue that hardly stiffens becomes one
+that is nearly all exponential, and a leaflet moves by no more than with its modulus."""
+
+SPACING = 0.4
+"""Spacing of the lattice, in the logarithm of each parameter (of a coefficient of a field: times
+its standard deviation of log E_f)."""
+
+DIGITS = 32
+"""Length of a file's name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedState:
+    """A closed valve from which further closures may be continued.
+
+    Attributes
+    ----------
+    at : (p,)
+        Its parameters.
+    positions : (n, 3) mm
+        Of the mesh's nodes.
+    guide : ClosedState or None
+        That of the model's guide.
+    slopes : (p, n, 3) mm or None
+        Derivatives of the positions by the parameters, if they are known.
+    """
+
+    at: FloatArray
+    positions: FloatArray
+    guide: ClosedState | None = None
+    slopes: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coordinates:
-    """Logarithms of positive parameters; a field's coefficients times its deviation of log E_f.
+    """Logarithms of positive parameters; coefficients of a field times its deviation of log E_f.
 
-    Of a stiffening alpha it is a share of log(1 + alpha): from none at all it is a short way.
+    A stiffening alpha counts as a share of log(1 + alpha): from no stiffening it is a short way.
 
     Attributes
     ----------
     units : (p,)
-        What a coefficient of a field changes log E_f by, what a logarithm is multiplied by.
+        Change of log E_f by a coefficient of a field; factor on a logarithm.
     offsets : (p,)
-        What is added to a parameter before its logarithm is taken; NaN where it is not.
+        Added to a parameter before its logarithm is taken; NaN if it has none.
     """
 
     units: FloatArray
@@ -81,91 +107,70 @@ class Coordinates:
             self._positive, np.exp(np.where(self._positive, own, 0.0)) - self.offsets, own
         )
 
-    def change(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
-        """Difference ``(p,)`` of the coordinates of two sets of parameters; None as above."""
+    def distance(self, start: FloatArray, end: FloatArray) -> float:
+        """Largest change of a coordinate between two sets of parameters; infinite without one."""
         one, other = self(start), self(end)
-        return None if one is None or other is None else other - one
+        return np.inf if one is None or other is None else float(np.abs(other - one).max())
 
-    def rates(self, m: FloatArray) -> FloatArray:
-        """Derivative ``(p,)`` of each parameter by its coordinate."""
-        return np.where(self._positive, m + self.offsets, 1.0) / self.units
+    def between(self, start: FloatArray, end: FloatArray, largest: float) -> list[FloatArray]:
+        """Parameters on the way between two sets, no coordinate changing by more than a step."""
+        one, other = self(start), self(end)
+        if one is None or other is None:
+            return []
+        n = int(np.ceil(float(np.abs(other - one).max()) / largest))
+        return [self.parameters(one + (other - one) * k / n) for k in range(1, n)]
 
-
-DIGITS = 32
-"""Of a name."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Kept:
-    """A closed state; without positions one that was not found.
-
-    Attributes
-    ----------
-    positions : (n, 3) mm
-        Of the mesh's nodes.
-    slopes : (p, n, 3) mm
-        Derivatives by the parameters.
-    """
-
-    positions: FloatArray
-    slopes: FloatArray
+    def expected_move(self, closed: ClosedState, m: FloatArray) -> FloatArray | None:
+        """First-order move ``(n, 3)`` mm of a closed state to ``m``; None if it is not known."""
+        start, end = self(closed.at), self(m)
+        if closed.slopes is None or start is None or end is None:
+            return None
+        # Derivatives of the parameters by their coordinates.
+        rates = np.where(self._positive, closed.at + self.offsets, 1.0) / self.units
+        return np.tensordot(rates * (end - start), closed.slopes, 1)
 
 
-NOT_FOUND = Kept(np.zeros((0, 3)), np.zeros((0, 0, 3)))
-"""What is kept of a valve that does not close."""
+def cached_state(
+    folder: Path,
+    key: str,
+    point: FloatArray,
+    at: FloatArray,
+    make: Callable[[], ClosedState | None],
+) -> ClosedState | None:
+    """The closed state at a point of the lattice; None if the valve does not close there.
 
-
-@dataclass(frozen=True, slots=True)
-class Anchors:
-    """A folder of closed states, and the lattice of their parameters.
-
-    Attributes
+    Parameters
     ----------
     folder : Path
-        Made when something is kept. Several processes may share it.
-    spacing : float
-        Of the lattice, in the logarithm of each parameter (of a field's coefficient: times its
-        standard deviation of log E_f).
-    largest_mb : float
-        Size of the folder, 10^6 bytes, beyond which the states that were not used for longest are
-        removed. One takes 0.2 MB on the default mesh with two parameters.
+        Of the cache; several processes may share it.
+    key : str
+        Digest of all that decides the state but its parameters.
+    point : (p,)
+        Whole numbers, the coordinates over `SPACING`.
+    at : (p,)
+        Parameters at the point.
+    make : callable
+        Closes the valve. If several processes need the state, one makes it and the others wait.
     """
+    name = f"{key} {','.join(f'{k:.0f}' for k in point)}"
+    file = folder / f"closed-{hashlib.sha256(name.encode()).hexdigest()[:DIGITS]}.npz"
 
-    folder: Path
-    spacing: float = 0.4
-    largest_mb: float = 1000.0
+    def read(path: Path) -> ClosedState:
+        positions, slopes = read_npz(path, ["positions", "slopes"]).values()
+        return ClosedState(at, positions, slopes=slopes)
 
-    def __post_init__(self) -> None:
-        if not self.spacing > 0:
-            raise InputError(f"spacing of the anchors = {self.spacing}, expected > 0")
-        if not self.largest_mb > 0:
-            raise InputError(f"largest_mb of the anchors = {self.largest_mb}, expected > 0")
+    def write(path: Path, made: ClosedState) -> None:
+        assert made.slopes is not None
+        np.savez(path, positions=made.positions, slopes=made.slopes)
 
-    def get_or_make(self, key: str, place: FloatArray, make: Callable[[], Kept]) -> Kept:
-        """The state that is kept at a point of the lattice, or is made and kept now.
-
-        Parameters
-        ----------
-        key : str
-            Of all that decides the state but its parameters, by :func:`content_digest`, and of the
-            code, by :func:`mvest.cache.source_key`.
-        place : (p,)
-            Whole numbers, the point over the spacing.
-        make : callable
-            Of several processes that need the state, one makes it and the others wait.
-        """
-        at = ",".join(f"{k:.0f}" for k in place)
-        about = f"{key} {self.spacing!r} {at}"
-        name = hashlib.sha256(about.encode()).hexdigest()[:DIGITS]
-        entry = Entry(self.folder / f"closed-{name}.npz", _read)
-        kept = entry.get_or_make(make, _write)
-        if entry.counts.misses:
-            prune(self.folder, "closed-*.npz", self.largest_mb)
-        return kept
+    # A valve that does not close is cached without positions.
+    none = ClosedState(at, np.zeros((0, 3)), slopes=np.zeros((0, 0, 3)))
+    state = Entry(file, read).get_or_make(lambda: make() or none, write)
+    return state if len(state.positions) else None
 
 
 def content_digest(*values: Any) -> str:
-    """SHA-256 of what values say: arrays, dataclasses, mappings, sequences, numbers and texts.
+    """SHA-256 of the content of arrays, dataclasses, mappings, sequences, numbers and texts.
 
     Raises
     ------
@@ -199,12 +204,3 @@ def _feed(digest: hashlib._Hash, value: Any) -> None:
         digest.update(f"{plain!r};".encode())
     else:
         raise InputError(f"no digest of a {type(value).__name__}")
-
-
-def _write(path: Path, kept: Kept) -> None:
-    np.savez(path, positions=kept.positions, slopes=kept.slopes)
-
-
-def _read(path: Path) -> Kept:
-    positions, slopes = read_npz(path, ["positions", "slopes"]).values()
-    return Kept(positions, slopes)

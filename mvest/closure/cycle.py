@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.closure.model import ClosureModel
+from mvest.closure.model import ClosureModel, failure_of
 from mvest.errors import InputError, MaterialError, require_numbers
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
@@ -200,9 +200,12 @@ class CycleModel:
         """
         simulation = self.run(m, sensitivities=False)
         if not simulation.converged:
-            raise InputError(f"no cycle with the parameters {m}: {_failure(simulation)}")
-        at = self.protocol.frame_steps
-        return np.stack([self.closure.observed(simulation.frames[k]) for k in at])
+            raise InputError(f"no cycle with the parameters {m}: {failure_of(simulation)}")
+        return self._seen(simulation.frames)
+
+    def _seen(self, steps: FloatArray) -> FloatArray:
+        """Observed vertices ``(f, n, 3)`` in the observed frames, of nodal values of all steps."""
+        return np.stack([self.closure.observed(steps[k]) for k in self.protocol.frame_steps])
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """All frames, one after another, and their Jacobian.
@@ -214,14 +217,10 @@ class CycleModel:
         except MaterialError as error:
             return Prediction.failed(str(error))
         if not simulation.converged:
-            return Prediction.failed(_failure(simulation))
-        observed, at = self.closure.observed, self.protocol.frame_steps
-        y = np.concatenate([observed(simulation.frames[k]).ravel() for k in at])
-        columns = [
-            np.concatenate([observed(simulation.sensitivities[k, i]).ravel() for k in at])
-            for i in range(len(self.names))
-        ]
-        return Prediction(y, np.stack(columns, axis=-1))
+            return Prediction.failed(failure_of(simulation))
+        moved = np.moveaxis(simulation.sensitivities, 1, 0)
+        columns = [self._seen(by_one).ravel() for by_one in moved]
+        return Prediction(self._seen(simulation.frames).ravel(), np.stack(columns, axis=-1))
 
 
 def compare_time_steps(
@@ -316,7 +315,3 @@ def _followed(model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], st
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _failure(simulation: Simulation) -> str:
-    return f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.anchors import ClosedState
+from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.valve_system import HeldState

@@ -10,11 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import accumulate
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mvest.cache import source_key
-from mvest.closure.anchors import NOT_FOUND, Anchors, Coordinates, Kept, content_digest
+from mvest.closure.anchors import SPACING, ClosedState, Coordinates, cached_state, content_digest
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.cables import TiedPoints
@@ -51,34 +53,17 @@ def _resting(start: float, end: float) -> list[Step]:
     return [*(Step(start + t) for t in accumulate(REST)), Step(end + sum(REST), static=True)]
 
 
+def failure_of(simulation: Simulation) -> str:
+    """Why and when a simulation failed."""
+    return f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosureResult:
     """A closure with the system it was computed on."""
 
     system: System
     simulation: Simulation
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ClosedState:
-    """A closed valve from which further closures may be continued.
-
-    Attributes
-    ----------
-    at : (p,)
-        Its parameters.
-    positions : (n, 3) mm
-        Of the mesh's nodes.
-    guide : ClosedState or None
-        That of the model's guide.
-    slopes : (p, n, 3) mm or None
-        Derivatives of the positions by the parameters, if they are known.
-    """
-
-    at: FloatArray
-    positions: FloatArray
-    guide: ClosedState | None = None
-    slopes: FloatArray | None = None
 
 
 @dataclass(eq=False)
@@ -98,39 +83,33 @@ class ClosureModel:
     fixed : dict
         Values of the parameters that are not estimated.
     continuation : bool
-        Whether closures after the first start from the last closed state (where its derivatives
-        expect the next one, if it has been differentiated) and go straight to the new equilibrium
-        (where the protocol ends in one), instead of closing the open valve again. The
-        closed state is the same as long as there is one only, which the gate
+        Whether closures after the first start from the last closed state, or where its derivatives
+        expect the next one, and go straight to the new equilibrium. Otherwise each starts from the
+        open valve. Both give the same closed state if there is only one, which the gate
         (:mod:`mvest.closure.robustness`) examines.
     reach : float
-        Largest change of any parameter's logarithm (of a field's coefficient: times its standard
-        deviation of log E_f) over which a closure is continued; beyond it the valve is closed from
-        the open state. A much softer valve may close in another way, and what is continued from
-        there may keep to that way.
+        Largest change of a coordinate (:class:`mvest.closure.anchors.Coordinates`) over which a
+        closure is continued; beyond it the valve is closed anew. A much softer valve may close in
+        another way, and a continuation from there may keep to that way.
     guide : ClosureModel, optional
-        The same valve with the same parameters on a coarser mesh. A closure that would start from
-        the open valve is followed there, and its closed state is where the equilibrium on this
-        mesh is looked for; a guide may have a guide itself. The same closed state comes out, for
-        the same reason as with ``continuation``.
+        The same valve and parameters on a coarser mesh. A closure that would start from the open
+        valve is computed there first, and its closed state is where the equilibrium on this mesh is
+        sought. A guide may have a guide.
     repeat : bool
         Whether a continued closure that fails is repeated with the guide, and one that fails with
-        the guide from the open valve, which takes long and seldom finds what the others did not.
+        the guide from the open valve, which takes long and seldom succeeds.
     largest_change : float
-        Of any parameter, measured as for ``reach``, from one continued equilibrium to the next: one
-        farther away is reached through others between. Newton's method does not find an equilibrium
-        that lies millimetres away.
+        Largest change of a coordinate from one continued equilibrium to the next; a state farther
+        away is reached through others. Newton's method does not find equilibria millimetres away.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     ties : TiedPoints, optional
         Pairs of points that are held together while the valve closes, as by a clip.
-    anchors : Anchors, optional
-        Where closed states of this and other models are kept. With ``continuation``, a closure that
-        would start from the open valve is continued from the one that belongs to its parameters.
+    anchors : Path, optional
+        Folder of cached closed states (:mod:`mvest.closure.anchors`). With ``continuation``, a
+        closure that would start from the open valve is continued from one of them.
     perturbation : (n, 3) mm, optional
-        By how much the nodes of the open valve are displaced before they are let go.
-    closures : int
-        How many closed states have been looked for, those between others included, anchors not.
+        Initial displacement of the nodes of the open valve.
     """
 
     valve: Valve
@@ -146,14 +125,11 @@ class ClosureModel:
     largest_change: float = np.inf
     on_step: Callable[[float, int], None] | None = None
     ties: TiedPoints | None = None
-    anchors: Anchors | None = None
+    anchors: Path | None = None
     perturbation: FloatArray | None = None
 
-    closures: int = field(default=0, init=False)
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
-    _in_guide: Embedding | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
-    _solver: LinearSolver | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.reach >= 0:
@@ -167,7 +143,7 @@ class ClosureModel:
             )
 
     def fresh(self) -> ClosureModel:
-        """A model of the same that has not built or closed anything, and tells nobody of steps."""
+        """The same model before it has built or closed anything, without a progress callback."""
         guide = None if self.guide is None else self.guide.fresh()
         return replace(self, guide=guide, on_step=None)
 
@@ -184,17 +160,30 @@ class ClosureModel:
         edge = float(self.valve.surface.thickness[self.valve.free_edge].mean())
         return self.settings.contact.activation_distance * edge
 
-    def restart(self, closed: ClosedState | None) -> None:
-        """Go on from a closed state of this model, or from the open valve, as if it had just begun.
+    @cached_property
+    def observed(self) -> Embedding:
+        """The observed vertices embedded in the mesh."""
+        return embed(self.mesh, self.valve.surface.vertices)
 
-        What the model computes afterwards depends on ``closed`` and on nothing before, to the last
-        bit: also the sparsity pattern and the order of elimination, which follow the contact that
-        was met, begin anew.
+    @cached_property
+    def solver(self) -> LinearSolver:
+        """The linear solver of the system."""
+        return linear_solver(self.settings.solver)
+
+    @cached_property
+    def _coordinates(self) -> Coordinates:
+        return Coordinates.of(self.names, self.settings)
+
+    def restart(self, closed: ClosedState | None) -> None:
+        """Forget everything but ``closed``, from which the next closure may be continued.
+
+        Later results depend on ``closed`` and on nothing before, to the last bit: the sparsity
+        pattern and the order of elimination, which follow the contact that was met, begin anew.
         """
         self._closed = None if closed is None else replace(closed, guide=None)
         if self._system is not None:
             self._system.forget_contact()
-            self._solver = linear_solver(self.settings.solver)
+            self.__dict__.pop("solver", None)
         if self.guide is not None:
             self.guide.restart(None if closed is None else closed.guide)
 
@@ -203,34 +192,16 @@ class ClosureModel:
         return self._closed is not None and self._within_reach(self._closed.at, m)
 
     def _within_reach(self, start: FloatArray, m: FloatArray) -> bool:
-        if not self.continuation or np.isinf(self.reach):
-            return self.continuation
-        change = self._coordinates.change(start, m)
-        return change is not None and bool(np.max(np.abs(change)) <= self.reach)
-
-    @cached_property
-    def _coordinates(self) -> Coordinates:
-        return Coordinates.of(self.names, self.settings)
-
-    def _expected_move(self, m: FloatArray) -> FloatArray | None:
-        """By how much ``(n, 3)`` mm the last closed state is expected to move; None if unknown."""
-        closed, coordinates = self._closed, self._coordinates
-        if closed is None or closed.slopes is None:
-            return None
-        change = coordinates.change(closed.at, m)
-        if change is None:
-            return None
-        return np.tensordot(coordinates.rates(closed.at) * change, closed.slopes, 1)
+        everywhere = np.isinf(self.reach)
+        return self.continuation and (
+            everywhere or self._coordinates.distance(start, m) <= self.reach
+        )
 
     def _way_to(self, m: FloatArray) -> list[FloatArray]:
-        """Parameters between the last closed state and ``m``, where that is continued from."""
+        """Parameters between the last closed state and ``m``, if it is continued from."""
         if np.isinf(self.largest_change) or self._closed is None or not self._near(m):
             return []
-        start, end = self._coordinates(self._closed.at), self._coordinates(m)
-        if start is None or end is None:
-            return []
-        n = int(np.ceil(float(np.abs(end - start).max()) / self.largest_change))
-        return [self._coordinates.parameters(start + (end - start) * k / n) for k in range(1, n)]
+        return self._coordinates.between(self._closed.at, m, self.largest_change)
 
     def _unstiffened(self, m: FloatArray) -> FloatArray | None:
         """Parameters ``(p,)`` of linear tissue, from which ``m`` is gone to; None if not needed.
@@ -244,34 +215,30 @@ class ClosureModel:
         return np.where(stiffens, 0.0, m) if np.any(m[stiffens] > 0.0) else None
 
     def _begin_at_anchor(self, m: FloatArray) -> bool:
-        """Go to the kept closed state that belongs to ``m``, if there is none to continue from."""
-        anchors = self.anchors
-        if anchors is None or not self.settings.protocol.equilibrium or self._near(m):
+        """Go to the cached closed state that belongs to ``m`` if there is none to continue from."""
+        if self.anchors is None or not self.settings.protocol.equilibrium or self._near(m):
             return False
-        self.tuned(m)  # refuses what is inadmissible before anything is closed
-        at = self._coordinates(m)
-        if at is None:
+        self.tuned(m)  # refuses inadmissible parameters before anything is closed
+        own = self._coordinates(m)
+        if own is None:
             return False
-        place = np.round(at / anchors.spacing)
-        anchor = self._coordinates.parameters(place * anchors.spacing)
-        if not self._within_reach(anchor, m):
+        point = np.round(own / SPACING)
+        at = self._coordinates.parameters(point * SPACING)
+        if not self._within_reach(at, m):
             return False
-        kept = anchors.get_or_make(self._digest(), place, lambda: self._anchor(anchor))
-        found = len(kept.positions) > 0
-        # In any case as if it had been read: what follows does not depend on who has made it.
-        self.restart(ClosedState(anchor, kept.positions, slopes=kept.slopes) if found else None)
-        return found
+        found = cached_state(self.anchors, self._digest(), point, at, lambda: self._anchor(at))
+        # In any case as if it had been read: the result does not depend on which process made it.
+        self.restart(found)
+        return found is not None
 
-    def _anchor(self, at: FloatArray) -> Kept:
+    def _anchor(self, at: FloatArray) -> ClosedState | None:
         """The closed state at ``at (p,)``, from the open valve and with nothing remembered."""
         self.restart(None)
         try:
-            simulation = self._close(at).simulation
+            closes = self._close(at).simulation.converged
         except MaterialError:
-            return NOT_FOUND
-        if not simulation.converged:
-            return NOT_FOUND
-        return Kept(simulation.frames[-1], simulation.sensitivities[-1])
+            return None
+        return self._closed if closes else None
 
     def _digest(self) -> str:
         """Of all that decides a closed state besides the parameters."""
@@ -301,84 +268,102 @@ class ClosureModel:
             If a modulus is inadmissible.
         """
         if every_frame:
-            return self._counted(m, sensitivities, every_frame=True)
+            return self._close(m, sensitivities, every_frame=True)
         anchored = self._begin_at_anchor(m)
         linear = self._unstiffened(m)
         if linear is not None:
-            self._counted(linear)
+            self._close(linear)
         for between in self._way_to(m):
-            result = self._counted(between)
+            result = self._close(between)
             if not result.simulation.converged:
                 break
         else:
-            result = self._counted(m, sensitivities)
+            result = self._close(m, sensitivities)
         if anchored and not result.simulation.converged:
-            # As if nothing had been kept.
+            # As if nothing had been cached.
             self.restart(None)
-            result = self._counted(m, sensitivities)
+            result = self._close(m, sensitivities)
         return result
-
-    def _counted(
-        self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False
-    ) -> ClosureResult:
-        self.closures += 1
-        return self._close(m, sensitivities, every_frame=every_frame)
 
     def _close(
         self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False
     ) -> ClosureResult:
-        """One closure, from the last closed state or from the open valve."""
+        """One closure, from the last closed state, from the guide's or from the open valve."""
         system, parameters = self.tuned(m)
         newton, steps = self.settings.newton, self.settings.protocol.steps()
+        end = self.settings.protocol.end
         run = partial(
-            simulate,
-            system,
-            boundary_loading(system, self.valve, self.contact_valve, self.settings),
+            self._run,
+            loading=boundary_loading(system, self.valve, self.contact_valve, self.settings),
             damping=self.damping(m),
             parameters=parameters if sensitivities else [],
             final_only=not every_frame,
-            solver=self._solver,
             on_step=self.on_step,
         )
-        simulation, end = None, self.settings.protocol.end
+        simulation = None
         straight = steps[-1].static and not every_frame
         if straight and self._closed is not None and self._near(m):
             soon = newton
             if self.guide is not None and self.repeat:
-                # Where that is not soon found, the guide finds it sooner.
-                most = min(newton.max_iterations, CONTINUED)
-                soon = replace(newton, max_iterations=most)
-            expected = self._expected_move(m)
+                # If the equilibrium is not found soon, the guide finds it sooner.
+                soon = replace(newton, max_iterations=min(newton.max_iterations, CONTINUED))
+            expected = self._coordinates.expected_move(self._closed, m)
             for move in (None,) if expected is None else (expected, None):
                 simulation = run(
                     steps[-1:],
+                    self._closed.positions,
                     newton=soon,
-                    initial_positions=self._closed.positions,
                     initial_move=move,
                     initial_time=end,
                 )
                 if simulation.converged:
                     break
         if straight and self.guide is not None and self._unsettled(simulation):
-            start = self._guided(self.guide, m)
-            if start is not None:
-                rest = _resting(end, steps[-1].time)
-                simulation = run(rest, newton=newton, initial_positions=start, initial_time=end)
+            guided = self._guided(self.guide, m)
+            if guided is not None:
+                simulation = run(_resting(end, steps[-1].time), guided, initial_time=end)
         if simulation is None or self._unsettled(simulation):
             # From the open valve.
             start = None if self.perturbation is None else self.mesh.nodes + self.perturbation
-            simulation = run(steps, newton=newton, initial_positions=start)
+            simulation = run(steps, start)
         if simulation.converged:
-            self._closed = ClosedState(
-                np.array(m, dtype=np.float64),
-                simulation.frames[-1],
-                slopes=simulation.sensitivities[-1] if sensitivities else None,
-            )
+            slopes = simulation.sensitivities[-1] if sensitivities else None
+            at = np.array(m, dtype=np.float64)
+            self._closed = ClosedState(at, simulation.frames[-1], slopes=slopes)
         return ClosureResult(system, simulation)
+
+    def _run(
+        self,
+        steps: Sequence[Step],
+        start: FloatArray | None,
+        *,
+        loading: Callable[[float], Loads],
+        **options: Any,
+    ) -> Simulation:
+        """Time steps of the system from nodal positions ``start (n, 3)``; None: the open valve."""
+        assert self._system is not None
+        options = {"newton": self.settings.newton, **options, "initial_positions": start}
+        return simulate(self._system, loading, steps, solver=self.solver, **options)
 
     def _unsettled(self, simulation: Simulation | None) -> bool:
         """Whether a closure is yet to be tried, or to be repeated in another way."""
         return simulation is None or (self.repeat and not simulation.converged)
+
+    @cached_property
+    def _in_guide(self) -> Embedding | None:
+        """The mesh's nodes in the guide's mesh; None if its coarse cells do not hold them."""
+        assert self.guide is not None
+        try:
+            return embed(self.guide.mesh, self.mesh.nodes)
+        except GeometryError:
+            return None
+
+    def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
+        """The guide's closed state at this mesh's nodes ``(n, 3)``; None without one."""
+        if self._in_guide is None:
+            return None
+        simulation = guide.close(m, sensitivities=False).simulation
+        return self._in_guide(simulation.frames[-1]) if simulation.converged else None
 
     def _values(self, m: FloatArray) -> dict[str, float]:
         """All parameters that have a value, those that are not estimated included."""
@@ -400,27 +385,18 @@ class ClosureModel:
             If a modulus is inadmissible.
         """
         values = self._values(m)
-        if self._system is None or self._solver is None:
-            self._solver = linear_solver(self.settings.solver)
+        if self._system is None:
             self._system = build_system(
                 self.valve, self.contact_valve, self.mesh, self.settings, values, ties=self.ties
             )
-        system = self._system
-        retune(system, self.settings, values)
-        return system, tuple(Parameter(n, values[n]) for n in self.names)
-
-    @property
-    def solver(self) -> LinearSolver:
-        """The solver that goes with the system, made with it."""
-        if self._solver is None:
-            self._solver = linear_solver(self.settings.solver)
-        return self._solver
+        retune(self._system, self.settings, values)
+        return self._system, tuple(Parameter(n, values[n]) for n in self.names)
 
     def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
         """Observed vertices ``(n, 3)`` mm of the closed valve in equilibria under other loads.
 
-        The valve is closed with parameters ``m (p,)`` first, and goes from one state to the next;
-        None from the first one on for which no equilibrium is found.
+        The valve is closed with parameters ``m (p,)`` and goes from one state to the next. From the
+        first state without an equilibrium on, the result is None.
 
         Raises
         ------
@@ -434,23 +410,23 @@ class ClosureModel:
         return frames + [None] * (len(states) - len(frames))
 
     def predict_held(self, m: FloatArray, states: Sequence[HeldState]) -> list[Prediction]:
-        """The observed vertices of the closed valve, and of equilibria under other loads.
+        """The closed valve and its equilibria under other loads, as `held`, with derivatives.
 
-        As `held`, with derivatives. The last prediction is the first that fails, if one does.
+        The last prediction is the first that fails, if one does.
         """
         try:
             ends = self.rests(m, states, sensitivities=True)
         except MaterialError as error:
             return [Prediction.failed(str(error))]
-        return [self._seen(end) for end in ends]
-
-    def _seen(self, simulation: Simulation) -> Prediction:
-        if not simulation.converged:
-            return Prediction.failed(
-                f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
+        return [
+            Prediction(
+                self.observed(end.frames[-1]).ravel(),
+                np.stack([self.observed(dx).ravel() for dx in end.sensitivities[-1]], axis=1),
             )
-        moved = [self.observed(dx).ravel() for dx in simulation.sensitivities[-1]]
-        return Prediction(self.observed(simulation.frames[-1]).ravel(), np.stack(moved, axis=1))
+            if end.converged
+            else Prediction.failed(failure_of(end))
+            for end in ends
+        ]
 
     def rests(
         self,
@@ -472,18 +448,17 @@ class ClosureModel:
         else:
             system = self.tuned(m)[0]
             loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
-            first = self._rest(system, loading, start, parameters, damped=True)
+            first = self._rest(loading, start, parameters, damped=True)
         ends = [first]
         for state in states:
             if not ends[-1].converged:
                 break
             loading = held_loading(system, self.contact_valve, state)
-            ends.append(self._rest(system, loading, ends[-1].frames[-1], parameters))
+            ends.append(self._rest(loading, ends[-1].frames[-1], parameters))
         return ends
 
     def _rest(
         self,
-        system: System,
         loading: Callable[[float], Loads],
         start: FloatArray,
         parameters: Sequence[Parameter] = (),
@@ -492,19 +467,16 @@ class ClosureModel:
     ) -> Simulation:
         """Equilibrium under constant loads from nodal positions ``start (n, 3)``.
 
-        It is looked for at once, or, where that fails or ``damped``, after some steps of time.
+        It is sought at once, or, where that fails or ``damped``, after some steps of time.
         """
         end = self.settings.protocol.end
         run = partial(
-            simulate,
-            system,
-            loading,
+            self._run,
+            start=start,
+            loading=loading,
             damping=self.settings.damping,
-            newton=self.settings.newton,
             parameters=parameters,
             final_only=True,
-            solver=self._solver,
-            initial_positions=start,
             initial_time=end,
         )
         if not damped:
@@ -513,24 +485,6 @@ class ClosureModel:
                 return simulation
         # Damping by stiffness helps leaflets to slide over each other to where they are held.
         return run(_resting(end, end + 1.0))
-
-    def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
-        """The guide's closed state at this mesh's nodes ``(n, 3)``.
-
-        None if it does not close, or if its cells are so coarse that they do not hold this mesh.
-        """
-        if self._in_guide is None:
-            try:
-                self._in_guide = embed(guide.mesh, self.mesh.nodes)
-            except GeometryError:
-                return None
-        simulation = guide.close(m, sensitivities=False).simulation
-        return self._in_guide(simulation.frames[-1]) if simulation.converged else None
-
-    @cached_property
-    def observed(self) -> Embedding:
-        """The observed vertices embedded in the mesh."""
-        return embed(self.mesh, self.valve.surface.vertices)
 
     def __call__(self, m: FloatArray) -> Prediction:
         """Positions of the observed vertices in the open and the closed frame, and their Jacobian.

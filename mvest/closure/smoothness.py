@@ -28,8 +28,8 @@ the resolution is continuous, which to an estimator of that modulus is the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -80,8 +80,8 @@ class Piece:
     vertices : int
         How many have more than the limit.
     unexplained, way : float
-        mm, of all vertices (the root of the sum of squares): what the derivatives do not say of the
-        way, and how long it is by what they say.
+        mm, of all vertices (the root of the sum of squares): what the derivatives do not explain of
+        the way, and its length by the derivatives.
     """
 
     low: float
@@ -91,27 +91,44 @@ class Piece:
     unexplained: float
     way: float
 
+    @classmethod
+    def between(cls, low: float, high: float, states: Mapping[float, PathState]) -> Piece:
+        """The piece between the states at two factors."""
+        a, b, width = states[low], states[high], np.log(high / low)
+        unexplained = b.y - a.y - 0.5 * width * (a.slope + b.slope)
+        at_vertex = np.linalg.norm(unexplained, axis=1)
+        way = 0.5 * width * float(np.linalg.norm(a.slope) + np.linalg.norm(b.slope))
+        many = int((at_vertex > JUMP_LIMIT).sum())
+        whole = float(np.linalg.norm(unexplained))
+        return cls(low, high, float(at_vertex.max()), many, whole, way)
+
     @property
     def share(self) -> float:
         """The unexplained over the way; 0 where there is no more than round-off."""
-        if self.unexplained_mm <= ROUND_OFF:
-            return 0.0
-        return self.unexplained / self.way if self.way > 0 else float("inf")
+        return 0.0 if self.unexplained_mm <= ROUND_OFF else _share(self.unexplained, self.way)
 
     @property
     def explained(self) -> bool:
-        """Whether it need not be looked at more closely."""
+        """Whether it need not be halved."""
         return self.unexplained_mm <= JUMP_LIMIT and self.share <= SLOPE_LIMIT
-
-    @property
-    def passed(self) -> bool:
-        """Whether it may stay as it is where it cannot be looked at more closely."""
-        return self.explained or self.unexplained_mm <= SEEN
 
     @property
     def width(self) -> float:
         """In log E."""
         return float(np.log(self.high / self.low))
+
+    @property
+    def fault(self) -> str:
+        """Why it fails where it cannot be halved; empty if it passes."""
+        if self.explained or self.unexplained_mm <= SEEN:
+            return ""
+        where = f"between {_percent(self.low)} and {_percent(self.high)}"
+        if self.unexplained_mm > JUMP_LIMIT:
+            return f"a jump of {self.unexplained_mm:.2g} mm at {self.vertices} vertices {where}"
+        return (
+            f"{100 * self.share:.2g} % of the way {where}, up to {self.unexplained_mm:.2g} mm, is "
+            "not what the derivatives say"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,12 +140,7 @@ class Path:
     name : str
         What is changed.
     pieces : tuple of Piece
-        In ascending order, after what was halved; up to the first that cannot be explained.
-    share : float
-        Of the whole way, what the derivatives do not explain: over all pieces, nothing cancels.
-    curvature : float
-        Largest difference of a central difference over the widest step from the exact derivative in
-        the middle, relative: how much the response bends. No limit is set to it.
+        In ascending order, after halving; up to the first that cannot be explained.
     closures : int
         How many states were computed, without the middle one.
     reason : str
@@ -137,10 +149,14 @@ class Path:
 
     name: str
     pieces: tuple[Piece, ...]
-    share: float
-    curvature: float
     closures: int
     reason: str
+
+    @property
+    def share(self) -> float:
+        """Unexplained share of the whole way: over all pieces, nothing cancels."""
+        unexplained = sum(piece.unexplained for piece in self.pieces if piece.share > 0)
+        return _share(unexplained, sum(piece.way for piece in self.pieces))
 
     @property
     def passed(self) -> bool:
@@ -167,7 +183,8 @@ def follow(
         Where else the path is looked at first, below and above 1.
     """
     states: dict[float, PathState] = {1.0: centre}
-    tried = 0
+    pieces: list[Piece] = []
+    tried, reason = 0, ""
 
     def missing(factor: float) -> str:
         nonlocal tried
@@ -180,80 +197,39 @@ def follow(
 
     for factor in factors:
         if reason := missing(factor):
-            return Path(name, (), float("nan"), float("nan"), tried, reason)
-    curvature = _curvature(states)
-    pieces: list[Piece] = []
+            return Path(name, (), tried, reason)
     # The last one is looked at first, so that pieces come in ascending order.
     waiting = [*pairwise(sorted(states))][::-1]
-    reason = ""
     while waiting and not reason:
         low, high = waiting.pop()
-        piece = _piece(low, high, states)
+        piece = Piece.between(low, high, states)
         if piece.explained or piece.width < RESOLUTION:
             pieces.append(piece)
-            reason = "" if piece.passed else _fault(piece)
+            reason = piece.fault
             continue
         middle = float(np.sqrt(low * high))
         reason = missing(middle)
         waiting += [(middle, high), (low, middle)]
-    share = _share(pieces)
-    return Path(name, tuple(pieces), share, curvature, tried, reason or _overall(pieces, share))
+    path = Path(name, tuple(pieces), tried, reason)
+    return replace(path, reason=reason or _overall(path))
 
 
-def _piece(low: float, high: float, states: dict[float, PathState]) -> Piece:
-    a, b, width = states[low], states[high], np.log(high / low)
-    unexplained = b.y - a.y - 0.5 * width * (a.slope + b.slope)
-    at_vertex = np.linalg.norm(unexplained, axis=1)
-    way = 0.5 * width * float(np.linalg.norm(a.slope) + np.linalg.norm(b.slope))
-    return Piece(
-        low,
-        high,
-        float(at_vertex.max()),
-        int((at_vertex > JUMP_LIMIT).sum()),
-        float(np.linalg.norm(unexplained)),
-        way,
-    )
-
-
-def _share(pieces: Sequence[Piece]) -> float:
-    """Of the whole way."""
-    unexplained = sum(piece.unexplained for piece in pieces if piece.share > 0)
-    way = sum(piece.way for piece in pieces)
-    if unexplained == 0:
-        return 0.0
-    return unexplained / way if way > 0 else float("inf")
-
-
-def _overall(pieces: Sequence[Piece], share: float) -> str:
-    """Why pieces that pass one by one do not do so together; empty if they do."""
-    for left, right in pairwise(pieces):
+def _overall(path: Path) -> str:
+    """Why pieces that pass one by one do not pass together; empty if they do."""
+    for left, right in pairwise(path.pieces):
         if min(left.share, right.share) > SIDE_LIMIT:
             return (
                 f"the derivative at {_percent(left.high)} explains neither side of it: "
                 f"{100 * left.share:.2g} and {100 * right.share:.2g} % of the way are left"
             )
-    if share > SLOPE_LIMIT:
-        return f"{100 * share:.2g} % of the whole way is not what the derivatives say"
+    if path.share > SLOPE_LIMIT:
+        return f"{100 * path.share:.2g} % of the whole way is not what the derivatives say"
     return ""
 
 
-def _fault(piece: Piece) -> str:
-    where = f"between {_percent(piece.low)} and {_percent(piece.high)}"
-    if piece.unexplained_mm > JUMP_LIMIT:
-        return f"a jump of {piece.unexplained_mm:.2g} mm at {piece.vertices} vertices {where}"
-    unexplained = (
-        f"{100 * piece.share:.2g} % of the way {where}, up to {piece.unexplained_mm:.2g} mm"
-    )
-    return f"{unexplained}, is not what the derivatives say"
+def _share(part: float, whole: float) -> float:
+    return part / whole if whole > 0 else float("inf") if part else 0.0
 
 
 def _percent(factor: float) -> str:
     return f"{100 * (factor - 1):+.3g} %"
-
-
-def _curvature(states: dict[float, PathState]) -> float:
-    low, high = min(states), max(states)
-    exact = states[1.0].slope
-    central = (states[high].y - states[low].y) / np.log(high / low)
-    size = float(np.linalg.norm(exact))
-    return float(np.linalg.norm(central - exact)) / size if size > 0 else 0.0

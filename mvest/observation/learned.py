@@ -102,14 +102,14 @@ def error_family(
         if points is None or points.shape != observation.positions.shape[1:]:
             raise InputError("errors of corresponding vertices need all vertices at rest")
         stds = np.sqrt(observation.variance)
-        stated, coordinates, curve_std = float(stds[-1]), 3, None
+        stated, coordinates = float(stds[-1]), 3
         scale = np.ones(len(points)) if observation.scale is None else observation.scale
         parts = [
             (frame, points[seen], scale[seen] * own / stds[-1], 0)
             for frame, seen, own in zip(observation.frames, observation.seen, stds, strict=True)
         ]
     else:
-        stated, coordinates, curve_std = observation.std_mm, 1, observation.curve_std_mm
+        stated, coordinates = observation.std_mm, 1
         parts = [
             (
                 seen.frame,
@@ -131,9 +131,8 @@ def error_family(
             quantities[ROUGH] = rough
             bands = bands or spectrum.prior(at)
         if curves:
-            assert curve_std is not None
             own.append(NoiseBlock(CURVES, np.ones(curves)))
-            quantities[CURVES] = LogNormal(curve_std, beliefs.std_factor)
+            quantities[CURVES] = LogNormal(stated, beliefs.std_factor)
         if own and frame != parts[-1][0]:
             name = f"frame {frame}"
             own = [replace(block, frame=name) for block in own]

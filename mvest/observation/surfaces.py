@@ -1,38 +1,29 @@
-"""What is seen of a valve where no vertex is known again: points and curves without correspondence.
+"""Observing surfaces without point correspondence: points and curves.
 
 A frame is seen as points somewhere on the leaflets and as a curve along the free edge. They are
-compared with a predicted surface by their distances to it:
+compared with the predicted surface, which is drawn finer and smoothed: of facets, derivatives jump
+across creases; points on the same closed valve were up to 0.3 mm off, and no estimate converged.
 
-* a point with the signed distance ``d = u . (x - c)`` to the closest point c of its own leaflet.
-  Inside a triangle u is its unit normal. Where c lies on an edge or a vertex, u is along x - c, on
-  the side of the angle-weighted normal there (Baerentzen and Aanaes, IEEE Trans. Vis. Comput.
-  Graph. 11 (2005) 243-253, who show that this side is right on any surface without border);
-* a point of the curve with the two components of x - c across the curve as it was seen. A distance
-  in space has a kink at zero; these have none, and two is what a point across a curve can tell.
+* A point is compared by its signed distance to its own leaflet (`smooth_distances`). Beyond the
+  border the surface goes on as it ends.
+* A point of the curve is compared by the two components of its offset across the curve as it was
+  seen (`smooth_offsets`). A distance in space has a kink at zero; these have none, and two is what
+  a point across a curve can tell. If its leaflet is known, it is compared with the edge of that
+  leaflet, since in a closed valve the edge of the other lies beside it.
 
 Sliding along the surface or the curve changes neither, so only what is seen enters the estimate.
-The derivatives are exact. c is where the distance is smallest, so its own sliding does not change
-the distance to first order (envelope theorem): ``dd/dm = -u . dc/dm`` with c fixed in the tissue.
-
-A surface of facets has creases, across which the derivatives jump, and vertices that are predicted
-are too few to draw it: points on the same closed valve were up to 0.3 mm off, and no estimate came
-to an end. So it may be drawn finer and smoothed (`PredictedSurface.finer`): it has no creases then,
-and goes on beyond its border as it ends. A point of the free edge is compared with the edge of its
-own leaflet where that is known, since in a closed valve that of the other lies beside it.
+The derivatives are exact.
 
 What to know:
 
 * Where two parts of a surface are equally near (inside a fold, between leaflets for points of
-  unknown leaflet), d has a kink; the derivative is that of one of them.
-* Beyond the border of a leaflet d is the distance to the border, and its sign changes across the
-  border triangle's plane. Independent errors do not see the sign, correlated ones do: leave such
-  points out then (`ObservedSurface.inner`, three standard deviations).
-* Errors that are rougher than they are said to be, as independent ones are, show in a normalised
-  innovation far above one per observation.
-* A point however far counts, at any distance; outliers are to be removed before.
-* Noise of s in every coordinate shifts d by about k s² on average, where k is the mean curvature:
-  0.025 mm for s = 0.5 mm at a bend of radius 5 mm (k = 0.1/mm).
-* Points are to lie on what the model predicts, the midsurface of the leaflets.
+  unknown leaflet), the distance has a kink; the derivative is that of one of them.
+* Errors that are rougher than stated, as independent ones are, show in a normalised innovation far
+  above one per observation.
+* A point counts at any distance; remove outliers first.
+* Noise of s in every coordinate shifts distances by about k s² on average, where k is the mean
+  curvature: 0.025 mm for s = 0.5 mm at a bend of radius 5 mm (k = 0.1/mm).
+* Points must lie on what the model predicts, the midsurface of the leaflets.
 """
 
 from __future__ import annotations
@@ -53,19 +44,15 @@ from mvest.estimation.noise import (
 from mvest.estimation.prediction import (
     ObservationModel,
     Prediction,
-    predict,
     read_only,
     require_finite,
 )
 from mvest.observation.errors import SpatialCorrelation
-from mvest.observation.vertices import FRAMES, scales
+from mvest.observation.vertices import FRAMES, observed_frames, require_frames, scales
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve, lumped_areas
 from mvest.valve.geometry.moving_distance import (
     across_curve,
-    closest_on_loop,
-    curve_offsets,
-    signed_distances,
     smooth_distances,
     smooth_offsets,
 )
@@ -125,25 +112,14 @@ class ObservedSurface:
         for name, values in {**checked, **numbers}.items():
             object.__setattr__(self, name, values)
 
-    def inner(self, distance: float | FloatArray, *curves: FloatArray) -> ObservedSurface:
-        """The same without the points nearer than ``distance`` mm to one of some closed curves.
-
-        ``distance`` is one number or one for each point ``(q,)``. Noise may put these points beyond
-        the border, which the curves are.
-        """
-        keep = np.ones(len(self.points), dtype=np.bool_)
-        for curve in curves:
-            offset = closest_on_loop(self.points, curve)[2]
-            keep &= np.linalg.norm(offset, axis=1) >= distance
-        return self._some(keep)
-
     def beyond(
         self, triangles: IntArray, vertices: FloatArray, distance: float | FloatArray
     ) -> ObservedSurface:
-        """The same without the points nearer than ``distance`` mm to some triangles."""
-        return self._some(surface_distance(self.points, vertices, triangles) >= distance)
+        """The same without the points nearer than ``distance`` mm to some triangles.
 
-    def _some(self, keep: BoolArray) -> ObservedSurface:
+        ``distance`` is one number or one for each point ``(q,)``.
+        """
+        keep = surface_distance(self.points, vertices, triangles) >= distance
         scale = None if self.scale is None else self.scale[keep]
         return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
 
@@ -158,64 +134,59 @@ class ObservedSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedSurface:
-    """How the positions that a model predicts form a surface.
+    """A surface through the positions that a model predicts, drawn finer and smoothed.
 
     Attributes
     ----------
-    n_vertices : int
-        Vertices n that the model predicts in each frame.
     triangles : (m, 3)
-        Their normals point to one side throughout.
+        Of the drawn vertices; their normals point to one side throughout.
     region : (m,)
         Leaflet of each triangle.
-    free_edge : (e,) or None
-        Vertices in loop order; None if the curve is not to be compared.
-    weights : (r, n) sparse or None
-        The surface's vertices, of those that are predicted; None: they are the same.
+    weights : (r, n) sparse
+        The drawn vertices, of those that are predicted.
     width : float
-        mm, over which the surface is smoothed where it has weights.
+        mm, over which the surface is smoothed.
+    free_edge : (e,) or None
+        Drawn vertices in loop order; None if the curve is not to be compared.
     """
 
-    n_vertices: int
     triangles: IntArray
     region: IntArray
+    weights: csr_array
+    width: float
     free_edge: IntArray | None = None
-    weights: csr_array | None = None
-    width: float = 0.0
 
     @classmethod
-    def of_valve(cls, valve: Valve) -> PredictedSurface:
+    def refined(
+        cls,
+        rest: FloatArray,
+        triangles: IntArray,
+        region: IntArray,
+        free_edge: IntArray | None,
+        edge_length: float,
+        width: float,
+    ) -> PredictedSurface:
+        """The surface of vertices ``rest (n, 3)`` mm with edges of a length; both lengths in mm."""
+        loops = () if free_edge is None else (free_edge,)
+        fine = refined(rest, triangles, edge_length, loops)
+        edge = fine.loops[0] if loops else None
+        return cls(fine.triangles, region[fine.parent], fine.weights, width, edge)
+
+    @classmethod
+    def of_valve(cls, valve: Valve, edge_length: float, width: float) -> PredictedSurface:
         """The surface of a valve whose vertices a model predicts, with the free edge."""
-        surface = valve.surface
-        return cls(len(surface.vertices), surface.triangles, surface.region, valve.free_edge)
-
-    def finer(self, rest: FloatArray, edge_length: float, width: float) -> PredictedSurface:
-        """The same surface drawn finer and smoothed; see `mvest.valve.geometry.triangles`.
-
-        Parameters
-        ----------
-        rest : (n, 3) mm
-            Its vertices at rest.
-        edge_length : float
-            mm.
-        width : float
-            mm, over which distances to it are smoothed.
-        """
-        loops = () if self.free_edge is None else (self.free_edge,)
-        fine = refined(rest, self.triangles, edge_length, loops)
-        return replace(
-            self,
-            triangles=fine.triangles,
-            region=self.region[fine.parent],
-            weights=fine.weights,
-            width=width,
-            free_edge=fine.loops[0] if loops else None,
+        own = valve.surface
+        return cls.refined(
+            own.vertices, own.triangles, own.region, valve.free_edge, edge_length, width
         )
 
+    @property
+    def size(self) -> int:
+        """Vertices n that the model predicts in each frame."""
+        return int(self.weights.shape[1])
+
     def drawn(self, predicted: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
-        """What belongs to the surface's vertices, or some, of what is predicted ``(n, ...)``."""
-        if self.weights is None:
-            return predicted[some]
+        """The drawn vertices, or some of them, of values of the predicted ones ``(n, ...)``."""
         flat = self.weights[some] @ predicted.reshape(len(predicted), -1)
         return np.asarray(flat).reshape(flat.shape[0], *predicted.shape[1:])
 
@@ -226,7 +197,7 @@ class PredictedSurface:
         ends = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1) @ [1 << 32, 1]
         return self.region[order[np.searchsorted(sides[order], ends)] % len(self.triangles)]
 
-    def of(self, region: int) -> IntArray:
+    def leaflet(self, region: int) -> IntArray:
         """Triangles of one leaflet, of all if it is ``UNKNOWN``."""
         return self.triangles if region == UNKNOWN else self.triangles[self.region == region]
 
@@ -244,9 +215,8 @@ class SurfaceObservation:
         One for each observed frame, the closed one last.
     surface : PredictedSurface
     std_mm : float
-        Standard deviation of the seen points along the normal.
-    curve_std_mm : float or None
-        Of each component of the points of the free edge; None if there are none.
+        Standard deviation of the seen points along the normal, and of each component of the points
+        of the free edge.
     correlation_length_mm : float
         Over which the errors of the distances are alike, see ``SpatialCorrelation``, within a frame
         and a leaflet; 0: independent. Errors of the free edge are independent.
@@ -265,15 +235,13 @@ class SurfaceObservation:
     seen: tuple[ObservedSurface, ...]
     surface: PredictedSurface
     std_mm: float
-    curve_std_mm: float | None = None
     correlation_length_mm: float = 0.0
     predicted: tuple[str, ...] = FRAMES
     R: NoiseCovariance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seen", tuple(self.seen))
-        if len(set(self.frames)) != len(self.frames):
-            raise InputError(f"observed frames {list(self.frames)}, expected different ones")
+        require_frames(self.frames, self.predicted)
         if not any(len(seen.points) or seen.free_edge is not None for seen in self.seen):
             raise InputError("nothing is seen: no frame has a point or a curve")
         require_numbers(self, "observation", "std_mm")
@@ -301,43 +269,32 @@ class SurfaceObservation:
         """The distances of what was seen to what a model predicts.
 
         What it hands on with a prediction are the observed frames with all vertices, (f, n, 3) mm.
-        To a triangle without area a distance is that to its edges; a point on it has no direction
-        and no derivative.
 
         Parameters
         ----------
         model : ObservationModel
             Predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
-
-        Raises
-        ------
-        InputError
-            If the model does not predict a frame that was seen.
         """
-        unknown = set(self.frames) - set(self.predicted)
-        if unknown:
-            raise InputError(f"observed frames {sorted(unknown)}, predicted {list(self.predicted)}")
-        chosen = [self.predicted.index(frame) for frame in self.frames]
-        shape = (len(self.predicted), self.surface.n_vertices, 3)
+        observed, n = observed_frames(model, self.frames, None, self.predicted), self.surface.size
 
         def distances(m: FloatArray) -> Prediction:
-            prediction = predict(model, m)
+            prediction = observed(m)
             if not prediction.converged:
                 return prediction
-            if prediction.y.size != np.prod(shape):
+            if prediction.y.size != 3 * n * len(self.frames):
                 raise InputError(
-                    f"the model predicts {prediction.y.size} coordinates; expected 3 of each of "
-                    f"{shape[1]} vertices in each of the frames {', '.join(self.predicted)}"
+                    f"the model predicts {prediction.y.size} coordinates of the frames "
+                    f"{', '.join(self.frames)}; expected 3 of each of {n} vertices in each"
                 )
-            whole = prediction.y.reshape(shape)[chosen]
-            motion = prediction.jacobian.reshape(*shape, prediction.jacobian.shape[1])[chosen]
+            whole = prediction.y.reshape(len(self.frames), n, 3)
+            motion = prediction.jacobian.reshape(*whole.shape, -1)
             parts = [
                 part
                 for seen, vertices, moved in zip(self.seen, whole, motion, strict=True)
                 for part in _of_frame(self, seen, vertices, moved)
             ]
             y, jacobian = (np.concatenate(column) for column in zip(*parts, strict=True))
-            return replace(prediction, y=y, jacobian=jacobian, aux=whole)
+            return replace(prediction, y=y, jacobian=jacobian)
 
         return distances
 
@@ -346,7 +303,7 @@ class SurfaceObservation:
         seen, distance = self.seen[-1], np.empty(len(self.seen[-1].points))
         vertices = self.surface.drawn(fitted[-1])
         for region, members in _by_region(seen):
-            triangles = self.surface.of(region)
+            triangles = self.surface.leaflet(region)
             distance[members] = surface_distance(seen.points[members], vertices, triangles)
         return distance
 
@@ -357,14 +314,10 @@ class SurfaceObservation:
                 f"frame {seen.frame}: points of region {min(missing)}, of which the model's "
                 f"surface has no triangle"
             )
-        if seen.free_edge is not None:
-            if self.surface.free_edge is None:
-                raise InputError(
-                    f"frame {seen.frame}: the free edge is seen, but the model's surface has none"
-                )
-            if self.curve_std_mm is None:
-                raise InputError("the free edge is seen, but curve_std_mm is not given")
-            require_numbers(self, "observation", "curve_std_mm")
+        if seen.free_edge is not None and self.surface.free_edge is None:
+            raise InputError(
+                f"frame {seen.frame}: the free edge is seen, but the model's surface has none"
+            )
 
     def size_of(self, seen: ObservedSurface) -> int:
         """How many numbers are observed in one of the frames."""
@@ -383,8 +336,7 @@ class SurfaceObservation:
             if q:
                 parts.append(noise if seen.scale is None else scaled_noise(noise, seen.scale))
             if rest := self.size_of(seen) - q:
-                assert self.curve_std_mm is not None
-                parts.append(observation_noise(self.curve_std_mm**2, rest))
+                parts.append(observation_noise(self.std_mm**2, rest))
         return stacked_noise(parts)
 
 
@@ -399,23 +351,16 @@ def _of_frame(
     drawn = surface.drawn(vertices)
     h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
     for region, members in _by_region(seen):
-        points, triangles = seen.points[members], surface.of(region)
-        if surface.weights is None:
-            h[members], H[members] = signed_distances(points, drawn, triangles, motion)
-            continue
+        points, triangles = seen.points[members], surface.leaflet(region)
         h[members], slopes = smooth_distances(points, drawn, triangles, surface.width)
         H[members] = sum(slope @ surface.weights @ motion[:, k] for k, slope in enumerate(slopes))
     yield h, H
     kept = _compared(seen)
     if seen.free_edge is None or surface.free_edge is None or not kept.any():
         return
-    assert observation.curve_std_mm is not None
     curve, loop = seen.free_edge, surface.free_edge
-    across = across_curve(curve, observation.curve_std_mm)[kept]
+    across = across_curve(curve, observation.std_mm)[kept]
     there, moved = drawn[loop], surface.drawn(motion, loop)
-    if surface.weights is None:
-        yield curve_offsets(curve[kept], across, there, moved)
-        return
     own = None
     if seen.free_edge_region is not None:
         own = seen.free_edge_region[kept, None] == surface.leaflet_along(loop)

@@ -234,7 +234,7 @@ class FrameErrors:
     def rough_observation(self) -> Observed:
         """The same, of which surfaces are seen through a blur."""
         observation = self.observation()
-        if not self.fitted.smooth:
+        if self.fitted.corresponding:
             return observation
         noise = observation.R
         if isinstance(noise, NoiseFamily):
@@ -256,7 +256,7 @@ class FrameErrors:
             fitted.length(),
             fitted.case.surface.vertices,
         )
-        if fitted.smooth:
+        if not fitted.corresponding:
             family = replace(family, resolution=max(family.resolution, SURFACE_MM))
         columns = [source.columns for source in self.sources]
         learned = [own for own in columns if own.factor > 1.0]

@@ -42,8 +42,7 @@ leaflet that is some millimetres away attracts smoothly, and what is beside it d
 
 SURFACE_MM = 0.1
 """mm, standard deviation below which no single point of a surface is believed where vertices do not
-correspond: between them both surfaces are only drawn. Where a case states less, surfaces are
-compared facet by facet as they are."""
+correspond: between them both surfaces are only drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,11 +77,6 @@ class FittedFrames:
         """Whether vertices are compared one by one."""
         return self.settings.correspondence and all(one.corresponds for one in self.frames)
 
-    @property
-    def smooth(self) -> bool:
-        """Whether surfaces are compared, and not known better than they can be drawn."""
-        return not self.corresponding and self.case.uncertainty.typical_mm >= SURFACE_MM
-
     def length(self, *, stated: bool = False) -> float:
         """Over how many mm errors are alike: as the case states, always so if ``stated``.
 
@@ -116,7 +110,7 @@ class FittedFrames:
         points = tuple(
             self._points(name, frame, scale) for name, frame in zip(names, self.frames, strict=True)
         )
-        return SurfaceObservation(points, self._surface(DRAWN, WIDTH), std, std, length, predicted)
+        return SurfaceObservation(points, self._surface(DRAWN, WIDTH), std, length, predicted)
 
     def blurred(self) -> SurfaceObservation:
         """Surfaces that are seen through a blur; see `BLUR`."""
@@ -140,16 +134,12 @@ class FittedFrames:
             seen,
             seen=tuple(replace(each, scale=None) for each in seen.seen),
             std_mm=std,
-            curve_std_mm=std,
             correlation_length_mm=0.0,
         )
 
     def _surface(self, edge: float, width: float) -> PredictedSurface:
-        """The predicted surface that points are compared with; see `PredictedSurface.finer`."""
-        surface = PredictedSurface.of_valve(self.valve)
-        if not self.smooth:
-            return surface
-        return surface.finer(self.valve.surface.vertices, edge, width)
+        """The predicted surface that points are compared with; see `PredictedSurface`."""
+        return PredictedSurface.of_valve(self.valve, edge, width)
 
     def _points(self, name: str, frame: Frame, scale: FloatArray | None) -> ObservedSurface:
         """What is compared of a frame whose vertices are not known again."""
@@ -164,15 +154,10 @@ class FittedFrames:
         )
         far = 1.0 if points.scale is None else points.scale
         alike = self.settings.errors is not None or uncertainty.correlation_length_mm > 0
-        if self.smooth:
-            if alike:
-                # Beyond its border the surface goes on, but where it bends not as it does here.
-                points = points.beyond(_rim(frame), frame.vertices, border * far)
-            return replace(points, free_edge_region=_edge_region(frame, region, border))
         if alike:
-            # Beyond a border a distance changes its sign, which correlated errors do not.
-            points = points.inner(border * far, frame.free_edge, frame.annulus)
-        return points
+            # Beyond its border the surface goes on, but where it bends not as it does here.
+            points = points.beyond(_rim(frame), frame.vertices, border * far)
+        return replace(points, free_edge_region=_edge_region(frame, region, border))
 
 
 def _thinned(n: int) -> BoolArray:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.closure.anchors import Anchors
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
@@ -95,12 +94,11 @@ def build_model(
     """
     _check_unknowns(case, settings)
     coarse = build_coarse(case, settings, store)
-    anchors = None if store is None else Anchors(store)
     shape = GivenValve(case.valve)
     if shape.band is None:
-        return replace(coarse, anchors=anchors)
+        return replace(coarse, anchors=store)
     solid = _solid(shape, settings.mesh, store)
-    return replace(coarse, mesh=solid, guide=coarse, anchors=anchors)
+    return replace(coarse, mesh=solid, guide=coarse, anchors=store)
 
 
 def build_coarse(

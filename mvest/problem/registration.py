@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mvest.closure.anchors import ClosedState
 from mvest.closure.frames import FramesModel, is_frame_pressure
-from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.parameters import KINDS

@@ -7,13 +7,13 @@ it (:mod:`mvest.cache`), is made once, and appears whole or not at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from mvest.cache import Counts, Entry, source_key
+from mvest.cache import Entry, source_key
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.provenance import config_hash
 from mvest.reading.npz import read_npz
@@ -42,17 +42,11 @@ class Store:
     Parameters
     ----------
     folder : Path
-        Made when something is kept.
-
-    Attributes
-    ----------
-    counts : Counts
-        Of all entries.
+        Made when something is cached.
     """
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
-        self.counts = Counts()
 
     def entry(
         self,
@@ -78,7 +72,7 @@ class Store:
             Of the file or folder, with ``{key}``.
         """
         path = self.folder / kind / name.format(key=key_of(described, made_by))
-        return Entry(path, read, counts=self.counts)
+        return Entry(path, read)
 
     def model(
         self,
@@ -101,14 +95,11 @@ class StoredModel:
     folder : Path
     key : str
         See :func:`key_of`; the parameters are added to it.
-    counts : Counts
-        Of what was in the store.
     """
 
     model: ObservationModel
     folder: Path
     key: str
-    counts: Counts = field(default_factory=Counts)
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``, read from disk if it is there; its Jacobian is then zero.
@@ -125,7 +116,7 @@ class StoredModel:
 
         about = {"key": self.key, "m": [float(v).hex() for v in m]}
         path = self.folder / f"{config_hash(about)[:DIGITS]}.npz"
-        return Entry(path, read, counts=self.counts).get_or_make(
+        return Entry(path, read).get_or_make(
             lambda: predict(self.model, m),
             lambda file, prediction: np.savez(file, y=prediction.y),
             lambda made: made.converged,
@@ -150,11 +141,6 @@ class Extrapolated:
     fine: StoredModel
     coarse: StoredModel
     share: float
-
-    @property
-    def counts(self) -> Counts:
-        """Of what was in the store."""
-        return self.fine.counts
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``, without derivatives."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tokenize
 import zipfile
 import zlib
@@ -18,15 +17,9 @@ from mvest.reading.text import one_line
 
 MAX_BYTES = 2**29
 """Of the arrays that are read from one file; what is compressed inflates to no more than stated."""
-MAX_LENGTH_OF_NOTHING = 1_000_000
-"""Of a dimension of an array without elements."""
 KINDS = "biufSU"
 """Of numbers and text."""
 
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 _DAMAGE = (
     *(OSError, ValueError, LookupError, EOFError, RuntimeError, ArithmeticError, TypeError),
     *(SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
@@ -69,22 +62,23 @@ def read_npz(
     """
     where = where or str(path)
     try:
+        # The file holds nothing else: NumPy would read a pickle or a single array as well.
         with zipfile.ZipFile(path) as archive:
-            members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-            wanted = list(members) if names is None else list(names)
-            wanted += [name for name in optional if name in members and name not in wanted]
-            if missing := ", ".join(name for name in wanted if name not in members):
-                raise InputError(f"{where}: arrays {one_line(missing, 120)} are missing")
-            more = ", ".join(name for name in members if name not in wanted)
-            if exact and more:
-                raise InputError(f"{where}: holds arrays {one_line(more, 120)} beside those needed")
-            total = sum(members[name].file_size for name in wanted)
-            if total > MAX_BYTES:
-                raise InputError(f"{where}: {total} bytes of arrays, expected at most {MAX_BYTES}")
-            return {
-                name: _array(archive, members[name], f"{where}: {one_line(name, 60)}")
-                for name in wanted
-            }
+            sizes = {one.filename.removesuffix(".npy"): one.file_size for one in archive.filelist}
+        wanted = list(sizes) if names is None else list(names)
+        wanted += [name for name in optional if name in sizes and name not in wanted]
+        if missing := ", ".join(name for name in wanted if name not in sizes):
+            raise InputError(f"{where}: arrays {one_line(missing, 120)} are missing")
+        more = ", ".join(name for name in sizes if name not in wanted)
+        if exact and more:
+            raise InputError(f"{where}: holds arrays {one_line(more, 120)} beside those needed")
+        total = sum(sizes[name] for name in wanted)
+        if total > MAX_BYTES:
+            raise InputError(f"{where}: {total} bytes of arrays, expected at most {MAX_BYTES}")
+        if not isinstance(path, Path):
+            path.seek(0)
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: _plain(arrays[name], f"{where}: {one_line(name, 60)}") for name in wanted}
     except FileNotFoundError as fault:
         raise InputError(f"{where} is missing") from fault
     except _DAMAGE as fault:
@@ -94,6 +88,20 @@ def read_npz(
             f"{where}: cannot be read: {one_line(fault, 100)}; expected .npz of plain arrays, "
             "without pickles"
         ) from fault
+
+
+def _plain(array: Any, where: str) -> NDArray[Any]:
+    """An array of numbers or text in the byte order of the machine."""
+    # A member without NumPy's header comes as bytes. An array without bytes may state any length.
+    plain = isinstance(array, np.ndarray) and array.dtype.kind in KINDS and array.dtype.itemsize
+    if not plain or max(array.shape, default=0) > MAX_BYTES:
+        raise InputError(f"{where}: expected a plain array of numbers or text")
+    array = np.asarray(array, array.dtype.newbyteorder("="))
+    if array.dtype.kind == "U":
+        codes = np.ascontiguousarray(array).view(np.uint32)
+        if ((codes > 0x10FFFF) | (codes >> 11 == 0x1B)).any():  # 0x1B << 11: surrogates
+            raise InputError(f"{where}: characters that are no Unicode")
+    return array
 
 
 def check_array(
@@ -120,28 +128,3 @@ def check_array(
     if kind == "f" and not np.isfinite(array).all():
         raise InputError(f"{where} has values that are not finite")
     return array if kind == "U" else array.astype({"f": np.float64, "i": np.int64}[kind])
-
-
-def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, where: str) -> NDArray[Any]:
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise InputError(f"{where}: compressed otherwise than NumPy does")
-    with archive.open(entry) as stream:
-        shape, in_columns, dtype = _HEADERS[np.lib.format.read_magic(stream)](stream)
-        if dtype.kind not in KINDS or not dtype.itemsize:
-            raise InputError(
-                f"{where} is of {one_line(dtype, 60)}; expected plain arrays of numbers or text"
-            )
-        size = math.prod(shape) * dtype.itemsize
-        whole = size == entry.file_size - stream.tell() and min(shape, default=0) >= 0
-        if not whole or (not size and max(shape) > MAX_LENGTH_OF_NOTHING):
-            raise InputError(
-                f"{where}: shape {one_line(shape, 60)} of {one_line(dtype, 40)} does not fit the "
-                f"{entry.file_size} bytes of the array"
-            )
-        content = bytearray(stream.read())
-    array = np.frombuffer(content, dtype).reshape(shape, order="F" if in_columns else "C")
-    if dtype.kind == "U":
-        codes = np.frombuffer(content, dtype.str[0] + "u4")
-        if ((codes > 0x10FFFF) | (codes >> 11 == 0x1B)).any():  # 0x1B << 11: surrogates
-            raise InputError(f"{where}: characters that are no Unicode")
-    return array.astype(dtype.newbyteorder("="), copy=False)

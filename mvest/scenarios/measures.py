@@ -23,7 +23,7 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.thickening import thicken
-from mvest.valve.measure.annulus import annulus_plane, measure_annulus
+from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.clinical import tenting
 from mvest.valve.measure.coaptation import (
     coaptation_area,
@@ -68,14 +68,12 @@ def measure_steps(
     closed_surface = thicken(surface, normals)
     faces = embed(model.mesh, closed_surface.vertices)
     loading = boundary_loading(system, valve, model.contact_valve, model.settings)
-    first = np.unique(surface.triangles[surface.region == 0])
     one, other = (surface.triangles[surface.region == k] for k in (0, 1))
     measures = []
     for time, x in zip(simulation.times, simulation.frames, strict=True):
         middle, outer = model.observed(x), faces(x)
         annulus = middle[valve.annulus]
-        anterior = middle[np.intersect1d(valve.annulus, first)].mean(axis=0)
-        plane = annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior)
+        plane = plane_of(valve, annulus)
         loads = loading(time)
         strain, force = _chordae(system, x, loads.tips)
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
@@ -136,6 +134,13 @@ def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.eigvalsh(sigma)[..., -1])
 
 
+def _stress(system: System, x: FloatArray) -> FloatArray:
+    """First principal Cauchy stress ``(e, q)`` MPa at the points of quadrature."""
+    solid = system.solid
+    state = solid.evaluate(x, solid.initial_strain(), 0.0)
+    return principal_cauchy(state.green, state.stress)
+
+
 def peak_stress(system: System, x: FloatArray) -> Measured:
     """Peak stress of each region in equilibrium, as `Measured` names it; volumes are at rest.
 
@@ -154,36 +159,25 @@ def peak_stress(system: System, x: FloatArray) -> Measured:
     InputError
         If an element is turned inside out.
     """
-    solid = system.solid
-    state = solid.evaluate(x, solid.initial_strain(), 0.0)
-    values = principal_cauchy(state.green, state.stress)
+    values, mesh = _stress(system, x), system.solid.mesh
     if not np.isfinite(values).all():
         raise InputError("the stress is not finite: an element is turned inside out")
-    mesh = solid.mesh
-    return {
-        f"stress_{kind}_{name}_mpa": peak
-        for number, name in enumerate(mesh.region_names)
-        for kind, peak in _peaks(
-            values[mesh.region == number].ravel(), solid.volumes[mesh.region == number].ravel()
-        ).items()
-    }
+    peaks: Measured = {}
+    for number, name in enumerate(mesh.region_names):
+        own = mesh.region == number
+        for kind, peak in _peaks(values[own].ravel(), system.solid.volumes[own].ravel()).items():
+            peaks[f"stress_{kind}_{name}_mpa"] = peak
+    return peaks
 
 
 def nodal_stress(system: System, x: FloatArray) -> FloatArray:
     """First principal Cauchy stress ``(n,)`` (MPa) at the nodes, means of their elements by volume.
 
-    Parameters
-    ----------
-    system : System
-        Set to its parameters.
-    x : ndarray
-        ``(n, 3)`` mm nodal positions.
+    Parameters are those of `peak_stress`.
     """
     solid = system.solid
-    state = solid.evaluate(x, solid.initial_strain(), 0.0)
-    values = principal_cauchy(state.green, state.stress)
     weight = solid.volumes.sum(axis=1)
-    mean = (values * solid.volumes).sum(axis=1) / weight
+    mean = (_stress(system, x) * solid.volumes).sum(axis=1) / weight
     nodes, count = solid.mesh.elements, solid.mesh.elements.shape[1]
     total = np.bincount(nodes.ravel(), np.repeat(weight, count), len(x))
     stress = np.bincount(nodes.ravel(), np.repeat(mean * weight, count), len(x))

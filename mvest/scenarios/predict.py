@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,26 +45,6 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     return np.array([estimate.transform.inverse(row) for row in z])
 
 
-def summary_of(values: Sequence[float]) -> dict[str, float]:
-    """What samples say of a number; those that are NaN gave none.
-
-    Returns
-    -------
-    dict
-        ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles, unbiased for the
-        median (Hyndman and Fan 1996, Am. Stat. 50:361, type 8), which lie close to the extremes
-        with fewer than 40 samples; and how many ``samples`` gave a number. NaN where these are too
-        few.
-    """
-    known = np.array([v for v in values if np.isfinite(v)])
-    mean = float(known.mean()) if len(known) else float("nan")
-    std = low = high = float("nan")
-    if len(known) > 1:
-        std = float(known.std(ddof=1))
-        low, high = map(float, np.quantile(known, [0.025, 0.975], method="median_unbiased"))
-    return {"mean": mean, "std": std, "low": low, "high": high, "samples": len(known)}
-
-
 NORMAL_95 = 1.959963984540054
 """Half-width of a 95 % interval in standard deviations."""
 
@@ -76,22 +56,21 @@ class Sample:
     Attributes
     ----------
     measures : dict
-        Empty where the valve was not closed.
+        Empty if the valve does not close.
     reason : str
     """
 
     measures: Measured
     reason: str = ""
 
-    @property
-    def failed(self) -> bool:
-        """Whether no closed valve was found."""
-        return not self.measures
+    def get(self, name: str) -> float:
+        """A measure; NaN if it is not known."""
+        return self.measures.get(name, float("nan"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedScenario:
-    """What is predicted of a valve under one scenario.
+    """Prediction of a valve under one scenario.
 
     Attributes
     ----------
@@ -112,25 +91,40 @@ class PredictedScenario:
     @property
     def failures(self) -> tuple[str, ...]:
         """Reasons of the samples that gave no closed valve."""
-        return tuple(sample.reason for sample in self.samples if sample.failed)
+        return tuple(sample.reason for sample in self.samples if not sample.measures)
 
     def spread(self, name: str) -> dict[str, float]:
-        """What the samples say of a measure; failed samples say nothing, and are counted apart."""
-        return summary_of([s.measures.get(name, float("nan")) for s in self.samples])
+        """Statistics of a measure over the samples; failed samples are left out.
+
+        Returns
+        -------
+        dict
+            ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles, unbiased for
+            the median (Hyndman and Fan 1996, Am. Stat. 50:361, type 8), which lie close to the
+            extremes with fewer than 40 samples; and how many ``samples`` gave a number. NaN where
+            these are too few.
+        """
+        known = np.array([v for v in (one.get(name) for one in self.samples) if np.isfinite(v)])
+        mean = float(known.mean()) if len(known) else float("nan")
+        std = low = high = float("nan")
+        if len(known) > 1:
+            std = float(known.std(ddof=1))
+            low, high = map(float, np.quantile(known, [0.025, 0.975], method="median_unbiased"))
+        return {"mean": mean, "std": std, "low": low, "high": high, "samples": len(known)}
 
     def mesh_error(self, name: str) -> float:
-        """How far a measure is from that of the finer mesh; NaN where there is none.
+        """Difference of a measure from that of the finer mesh; NaN where there is none.
 
-        Taken as a standard deviation of what the mesh adds [choice]. Where two meshes are all there
-        is, Roache's grid convergence index (1994, J. Fluids Eng. 116:405) is stricter: with its
-        safety factor of 3, a refinement ratio of 1.65 and second order, 4.7 differences in place of
-        the 1.96 of `interval`.
+        Taken as a standard deviation of the mesh's error [choice]. Of two meshes, Roache's grid
+        convergence index (1994, J. Fluids Eng. 116:405) is stricter: with its safety factor of 3, a
+        refinement ratio of 1.65 and second order, 4.7 differences in place of the 1.96 of
+        `interval`.
         """
-        if self.finer is None:
-            return float("nan")
-        missing = float("nan")
-        finer, own = (s.measures.get(name, missing) for s in (self.finer, self.at_estimate))
-        return abs(finer - own)
+        return (
+            float("nan")
+            if self.finer is None
+            else abs(self.finer.get(name) - self.at_estimate.get(name))
+        )
 
     def interval(self, name: str) -> tuple[float, float]:
         """95 % interval of a measure with the error of the mesh; NaN where that is not known.
@@ -139,7 +133,7 @@ class PredictedScenario:
         errors add up. A measure that cannot be negative (see `NEVER_NEGATIVE`) stays so.
         """
         spread, error = self.spread(name), NORMAL_95 * self.mesh_error(name)
-        centre = self.at_estimate.measures.get(name, float("nan"))
+        centre = self.at_estimate.get(name)
         low = centre - np.hypot(max(centre - spread["low"], 0.0), error)
         high = centre + np.hypot(max(spread["high"] - centre, 0.0), error)
         if name.startswith(NEVER_NEGATIVE) and low < 0.0:
@@ -164,25 +158,27 @@ class PredictedScenario:
         """
         rows: dict[str, dict[str, float | bool | None]] = {}
         for name, value in self.at_estimate.measures.items():
-            spread, (low, high) = self.spread(name), self.interval(name)
-            on_own, on_same = (sample.measures.get(name) for sample in (own, same))
+            spread, wide = self.spread(name), self.interval(name)
+            narrow = spread["low"], spread["high"]
+            on_own, on_same = own.measures.get(name), same.measures.get(name)
             rows[name] = {
                 "estimate": value,
                 **spread,
                 "mesh_error": self.mesh_error(name),
-                "wide_low": low,
-                "wide_high": high,
+                "wide_low": wide[0],
+                "wide_high": wide[1],
                 "truth_own_mesh": on_own,
-                "inside_own_mesh": _inside(spread["low"], on_own, spread["high"]),
+                "inside_own_mesh": _inside(narrow, on_own),
                 "truth_same_mesh": on_same,
-                "inside_same_mesh": _inside(spread["low"], on_same, spread["high"]),
-                "inside_wide": _inside(low, on_own, high),
+                "inside_same_mesh": _inside(narrow, on_same),
+                "inside_wide": _inside(wide, on_own),
             }
         return rows
 
 
-def _inside(low: float, true: float | None, high: float) -> bool | None:
+def _inside(interval: tuple[float, float], true: float | None) -> bool | None:
     """Whether an interval holds the truth; None where one of them is not known."""
+    low, high = interval
     return None if true is None or not np.isfinite(high - low) else bool(low <= true <= high)
 
 
@@ -236,7 +232,7 @@ def predict_scenario(
             f"the estimate is of {', '.join(estimate.names)}, the model has "
             f"{', '.join(model.names)}"
         )
-    # With derivatives, which tell the samples where their equilibria are to be expected.
+    # With derivatives, from which the equilibria of the samples are expected.
     first, shape = closed_valve(model, estimate.mean, sensitivities=True)
     start = model.closed
     predicted = []

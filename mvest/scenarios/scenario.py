@@ -20,7 +20,7 @@ from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 
 NARROWEST = 0.3
-"""Share of the anteroposterior diameter below which nothing is narrowed."""
+"""Share of the anteroposterior diameter that any ring leaves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,40 +34,25 @@ class Annuloplasty:
 
     Attributes
     ----------
-    percent, mm : float
-        By how much the anteroposterior diameter becomes smaller; one of the two is 0.
+    percent : float
+        By how much the anteroposterior diameter becomes smaller.
     """
 
-    percent: Percent = 0.0
-    mm: Length = 0.0
+    percent: Percent
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.percent) and np.isfinite(self.mm)):
-            raise InputError(f"annuloplasty of {self.percent} % and {self.mm} mm, expected numbers")
-        if min(self.percent, self.mm) < 0 or (self.percent > 0) == (self.mm > 0):
+        if not 0 < self.percent < 100 * (1 - NARROWEST):
             raise InputError(
-                f"annuloplasty of {self.percent} % and {self.mm} mm, expected one of them > 0 and "
-                "the other 0"
+                f"annuloplasty of {self.percent} %, expected more than 0 and less than "
+                f"{100 * (1 - NARROWEST):g} %"
             )
-        if self.percent >= 100 * (1 - NARROWEST):
-            raise InputError(
-                f"annuloplasty of {self.percent} %, expected less than {100 * (1 - NARROWEST):g} %"
-            )
-
-    def diameter(self, before: float) -> float:
-        """Anteroposterior diameter (mm) that is asked for where it was ``before``."""
-        after = before * (1 - self.percent / 100) - self.mm
-        if not after > NARROWEST * before:
-            raise InputError(
-                f"annuloplasty by {self.mm} mm of an annulus of {before:.1f} mm, expected to "
-                f"leave more than {100 * NARROWEST:g} %"
-            )
-        return after
 
 
 @dataclass(frozen=True, slots=True)
 class Clip:
     """An edge-to-edge clip: pairs of points of the two leaflets that are tied together.
+
+    The midsurfaces are held at the distance at which the contact carries its reference pressure.
 
     Attributes
     ----------
@@ -78,9 +63,6 @@ class Clip:
         Along the free edges.
     grasp_mm : float
         How far from the free edges the leaflets are held.
-    distance_mm : float or None
-        Between the midsurfaces that are held; None: the distance at which the contact carries its
-        reference pressure.
     stiffness : float
         N/mm of each pair.
     """
@@ -88,25 +70,22 @@ class Clip:
     position_mm: Place = 0.0
     width_mm: Length = 5.0
     grasp_mm: Length = 4.0
-    distance_mm: Length | None = None
     stiffness: Stiffness = 100.0
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.position_mm):
             raise InputError(f"clip at {self.position_mm} mm, expected a finite number")
         require_numbers(self, "clip", "width_mm", "grasp_mm", "stiffness")
-        if self.distance_mm is not None:
-            require_numbers(self, "clip", "distance_mm")
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What is changed; nothing is the valve as it was observed. All of it can be combined.
+    """Changes of a valve, in any combination; without any it is the valve as observed.
 
     Attributes
     ----------
     title : str
-        What a table calls it.
+        Its name in a table.
     pressure_mmHg : float or None
         Peak transmitral pressure; None: that of the observed valve.
     annuloplasty : Annuloplasty or None
@@ -121,10 +100,8 @@ class Scenario:
     def __post_init__(self) -> None:
         if not self.title.strip():
             raise InputError("a scenario needs a title")
-        if self.pressure_mmHg is not None and not (
-            np.isfinite(self.pressure_mmHg) and self.pressure_mmHg > 0
-        ):
-            raise InputError(f"pressure {self.pressure_mmHg} mmHg of a scenario, expected > 0")
+        if self.pressure_mmHg is not None:
+            require_numbers(self, "scenario", "pressure_mmHg")
 
 
 def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
@@ -132,7 +109,7 @@ def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
 
     Raises
     ------
-    InputError, GeometryError
+    GeometryError
         If the scenario does not fit the valve.
     """
     changed = model.fresh()
@@ -142,10 +119,10 @@ def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
         protocol = replace(model.settings.protocol, pressure_mmHg=scenario.pressure_mmHg)
         changed.settings = replace(model.settings, protocol=protocol)
     if scenario.annuloplasty is not None:
-        contact_valve = model.contact_valve
-        plane = plane_of(contact_valve, contact_valve.motion.annulus[-1])
-        share = _share(contact_valve, plane, scenario.annuloplasty)
-        changed.contact_valve = _with_ring(contact_valve, plane, share)
+        annulus = model.contact_valve.motion.annulus[-1]
+        plane = plane_of(model.contact_valve, annulus)
+        share = _share(model.contact_valve, plane, scenario.annuloplasty)
+        changed.contact_valve = _with_ring(model.contact_valve, plane, share)
         changed.valve = _with_ring(model.valve, plane, share)
     if scenario.clip is not None:
         changed.ties = _tied(model, scenario.clip)
@@ -166,12 +143,13 @@ def narrowed(annulus: FloatArray, plane: AnnulusPlane, share: float) -> FloatArr
 
 
 def _share(valve: Valve, plane: AnnulusPlane, ring: Annuloplasty) -> float:
-    """Share that gives the annulus, measured in its own new plane, the diameter asked for.
+    """Share that gives the annulus, measured in its own new plane, the wanted diameter.
 
     Nearly the ratio of the diameters; the centre of the curve moves a little as it is narrowed.
     """
     annulus = valve.motion.annulus[-1]
-    wanted = ring.diameter(measure_annulus(annulus, plane).anteroposterior_diameter)
+    before = measure_annulus(annulus, plane).anteroposterior_diameter
+    wanted = before * (1 - ring.percent / 100)
 
     def excess(share: float) -> float:
         new = narrowed(annulus, plane, share)
@@ -194,11 +172,9 @@ def _with_ring(valve: Valve, plane: AnnulusPlane, share: float) -> Valve:
 
 # -- clip -----------------------------------------------------------------------------------------
 def _tied(model: ClosureModel, clip: Clip) -> TiedPoints:
-    surface = model.contact_valve.surface
-    distance = clip.distance_mm
-    if distance is None:
-        edge = float(surface.thickness[model.contact_valve.free_edge].mean())
-        distance = model.settings.contact.reference_distance * edge
+    valve = model.contact_valve
+    edge = float(valve.surface.thickness[valve.free_edge].mean())
+    distance = model.settings.contact.reference_distance * edge
     return TiedPoints(*clip_points(model.contact_valve, clip), distance, clip.stiffness)
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.anchors import Anchors
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Step
@@ -124,7 +123,7 @@ def test_continued_closure(case, measure):
 
 def test_anchored_closure(case, measure, tmp_path):
     c, about = case
-    model = replace(c.model.fresh(), continuation=True, anchors=Anchors(tmp_path))
+    model = replace(c.model.fresh(), continuation=True, anchors=tmp_path)
     m = farther(about["size"])
     assert model.close(m).simulation.converged  # builds the mechanics and makes the anchor
     about = about | {"rounds": 3, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb}

@@ -1,13 +1,7 @@
-"""Closures of valves out of this world, and whether they end as closures must.
-
-``python -m tests.closure.extremes`` prints the table of all of them, and with names of those only.
-"""
+"""Closures of extreme valves, and whether they end as closures must."""
 
 from __future__ import annotations
 
-import resource
-import sys
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -115,9 +109,6 @@ class Ended:
     intersects : bool
     finite : bool
         Whether positions and derivatives are.
-    iterations : int
-    seconds : float
-        Of a core.
     """
 
     reason: str
@@ -125,8 +116,6 @@ class Ended:
     residual: float = np.nan
     intersects: bool = False
     finite: bool = True
-    iterations: int = 0
-    seconds: float = 0.0
 
     @property
     def sound(self) -> bool:
@@ -160,18 +149,15 @@ REGIONS = ("anterior", "posterior")
 
 def close(extreme: Extreme) -> Ended:
     """Close a valve, and look at what comes of it."""
-    began = time.process_time()
     try:
         model = model_of(extreme)
         simulation = model.close(np.array(extreme.moduli)).simulation
     except MvestError as error:
-        return Ended(str(error), seconds=time.process_time() - began)
-    return look_at(model, simulation, extreme.moduli, time.process_time() - began)
+        return Ended(str(error))
+    return look_at(model, simulation, extreme.moduli)
 
 
-def look_at(
-    model: ClosureModel, simulation: Simulation, moduli: tuple[float, ...], seconds: float = 0.0
-) -> Ended:
+def look_at(model: ClosureModel, simulation: Simulation, moduli: tuple[float, ...]) -> Ended:
     """The last state of a closure in the eyes of a system that has seen nothing else."""
     x, dx = simulation.frames[-1], simulation.sensitivities[-1]
     system, _ = model.fresh().tuned(np.array(moduli))
@@ -187,24 +173,4 @@ def look_at(
         float(np.linalg.norm(state.residual)) / max(state.scale, 1e-12),
         system.contact.intersects(system.contact.points(x)),
         bool(np.isfinite(x).all() and np.isfinite(dx).all()),
-        simulation.iterations,
-        seconds,
     )
-
-
-def main(names: list[str]) -> None:
-    """Print a line for each."""
-    known = EXTREMES | ENDLESS
-    for name in names or known:
-        ended = close(known[name])
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(
-            f"{name:36s} {'closed' if ended.converged else 'open'}, "
-            f"{'sound' if ended.sound else 'NOT SOUND'}, residual {ended.residual:.0e}, "
-            f"{ended.iterations} iterations, {ended.seconds:.1f} s, {peak:.2f} GB: {ended.reason}",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -8,9 +8,6 @@ import pytest
 from mvest import Gaussian, IteratedFilter, Log
 from tests.closure.extremes import ENDLESS, EXTREMES, STIFF, close, look_at, model_of
 
-SOON, LATE = 60.0, 300.0
-"""s of a core, compilation on a fresh machine included: several times what is needed."""
-
 
 @pytest.mark.parametrize("name", EXTREMES)
 def test_an_extreme_closes_or_says_why_not(name):
@@ -18,7 +15,6 @@ def test_an_extreme_closes_or_says_why_not(name):
     assert ended.sound, ended
     if EXTREMES[name].closes is not None:
         assert ended.converged == EXTREMES[name].closes, ended
-    assert ended.seconds < SOON
 
 
 @pytest.mark.slow
@@ -26,7 +22,6 @@ def test_an_extreme_closes_or_says_why_not(name):
 def test_what_is_tried_for_long_ends_as_well(name):
     ended = close(ENDLESS[name])
     assert ended.sound, ended
-    assert ended.seconds < LATE
 
 
 @pytest.mark.parametrize("name", ["mesh 300 x 40", "mesh 300 x 40, thickness 4 mm"])

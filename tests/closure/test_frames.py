@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mvest.closure.anchors import ClosedState
 from mvest.closure.frames import ERROR, OFFSET, FramesModel
-from mvest.closure.model import ClosedState
 from mvest.errors import InputError
 from mvest.mechanics.valve_system import HeldState
 from tests.closure.test_model import AT, CLOSING, MODULI, model_of, settings_of, step_study

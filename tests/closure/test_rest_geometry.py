@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.model import ClosedState
+from mvest.closure.anchors import ClosedState
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.mechanics.forces.contact import Contact

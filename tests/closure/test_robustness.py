@@ -112,15 +112,6 @@ def test_a_valve_of_one_modulus_is_followed_once():
     assert [path.name for path in report.paths] == ["E_f"]
 
 
-def test_a_bent_response_passes_and_its_curvature_is_stated():
-    # f^6 over 0.8 .. 1.2: (1.2^6 - 0.8^6) / log 1.5 is 10.9 % more than 6.
-    report = run_gate(built(size=1.0, power=6), AT)
-    assert report.passed
-    expected = (1.2**6 - 0.8**6) / np.log(1.5) / 6 - 1
-    assert report.paths[0].curvature == pytest.approx(expected, rel=1e-6)
-    assert expected > 0.1
-
-
 def test_a_jump_along_the_moduli_fails():
     report = run_gate(built(jump_at=1.1), AT)
     assert not report.passed
@@ -236,7 +227,6 @@ def test_rows_and_paths_are_told_as_they_are_finished():
     report = run_gate(built(), AT, cases, on_case=seen.append, on_path=followed.append)
     assert tuple(seen) == report.rows
     assert [row.case for row in seen] == ["reference", "time step / 2", "ramp / 3"]
-    assert all(row.seconds >= 0 for row in seen)
     assert tuple(followed) == report.paths
 
 

@@ -89,8 +89,8 @@ def surface_observation(height: FloatArray, curve: FloatArray) -> SurfaceObserva
         of_point[inner],
         free_edge=POINTS[border] + curve,
     )
-    surface = PredictedSurface(N, TRIANGLES, leaflet, border)
-    return SurfaceObservation((seen,), surface, 0.5, 0.5)
+    surface = PredictedSurface.refined(POINTS, TRIANGLES, leaflet, border, 2.0, 1.0)
+    return SurfaceObservation((seen,), surface, 0.5)
 
 
 def test_points_of_different_leaflets_and_curves_are_independent() -> None:

@@ -50,12 +50,12 @@ def test_a_guided_case_is_also_closed_with_its_guide(asked):
 
 def test_the_verdict_comes_first_and_then_what_it_fails_by():
     rows = (
-        GateRow("reference", 0.0, 0.0, True, 1.0, "converged"),
-        GateRow("time step / 2", float("nan"), float("nan"), False, 1.0, "it buckled"),
-        GateRow("ramp / 3", 0.04, 0.7, False, 1.0, "converged"),
+        GateRow("reference", 0.0, 0.0, True, "converged"),
+        GateRow("time step / 2", float("nan"), float("nan"), False, "it buckled"),
+        GateRow("ramp / 3", 0.04, 0.7, False, "converged"),
     )
-    jumping = Path("E_f", (), 0.01, 0.1, 3, "a jump of 0.3 mm")
-    paths = (jumping, Path("E_f.anterior", (), 0.01, 0.1, 3, ""))
+    jumping = Path("E_f", (), 3, "a jump of 0.3 mm")
+    paths = (jumping, Path("E_f.anterior", (), 3, ""))
     first, *others = gate_lines(GateReport(rows, paths, None, False))
     assert "gate NOT passed" in first
     assert "2 variations, 0.7 mm at most" in first

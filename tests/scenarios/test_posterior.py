@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction, Reason, observation_noise
-from mvest.scenarios.predict import posterior_samples, summary_of
+from mvest.scenarios.predict import PredictedScenario, Sample, posterior_samples
 
 MEAN, SHIFT = np.array([5.0, 2.0]), np.array([[1.0, 0.6], [0.0, 1.0]])
 
@@ -62,17 +62,20 @@ def test_an_estimate_that_did_not_converge_has_no_samples():
         posterior_samples(replace(estimated(), reason=Reason.NO_DECREASE), 8, 1)
 
 
+def spread_of(values):
+    samples = tuple(Sample({"a": float(value)}) for value in values)
+    return PredictedScenario(Sample({}), None, (*samples, Sample({}, "did not close"))).spread("a")
+
+
 def test_the_interval_is_that_of_the_samples():
     # Type 8 of n = 40 numbers 1 to 40: at position (n + 1/3) p + 1/3 = 1.3417 for p = 0.025.
-    spread = summary_of([*range(1, 41), float("nan")])
+    spread = spread_of(range(1, 41))
     assert spread["samples"] == 40
     assert spread["low"] == pytest.approx(1.3417, abs=1e-4)
     assert spread["high"] == pytest.approx(41 - 1.3417, abs=1e-4)
     assert spread["mean"] == 20.5
     assert spread["std"] == pytest.approx(np.std(range(40), ddof=1))
-
-
-def test_one_sample_has_no_spread():
-    spread = summary_of([3.0, float("nan")])
+    # One sample has no spread.
+    spread = spread_of([3.0])
     assert (spread["mean"], spread["samples"]) == (3.0, 1)
     assert np.isnan([spread["std"], spread["low"], spread["high"]]).all()

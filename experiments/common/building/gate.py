@@ -60,7 +60,7 @@ def gate_rows(report: GateReport) -> Table:
     """A row for each variation, and for each path along moduli (``along E_f``).
 
     The largest distance of a path is what the derivatives do not explain at any one vertex; of it
-    there is also the share of the whole way, and the curvature of the way.
+    there is also the share of the whole way.
     """
     rows = [
         {"variation": r.case, "mean": r.mean_mm, "max": r.max_mm, "passed": r.passed}
@@ -71,8 +71,7 @@ def gate_rows(report: GateReport) -> Table:
         {
             "variation": f"along {path.name}",
             "max": max((piece.unexplained_mm for piece in path.pieces), default=None),
-            "share": path.share,
-            "curvature": path.curvature,
+            "share": path.share if path.pieces else None,
             "passed": path.passed,
             "reason": path.reason,
         }

@@ -13,7 +13,8 @@ from experiments.common.records.record import read_record
 from experiments.common.study import Results
 from experiments.studies import prediction
 from experiments.studies.prediction import DRAWN, PREDICTED, PRESCRIBED, coverage_table
-from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.anchors import ClosedState
+from mvest.closure.model import ClosureModel
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import build_system
 
@@ -200,7 +201,7 @@ def test_an_interval_without_width_counts_only_where_it_misses():
         ("prediction.samples=24", "prediction.samples = 24, expected a power of two"),
         ("prediction.spread=[0.1]", "prediction.spread has 1 values"),
         ("prediction.scenarios.both.clip.width_mm=-1", "clip.width_mm = -1, expected 0 to"),
-        ("prediction.scenarios.both.annuloplasty.mm=2", "one of them > 0"),
+        ("prediction.scenarios.both.annuloplasty.percent=80", "less than 70 %"),
     ],
 )
 def test_inadmissible_settings_are_refused(run, override, message):
