@@ -9,11 +9,11 @@ from __future__ import annotations
 import runpy
 import sys
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
 from experiments.common.building.filters import build_filter
 from experiments.common.places import CHECKOUT
@@ -32,6 +32,7 @@ from mvest.exchange.external.model import Differences, ProcessModel
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate
 from mvest.problem.record import EstimateRecord, record_of
+from mvest.quantities import Length, Processes, TimeLimit, Tolerance, Value, within
 from mvest.reporting.tables import Column, table
 from mvest.typing import FloatArray
 
@@ -67,11 +68,11 @@ class ModelSettings:
     environment: dict[str, str] = field(default_factory=dict)  # beside what this process has
     # Files and folders after whose change runs are done anew, beside those in the command.
     inputs: Annotated[tuple[str, ...], Reads(contents)] = ()
-    time_limit_s: Annotated[float, Field(ge=0.01, le=2_592_000)] = 600.0  # of one run
+    time_limit_s: TimeLimit = 600.0  # of one run
     differences: str = "central"  # or forward, or none: the program must give jacobian.csv
-    relative_step: Annotated[float, Field(ge=1e-15, le=1)] = 1e-3  # of a parameter
-    floor: Annotated[float, Field(ge=0, le=1e12)] = 0.0  # size of a parameter that may be zero
-    processes: Annotated[int, Field(ge=1, le=1024), NOT_HASHED] = 1  # runs at a time
+    relative_step: Tolerance = 1e-3  # of a parameter
+    floor: Annotated[float, within(0, 1e12, "", "in the units of any model")] = 0.0  # if it is zero
+    processes: Annotated[Processes, NOT_HASHED] = 1  # runs at a time
     reuse: bool = True  # finished runs serve again
 
 
@@ -83,9 +84,8 @@ class ExternalSettings(ModelSettings):
     observation: InputFile = None  # .csv x,y,z (mm), one row per observed point
     points: InputFile = None  # .csv x,y,z (mm), reference positions that programs are given
     units: tuple[str, ...] = ()  # of the parameters; empty: not stated
-    prior_std: tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...] = ()  # of the parameters
-    # SD of the error of each observed coordinate
-    noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
+    prior_std: tuple[Value, ...] = ()  # of the parameters
+    noise_mm: Length | None = None  # SD of the error of each observed coordinate
     models: dict[str, ModelSettings] = field(default_factory=dict)  # several, with their settings
     data: tuple[str, ...] = ()  # those of them that predict observations from truth.values
 
@@ -108,16 +108,19 @@ class Task:
         With a model that predicts nothing.
     truth : mapping
         True values by parameter, as far as they are known.
-    variance : float
-        Of a coordinate, mm².
     folder : Path
     """
 
     about: ExternalSettings
     problem: Problem
     truth: dict[str, float]
-    variance: float
     folder: Path
+
+    @property
+    def noise_mm(self) -> float:
+        """Standard deviation of a coordinate."""
+        assert self.about.noise_mm is not None
+        return self.about.noise_mm
 
 
 def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
@@ -136,19 +139,20 @@ def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
         raise ConfigurationError(
             f"external.units = {list(about.units)}, expected one for each of {', '.join(names)}"
         )
-    std, noise = np.array(about.prior_std, dtype=float), about.noise_mm
-    if std.shape != (len(names),) or not np.all(np.isfinite(std) & (std > 0)):
+    if len(about.prior_std) != len(names) or min(about.prior_std) <= 0:
         raise ConfigurationError(
             f"external.prior_std = {list(about.prior_std)}, expected one standard deviation > 0 "
             f"for each of {', '.join(names)}"
         )
-    if noise is None or not (np.isfinite(noise) and noise > 0):
-        raise ConfigurationError(f"external.noise_mm = {noise}, expected a number > 0 (mm)")
-    settings = {**values["filter"], "P0": (std**2).tolist()}
+    if not about.noise_mm:
+        raise ConfigurationError(
+            f"external.noise_mm = {about.noise_mm}, expected a number > 0 (mm)"
+        )
+    settings = {**values["filter"], "P0": [std**2 for std in about.prior_std]}
     truth = dict(zip(names, map(float, values["truth"]["values"]), strict=False))
     filter_, transform, prior = build_filter(settings, names, positive=True)
     problem = Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
-    return Task(about, problem, truth, float(noise) ** 2, folder)
+    return Task(about, problem, truth, folder)
 
 
 def model_of(task: Task, name: str, count: int) -> ObservationModel:
@@ -228,29 +232,19 @@ def run(job: Job[Settings]) -> Result:
             return Result(status="failed", reason=f"{name}: {exact.reason}")
         # The same errors for all, so that estimates differ by the models alone.
         errors = np.random.default_rng(job.values["seed"]).standard_normal(exact.y.size)
-        data[name] = (exact.y + np.sqrt(task.variance) * errors).reshape(-1, 3)
-    records: dict[tuple[str, str], EstimateRecord] = {}
-    programs: dict[tuple[str, str], dict[str, Any]] = {}
-    for seen, y in data.items():
-        for name in about.models or ("model",):
-            model = model_of(task, name, len(y))
-            records[seen, name] = _estimate(f"{name}, from {seen}", model, y, task)
-            if isinstance(model, ProcessModel):
-                about_runs = {"runs": model.runs, "served again": model.reused}
-                programs[seen, name] = about_runs | {"own derivatives": model.own_jacobian}
-    rows = [
-        {"data": seen, "model": name}
-        | {key: row.get(key) for key in SHOWN}
-        | {"apart": _apart(row["estimate"], records.get((seen, seen)), k)}
-        | {"residual": record.innovation and record.innovation.residual_rms}
-        | programs.get((seen, name), {})
-        for (seen, name), record in records.items()
-        for k, row in enumerate(record.rows())
-    ]
-    estimates = tuple(records.values())
+        data[name] = (exact.y + task.noise_mm * errors).reshape(-1, 3)
+    estimates, rows = list[EstimateRecord](), list[dict[str, Any]]()
+    for (seen, y), name in product(data.items(), about.models or ("model",)):
+        model = model_of(task, name, len(y))
+        record = _estimate(f"{name}, from {seen}", model, y, task)
+        whole = {"data": seen, "model": name}
+        if isinstance(model, ProcessModel):
+            whole |= {"runs": model.runs, "served again": model.reused}
+        rows += [{**whole, **{key: row.get(key) for key in COLUMNS}} for row in record.rows()]
+        estimates.append(record)
     return Result(
-        tables={"": table(rows, **(dict.fromkeys(rows[0], "") | COLUMNS))},
-        estimates=estimates,
+        tables={"": table(rows, data="", model="", **COLUMNS)},
+        estimates=tuple(estimates),
         status="converged" if any(one.converged for one in estimates) else "failed",
         reason=estimates[0].reason,
         detail=estimates[0].detail,
@@ -258,36 +252,24 @@ def run(job: Job[Settings]) -> Result:
     )
 
 
-SHOWN = (
-    *("parameter", "unit", "prior_mean", "prior_std", "estimate", "std", "truth", "relative_error"),
-    *("reason", "iterations", "forward_solves", "distance_mean", "distance_max", "nis"),
-)
-"""What the table takes of the rows of a record."""
-
 COLUMNS: dict[str, Column | str] = {
+    **dict.fromkeys(("parameter", "unit", "truth"), ""),
     "prior_mean": Column(std="prior_std", label="prior"),
+    "prior_std": "",
     "estimate": Column(digits=".3f", std="std"),
+    "std": "",
     "relative_error": Column(digits="+.2%", label="error"),
     "reason": Column(hidden=True),
     "forward_solves": Column(label="predictions"),
     "distance_mean": Column("mm"),
-    "distance_max": Column("mm"),
-    "apart": Column(digits="+.2%", label="apart from the data's own model"),
-    "residual": "mm",
 }
-"""The residual is the root mean square of a coordinate."""
-
-
-def _apart(value: float | None, own: EstimateRecord | None, k: int) -> float | None:
-    """By what share an estimate is off what the model that made the data finds."""
-    other = None if own is None else own.unknowns[k].estimate
-    return value / other - 1 if value is not None and other else None
+"""What the table takes of the rows of a record."""
 
 
 def _estimate(title: str, model: ObservationModel, y: FloatArray, task: Task) -> EstimateRecord:
     """The record of one estimate from positions ``(n, 3)`` mm."""
     names = task.problem.parameters
-    seen = Observation(POINTS, y[None], np.array(task.variance), predicted=POINTS)
+    seen = Observation(POINTS, y[None], np.array(task.noise_mm**2), predicted=POINTS)
     with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
         found = estimate(replace(task.problem, model=model), seen, on_iterate=bar.iterate)
     if found.fitted is not None and not task.about.models:
