@@ -411,12 +411,10 @@ def _left_figure(results: Results) -> Figure:
         len(geometries), len(KINDS), 2.5 * len(geometries), sharex=True, sharey=True
     )
     for (row, geometry), (column, kind) in product(enumerate(geometries), enumerate(KINDS)):
-        axes, own = grid[row, column], medians.loc[geometry, kind]
-        for (error, _), colour in zip(own.index, levels(len(own)), strict=True):
-            counts = range(1, own.shape[1] + 1)
-            axes.plot(
-                counts, own.loc[error].iloc[0], "o-", color=colour, ms=3, label=f"{error:g} mmHg"
-            )
+        axes, own = grid[row, column], medians.loc[geometry, kind].xs("", level="known")
+        for (error, left), colour in zip(own.iterrows(), levels(len(own)), strict=True):
+            counts = range(1, len(left) + 1)
+            axes.plot(counts, left, "o-", color=colour, ms=3, label=f"{error:g} mmHg")
         axes.axhline(100 * HALF, color="0.5", lw=0.9, ls="--")
         axes.set_ylim(0, None)
         axes.set_title(f"{KINDS[kind]}, geometry {geometry}", fontsize=SMALL)

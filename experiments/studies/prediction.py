@@ -8,7 +8,7 @@ its posterior. Only then are the same scenarios computed with the true parameter
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -289,24 +289,20 @@ def coverage_table(rows: Sequence[Row]) -> Table:
     return table([*out, {"measure": "all", **counts}])
 
 
-def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> list[Row]:
+def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> Iterator[Row]:
     """Valves that were not estimated or did not close, and why."""
-    out: list[Row] = []
     for seed, (result, compared) in patients.items():
+        whole = {"patient": seed, "scenario": "", "valve": "estimate", "count": 1}
         if not compared:
-            out.append({"patient": seed, "scenario": "", "valve": "estimate", "count": 1,
-                        "reason": result.reason})  # fmt: skip
+            yield whole | {"reason": result.reason}
         for title, (found, own, _) in compared.items():
-            reasons = [("at the estimate", found.at_estimate.reason), ("true", own.reason)]
+            valves = {"at the estimate": found.at_estimate, "true": own, "finer mesh": found.finer}
+            reasons = [(name, one.reason) for name, one in valves.items() if one is not None]
             reasons += [("sample", reason) for reason in found.failures]
-            reasons += [] if found.finer is None else [("finer mesh", found.finer.reason)]
-            out += [
-                {"patient": seed, "scenario": title, "valve": valve, "count": count,
-                 "reason": reason}
-                for (valve, reason), count in Counter(reasons).items()
-                if reason
-            ]  # fmt: skip
-    return out
+            for (name, reason), count in Counter(reasons).items():
+                if reason:
+                    about = {"scenario": title, "valve": name, "count": count, "reason": reason}
+                    yield whole | about
 
 
 # -- figure ---------------------------------------------------------------------------------------

@@ -28,12 +28,12 @@ from experiments.common.cases.revealed import (
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Number, Record
 from experiments.common.study import Job, Result, Results, Study
-from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.case import Frame
 from mvest.cases.folder import read_case, write_case
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.arrival import KINDS, DoorSettings, arrive
+from mvest.simulation.arrival import KINDS, Arrived, DoorSettings, arrive
 from mvest.simulation.drawn_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import closest_points
@@ -70,9 +70,9 @@ def run_surfaces(job: Job[Settings]) -> Result:
         found = Result(status="failed", reason=found)
     else:
         (estimate,) = found.estimates
-    for role, true in ((Role.REFERENCE, arrived.opened), (Role.CLOSED, arrived.closed)):
-        numbers |= surface_error(arrived.case.frame(role), true)
-    numbers |= thickness_error(arrived.case, arrived.opened, patient.surface.thickness)
+    for role, true in (("open", arrived.opened), ("closed", arrived.closed)):
+        numbers[f"{role}_back_mm"] = surface_error(arrived.case.frame(true.role), true)
+    numbers["thickness_mean_mm"] = thickness_error(arrived, patient.surface.thickness)
     # What is displaced in the case of the patient is not in what was imported.
     truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
     about = {"case": patient.name, "seed": job.values["seed"]}
@@ -80,36 +80,20 @@ def run_surfaces(job: Job[Settings]) -> Result:
     return found.changed(tables={}, numbers=numbers, estimates=(revealed,), arrays={}, row="")
 
 
-def surface_error(found: Frame, true: Frame) -> dict[str, Number]:
-    """Distances (mm) of a midsurface from the true one: root mean squares and the largest.
-
-    ``there`` from its vertices, ``back`` from those of the true one to it.
-    """
-    there, back = (
-        closest_points(a.vertices, b.vertices, b.triangles).distance
-        for a, b in ((found, true), (true, found))
-    )
-    frame = "closed" if true.role is Role.CLOSED else "open"
-    largest = float(max(there.max(), back.max()))
-    return {
-        f"{frame}_there_mm": _rms(there),
-        f"{frame}_back_mm": _rms(back),
-        f"{frame}_largest_mm": largest,
-    }
+def surface_error(found: Frame, true: Frame) -> float:
+    """Root mean square (mm) of the distances of the true midsurface's vertices from another."""
+    distance = closest_points(true.vertices, found.vertices, found.triangles).distance
+    return float(np.sqrt(np.mean(np.square(distance))))
 
 
-def thickness_error(case: ValveCase, true: Frame, thickness_mm: FloatArray) -> dict[str, Number]:
-    """Thickness of the open midsurface less the true one at the nearest point, mm.
+def thickness_error(arrived: Arrived, thickness_mm: FloatArray) -> float:
+    """Mean thickness of the open midsurface less the true one at the nearest point, mm.
 
     ``thickness_mm`` ``(n,)`` is that of the vertices of the true frame.
     """
-    nearest = closest_points(case.surface.vertices, true.vertices, true.triangles)
-    off = case.surface.thickness - nearest.interpolate(thickness_mm, true.triangles)
-    return {"thickness_mean_mm": float(off.mean()), "thickness_rms_mm": _rms(off)}
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    surface, true = arrived.case.surface, arrived.opened
+    nearest = closest_points(surface.vertices, true.vertices, true.triangles)
+    return float(np.mean(surface.thickness - nearest.interpolate(thickness_mm, true.triangles)))
 
 
 def _believed(personal: PersonalSettings) -> tuple[Unknown, ...]:
@@ -139,7 +123,7 @@ def summary(results: Results) -> dict[str, Table]:
             for own in estimate.moduli
         ]
     about = {"patient": Column(label="patient (simulated)"), "geometry": Column()}
-    about |= {name: Column("mm", ".2f", hidden=name not in SHOWN) for name in OFF}
+    about |= dict.fromkeys(OFF, Column("mm", ".2f"))
     hidden = dict.fromkeys(("grounds", "ended"), Column(hidden=True))
     return {
         "": table(rows, **about, **MODULUS_COLUMNS, **hidden),
@@ -147,12 +131,8 @@ def summary(results: Results) -> dict[str, Table]:
     }
 
 
-OFF = tuple(
-    f"{frame}_{way}" for frame in ("open", "closed") for way in ("there", "back", "largest")
-)
-OFF += ("thickness_mean", "thickness_rms")
+OFF = ("open_back", "closed_back", "thickness_mean")
 """How far geometries are off, in mm, by their names in a record."""
-SHOWN = ("open_back", "closed_back", "thickness_mean")
 
 
 def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:

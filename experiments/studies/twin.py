@@ -53,8 +53,7 @@ def run_twin(job: Job[Settings]) -> Result:
         record_of(one, seed=seed, simulated=True) for seed, one in zip(seeds, results, strict=True)
     )
     solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
-    row = _row(values, estimates[0], _truth_band(twin, result))
-    row |= {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}
+    row = _row(values, estimates[0], _truth_band(twin, result)) | {"forward solves": solves}
     paper = [_paper_row(values, estimates[0])] if values["paper"] else []
     return Result(
         tables={"": _table([*paper, row])},
@@ -142,7 +141,6 @@ def _row(
         error = own.relative_error
         row |= {
             f"truth {name}": own.truth,
-            f"start {name}": own.prior_mean,
             f"estimate {name}": own.estimate,
             f"std {name}": own.std,
             f"error {name}": None if error is None else 100.0 * abs(error),
@@ -156,12 +154,8 @@ def _row(
         "moduli error SD": 100 * float(np.std(errors)) if errors else None,
         "distance mean": distance and distance.mean,
         "distance SD": distance and distance.std,
-        "distance max": distance and distance.max,
         "element": model.element,
         "cells": " x ".join(str(n) for n in model.cells),
-        "filter": model.filter,
-        "noise": model.noise_mm,
-        "iterations": record.iterations or 0,
         "status": record.status,
         "ended": record.reason.partition(":")[0],
         "reason": record.reason,
@@ -170,31 +164,18 @@ def _row(
 
 def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, Any]:
     """What the paper reports of the same experiment."""
-    paper = values["paper"]
-    row: dict[str, Any] = {"run": f"paper, {paper['table']}", "source": "paper"}
-    for k, name in enumerate(values["parameters"]):
-        row |= {
-            f"truth {name}": record.unknown(name).truth,
-            f"estimate {name}": _at(paper["estimate"], k),
-            f"error {name}": _at(paper["error_percent"], k),
-        }
-    return row | {
-        "moduli error mean": _at(paper["moduli_error_percent"], 0),
-        "moduli error SD": _at(paper["moduli_error_percent"], 1),
-        "distance mean": _at(paper["distance_mm"], 0),
-        "distance SD": _at(paper["distance_mm"], 1),
+    paper, names = values["paper"], values["parameters"]
+    columns = {
+        "estimate": [f"estimate {name}" for name in names],
+        "error_percent": [f"error {name}" for name in names],
+        "moduli_error_percent": ["moduli error mean", "moduli error SD"],
+        "distance_mm": ["distance mean", "distance SD"],
     }
-
-
-def _at(values: Sequence[float] | None, k: int) -> float | None:
-    return None if values is None or k >= len(values) else values[k]
-
-
-HIDDEN = {
-    **dict.fromkeys(("source", "nodes", "iterations", "status", "filter", "reason"), ""),
-    **dict.fromkeys(("distance max", "noise"), "mm"),
-}
-"""Columns that only programs see, and their units."""
+    row: dict[str, Any] = {"run": f"paper, {paper['table']}", "source": "paper"}
+    row |= {f"truth {name}": record.unknown(name).truth for name in names}
+    for key, own in columns.items():
+        row |= zip(own, paper[key] or (), strict=False)
+    return row
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -204,7 +185,6 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         unit, std, band = unit_of(name), f"std {name}", f"truth of {name} known to"
         about |= {
             f"truth {name}": Column(unit, hidden=True),
-            f"start {name}": Column(unit, hidden=True),
             f"estimate {name}": Column(unit, std=std, label=name),
             std: Column(unit),
             f"error {name}": Column("%", std=band, label=f"error {name}"),
@@ -214,8 +194,9 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     about["moduli error SD"] = Column("%")
     about["distance mean"] = Column("mm", std="distance SD", label="distance")
     about["distance SD"] = Column("mm")
-    about |= {name: Column(unit, hidden=True) for name, unit in HIDDEN.items()}
-    return table(rows, **about)
+    return table(
+        rows, **about, **dict.fromkeys(("source", "status", "reason"), Column(hidden=True))
+    )
 
 
 def summary(results: Results) -> dict[str, Table]:

@@ -130,8 +130,6 @@ def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, see
         "unknowns": len(estimate.parameters),
         "nees": _nees(estimate),
     }
-    paper = zip(estimate.moduli, patient.paper_moduli, strict=False)
-    numbers |= {f"paper_{own.region}_MPa": value for own, value in paper}
     distances = zip(("generic", "personalised"), patient.paper_distance_mm, strict=False)
     numbers |= {f"paper_{which}_mm": value for which, value in distances}
     return estimated.changed(tables={}, numbers=numbers, estimates=(estimate,), arrays=arrays)
@@ -205,7 +203,7 @@ def summary(results: Results) -> dict[str, Table]:
             "estimates": _estimates(patients),
         }
     return {
-        "table_2": _table2(patients),
+        "table_2": _table2(estimates),
         "table_3": distances,
         "moduli": moduli_table,
         "distances": _distances(distances),
@@ -249,10 +247,13 @@ def _ways(estimate: EstimateRecord) -> dict[str, EstimateRecord]:
     return {WITH: estimate} | others
 
 
-def _table2(patients: Patients) -> Table:
-    """A row for each patient and modulus: all estimates beside the truth."""
+def _table2(estimates: Sequence[EstimateRecord]) -> Table:
+    """A row for each patient and modulus: all estimates beside the truth.
+
+    The truth is what the paper estimated of its patient.
+    """
     rows = []
-    for record, estimate in patients:
+    for estimate in estimates:
         ways = _ways(estimate)
         for own in stated(estimate):
             if not own.is_modulus:
@@ -263,13 +264,12 @@ def _table2(patients: Patients) -> Table:
                 way = ways.get(label)
                 row |= interval(label, None if way is None else way.unknown(own.name))
                 row[f"{label} converged"] = None if way is None else way.converged
-            rows.append(row | {"paper": record.numbers.get(f"paper_{own.region}_MPa")})
+            rows.append(row)
     about = {"patient": Column(label="patient (simulated)")}
     about |= {"verdict": Column(), "modulus": Column(), "truth": Column("MPa")}
     about |= interval_columns("estimate")
     for label in ALTERNATIVES.values():
         about |= interval_columns(label) | {f"{label} converged": Column()}
-    about["paper"] = Column("MPa", label="paper's estimate of its patient")
     return table(rows, **about)
 
 
@@ -386,12 +386,11 @@ def figure(results: Results) -> dict[str, Figure]:
         return {"ranks": ranks_figure(_by_scenario(patients))}
     from mvest.problem.fields import case_fields
 
-    names = {id(record): name for name, record in results.records.items()}
-    places = {estimate.case: names[id(record)] for record, estimate in patients}
     fields = {
-        case: case_fields(results.arrays[name])
-        for case, name in places.items()
-        if name in results.arrays
+        estimate.case: case_fields(results.arrays[name])
+        for record, estimate in patients
+        for name, own in results.records.items()
+        if own is record and name in results.arrays
     }
     denied = [estimate.case for _, estimate in patients if not estimate.is_stated]
     return {"figure_3": figure_3(fields, denied)} if fields else {}

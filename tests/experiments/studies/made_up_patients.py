@@ -82,8 +82,7 @@ def patient(name: str = "normal_small", table: str = "patients", **changes: Any)
     }
     numbers = changes.pop("numbers", {})
     estimate = EstimateRecord(**{**whole, **changes})
-    paper = {"paper_anterior_MPa": 6.28, "paper_posterior_MPa": 2.61}
-    paper |= {"paper_generic_mm": 1.5, "paper_personalised_mm": 1.47}
+    paper = {"paper_generic_mm": 1.5, "paper_personalised_mm": 1.47}
     return made_up(
         study="patient",
         experiment=table,
