@@ -24,12 +24,9 @@ from experiments.common.building.gate import (
 )
 from experiments.common.records.record import Mesh, Record
 from experiments.common.study import Job, Result, Results, Study
-from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GateReport
 from mvest.reporting.tables import Column, Table, joined, table
-from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
-from mvest.valve.measure.coaptation import find_gap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,13 +58,12 @@ def _gate(job: Job[Settings]) -> Result:
     closures = closures_of(report)
     verdict = {
         "passed": report.passed,
-        "gap": None if report.closed is None else _gap(model, report.closed),
         "closures": closures,
         "fails by": "; ".join(_failures(report)),
     }
     reference = report.rows[0]
     return Result(
-        tables={"": _verdicts([verdict]), "variations": gate_rows(report)},
+        tables={"": table([verdict], passed=""), "variations": gate_rows(report)},
         # By these others look the verdict up.
         numbers={"anatomy": anatomy_digest(values), "passed": report.passed},
         status="converged" if reference.passed else "failed",
@@ -77,10 +73,6 @@ def _gate(job: Job[Settings]) -> Result:
     )
 
 
-def _verdicts(rows: list[dict[str, Any]]) -> Table:
-    return table(rows, passed="", gap="mm²:.2g")
-
-
 def _failures(report: GateReport) -> list[str]:
     rows = [
         f"{row.case}: " + (f"{row.max_mm:.2g} mm off" if row.max_mm > 0 else row.reason)
@@ -88,13 +80,6 @@ def _failures(report: GateReport) -> list[str]:
         if not row.passed
     ]
     return [*rows, *(f"{p.name}: {p.reason}" for p in report.paths if not p.passed)]
-
-
-def _gap(model: ClosureModel, vertices: FloatArray) -> float:
-    """Gap (mm²) of a closed valve."""
-    valve, annulus = model.valve, vertices[model.valve.annulus]
-    seen = vertices, valve.surface.triangles, annulus, plane_of(valve, annulus)
-    return find_gap(*seen, model.contact_reach_mm).area
 
 
 def _closing(job: Job[Settings]) -> Result:

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
-from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words, write_report
 from experiments.common.cases.revealed import (
     MODULUS_COLUMNS,
     Groups,
+    estimate_hidden,
     grouped,
     groups_figure,
     modulus_row,
@@ -34,7 +34,6 @@ from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
-from mvest.errors import InputError
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
@@ -103,61 +102,37 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_imaged_patient(job: Job[Settings]) -> Result:
-    """Simulate, estimate from the volume and from better geometries, reveal.
-
-    Raises
-    ------
-    InputError
-        If neither the volume nor the known geometry left an estimation.
-    """
-    values, folder = job.values, job.folder
+    """Simulate, estimate from the volume and from better geometries, reveal."""
+    values, folder, personal = job.values, job.folder, job.settings.personal
     place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
     hidden = read_mapping(place / TRUTH / REVEALED)
     given = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
-    found = {"": estimated_or_reason(given, folder, place / VOLUME, place / HIDDEN)}
+    found = estimate_hidden(given, folder, place / VOLUME, place / HIDDEN, personal)
+    better = {}
     for name in (KNOWN, SEGMENTED):
         (folder / name).mkdir(exist_ok=True)
-        found[name] = estimated_or_reason(
-            values, folder / name, place / HIDDEN / name, place / TRUTH
-        )
-    main = found[""]
-    run = found[KNOWN] if isinstance(main, str) else main
-    if isinstance(run, str):
-        raise InputError(run)
-    estimates = {name: _estimate(each, run.estimates[0]) for name, each in found.items()}
-    better = {name: estimates[name] for name in (KNOWN, SEGMENTED)}
-    estimate = estimates[""].model_copy(
-        update={
-            "case": job.settings.patient.name,
-            "seed": values["seed"],
-            "alternatives": {**estimates[""].alternatives, **better},
-        }
-    )
+        case = place / HIDDEN / name
+        result = estimate_hidden(values, folder / name, case, place / TRUTH, personal)
+        better[name] = _numbers_if_converged(result.estimates[0])
+    estimate = _numbers_if_converged(found.estimates[0])
+    about = {"case": job.settings.patient.name, "seed": values["seed"]}
+    others = {"alternatives": {**estimate.alternatives, **better}}
     ratios = [
         {"family": name, "ratio": one}
         for name, each in hidden["chord_ratios"].items()
         for one in each
     ]
-    lost = main if isinstance(main, str) else ""
-    return run.changed(
+    return found.changed(
         tables={"chordae": table(ratios)} if ratios else {},
         numbers={"anatomies_drawn": hidden["anatomies_drawn"]},
-        arrays={} if lost else run.arrays,
-        estimates=(estimate.with_truth(hidden["values"]),),
-        status="failed" if lost else run.status,
-        reason=lost or run.reason,
-        detail="" if lost else run.detail,
+        estimates=(estimate.model_copy(update=about | others).with_truth(hidden["values"]),),
         row="",
         gate=None,
     )
 
 
-def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
-    """What an estimation left; unknowns have no numbers where it did not converge."""
-    if isinstance(found, str):
-        record = EstimateRecord(status="failed", reason=found, unknowns=other.parameters)
-    else:
-        record = found.estimates[0]
+def _numbers_if_converged(record: EstimateRecord) -> EstimateRecord:
+    """An estimate; its unknowns have no numbers where it did not converge."""
     if record.converged:
         return record
     nothing = dict.fromkeys(("estimate", "std", "low", "high", "bound"))

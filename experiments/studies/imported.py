@@ -178,18 +178,20 @@ class Recorded:
         valves = self.coarse, self.contact
         return ClosureModel(*valves, self.mesh, self.settings, parameters, **settings)
 
-    def distances(self, closed: FloatArray) -> dict[str, float]:
+    def distances(self, closed: FloatArray | None) -> dict[str, float | None]:
         """Distances (mm) of closed positions ``(n, 3)`` from where they were recorded.
 
         The surface's is the mean of the whole surface from the recorded one, both ways.
         """
-        d, surface = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface
+        if closed is None:
+            return dict.fromkeys(DISTANCES)
+        d, triangles = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface.triangles
         recorded = self.recording.frames[-1], self.recording.valve.surface.triangles
-        return {
-            "mean": float(d.mean()),
-            "max": float(d.max()),
-            "surface": mean_surface_distance(closed, surface.triangles, *recorded),
-        }
+        surface = mean_surface_distance(closed, triangles, *recorded)
+        return dict(zip(DISTANCES, (float(d.mean()), float(d.max()), surface), strict=True))
+
+
+DISTANCES = ("mean", "max", "surface")
 
 
 def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
@@ -251,58 +253,44 @@ def _donor(job: Job[Settings]) -> Result:
         # A start is met again by rounding of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)
-        row = {"closure": "generic", "ended": generic.reason, "predictions": 1, "equilibria": 1}
         if generic.converged:
             shapes["generic"] = generic.y.reshape(2, -1, 3)[1]
-            row |= valve.distances(shapes["generic"])
-        rows.append(row)
+        row = {"closure": "generic", "ended": generic.reason}
+        rows.append(row | valve.distances(shapes.get("generic")))
         for k, start in enumerate(starts):
             # Each goes on from the generic closed valve.
-            model = copy(first)
-            model.closures = 0
-            model_ = Remembered(model, known.runs, known.rtol)
+            model = Remembered(copy(first), known.runs, known.rtol)
             own = replace(filter_, start=tuple(map(float, start)))
             tissue = valve.settings.tissue
-            problem = Problem(parameters, model_, prior, own, transform, tissue)
+            problem = Problem(parameters, model, prior, own, transform, tissue)
             found = estimate(problem, seen, on_iterate=bar.iterate)
             record = record_of(found, case=f"fitted, start {k + 1}", simulated=True)
-            row = {"closure": record.case, "ended": record.reason, "equilibria": model.closures}
-            row |= {"iterations": record.iterations, "predictions": record.forward_solves}
-            if found.fitted is not None:
-                shapes.setdefault("fitted", found.fitted[-1])
-                row |= valve.distances(found.fitted[-1])
-            rows.append(row)
+            closed = None if found.fitted is None else found.fitted[-1]
+            if closed is not None:
+                shapes.setdefault("fitted", closed)
+            row = {"closure": record.case, "ended": record.reason}
+            rows.append(row | valve.distances(closed))
             records.append(record)
-    rest = valve.coarse.surface.vertices
-    tips = valve.recording.valve.motion.papillary_tips
-    failed = [one for one in records if not one.converged]
-    ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
+    failed = [] if generic.converged else [f"generic: {generic.reason}"]
+    failed += [one.reason for one in records if not one.converged]
+    about = {"closure": Column(), "ended": Column(hidden=True)}
     return Result(
         tables={
-            "": table(rows, **DISTANCES),
+            "": table(rows, **about, **dict.fromkeys(DISTANCES, Column("mm", ".2f"))),
             "moduli": estimates_table("estimation", records),
         },
         estimates=tuple(records),
         numbers={
             "data": donor.citation,
             "pressure_mmHg": valve.settings.protocol.pressure_mmHg,
-            "recorded_motion_mm": float(np.linalg.norm(valve.seen - rest, axis=1).mean()),
-            "tip_motion_mm": float(np.linalg.norm(tips[-1] - tips[0], axis=1).max()),
         },
         arrays=_arrays(valve, shapes) if len(shapes) == 2 else {},
-        status="failed" if failed or not generic.converged else "converged",
-        reason=ended if not failed or not generic.converged else failed[0].reason,
+        status="failed" if failed else "converged",
+        reason=failed[0] if failed else records[0].reason,
         detail=records[0].detail,
         mesh=Mesh.of(valve.mesh),
         forward_solves=1 + sum(one.forward_solves or 0 for one in records),
     )
-
-
-DISTANCES: dict[str, Column | str] = {
-    "closure": "",
-    "ended": Column(hidden=True),
-    **dict.fromkeys(("mean", "max", "surface"), "mm:.2f"),
-}
 
 
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.common.building.patient_store import make_patient
-from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words
 from experiments.common.cases.revealed import (
     MODULUS_COLUMNS,
     Groups,
+    estimate_hidden,
     grouped,
     groups_figure,
     modulus_row,
@@ -30,7 +30,7 @@ from experiments.common.records.record import Number, Record
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Frame
 from mvest.cases.folder import read_case, write_case
-from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.record import EstimateRecord
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.arrival import KINDS, Arrived, DoorSettings, arrive
@@ -62,22 +62,16 @@ def run_surfaces(job: Job[Settings]) -> Result:
     registration = np.array([hidden["values"][name] for name in REGISTRATION])
     arrived = arrive(patient, positions["closed"], registration, door, folder / "door")
     case = write_case(folder / "case", arrived.case)
-    found = estimated_or_reason(job.values, folder, case, place.hidden)
+    found = estimate_hidden(job.values, folder, case, place.hidden, job.settings.personal)
     numbers: dict[str, Number] = {"kind": door.kind, "geometry": door.label}
-    if isinstance(found, str):
-        unknowns = _believed(job.settings.personal)
-        estimate = EstimateRecord(status="failed", reason=found, unknowns=unknowns)
-        found = Result(status="failed", reason=found)
-    else:
-        (estimate,) = found.estimates
     for role, true in (("open", arrived.opened), ("closed", arrived.closed)):
         numbers[f"{role}_back_mm"] = surface_error(arrived.case.frame(true.role), true)
     numbers["thickness_mean_mm"] = thickness_error(arrived, patient.surface.thickness)
     # What is displaced in the case of the patient is not in what was imported.
     truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
     about = {"case": patient.name, "seed": job.values["seed"]}
-    revealed = estimate.model_copy(update=about).with_truth(truth)
-    return found.changed(tables={}, numbers=numbers, estimates=(revealed,), arrays={}, row="")
+    (estimate,) = (one.model_copy(update=about).with_truth(truth) for one in found.estimates)
+    return found.changed(tables={}, numbers=numbers, estimates=(estimate,), arrays={}, row="")
 
 
 def surface_error(found: Frame, true: Frame) -> float:
@@ -94,15 +88,6 @@ def thickness_error(arrived: Arrived, thickness_mm: FloatArray) -> float:
     surface, true = arrived.case.surface, arrived.opened
     nearest = closest_points(surface.vertices, true.vertices, true.triangles)
     return float(np.mean(surface.thickness - nearest.interpolate(thickness_mm, true.triangles)))
-
-
-def _believed(personal: PersonalSettings) -> tuple[Unknown, ...]:
-    """The moduli before anything was seen."""
-    return tuple(
-        Unknown(name=name, unit="MPa", prior_mean=about.mean, prior_std=about.std)
-        for name, about in personal.unknowns.items()
-        if name.startswith("E_f.")
-    )
 
 
 # -- tables ---------------------------------------------------------------------------------------

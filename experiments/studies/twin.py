@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from experiments.common.building.filters import build_filter, observation_variance
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin, estimate_twin, expect_twin
-from experiments.common.progress import SolveBar
 from experiments.common.records.record import Mesh, model_of_values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.errors import ConfigurationError
@@ -48,16 +47,14 @@ def run_twin(job: Job[Settings]) -> Result:
     seeds = range(values["seed"], values["seed"] + values["repeats"])
     results = estimate_twin(twin, seeds)
     result = results[0]
-    confirmed = _confirm(twin, result) if values["confirm"] else None
     estimates = tuple(
         record_of(one, seed=seed, simulated=True) for seed, one in zip(seeds, results, strict=True)
     )
-    solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
+    solves = estimates[0].forward_solves or 0
     row = _row(values, estimates[0], _truth_band(twin, result)) | {"forward solves": solves}
     paper = [_paper_row(values, estimates[0])] if values["paper"] else []
     return Result(
         tables={"": _table([*paper, row])},
-        numbers={"confirmed_mm": confirmed},
         estimates=estimates,
         arrays=_fields(twin, result) if values["figures"] and result.fitted is not None else {},
         status=estimates[0].status,
@@ -67,28 +64,6 @@ def run_twin(job: Job[Settings]) -> Result:
         forward_solves=solves,
         gate=gate_of(values),
     )
-
-
-def _confirm(twin: Twin, result: StudyResult) -> float | None:
-    """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
-
-    None where every closure started from the open state or the closed frame is not observed, so
-    that there is nothing to confirm, or where the new closure failed.
-    """
-    usual = twin.model.continuation, twin.model.guide
-    if result.estimate is None or result.fitted is None or usual == (False, None):
-        return None
-    fitted = dict(zip(twin.frames, result.fitted, strict=True)).get("closed")
-    if fitted is None:
-        return None
-    twin.model.continuation, twin.model.guide = False, None
-    with SolveBar("confirmation", len(twin.model.settings.protocol.steps()), 1) as bar:
-        twin.model.on_step = bar.step
-        anew = twin.model.close(result.estimate, sensitivities=False).simulation
-    twin.model.continuation, twin.model.guide = usual
-    if not anew.converged:
-        return None
-    return float(np.linalg.norm(twin.model.observed(anew.frames[-1]) - fitted, axis=1).max())
 
 
 def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:

@@ -1,13 +1,17 @@
-"""Estimates of virtual patients beside their truth: grouped, counted, drawn and kept."""
+"""Virtual patients with a truth: estimated, then grouped, counted, drawn and kept."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from experiments.common.cases import blind
+from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Record
-from experiments.common.study import Results
+from experiments.common.study import Result, Results
+from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import NONE
 from mvest.reporting.skill import (
@@ -30,6 +34,25 @@ Groups: TypeAlias = Mapping[str, Sequence[Judged]]
 """Estimates by what tables call their scenario, data or filter."""
 
 NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
+
+
+def estimate_hidden(
+    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, personal: PersonalSettings
+) -> Result:
+    """Estimate a case or volume in a process that cannot see its truth.
+
+    Where that left nothing the result has failed, and its moduli are as they were believed before.
+    """
+    try:
+        return blind.estimate_blindly(values, folder, case, sealed)
+    except InputError as fault:
+        believed = tuple(
+            Unknown(name=name, unit="MPa", prior_mean=about.mean, prior_std=about.std)
+            for name, about in personal.unknowns.items()
+            if name.startswith("E_f.")
+        )
+        estimate = EstimateRecord(status="failed", reason=str(fault), unknowns=believed)
+        return Result(status="failed", reason=str(fault), estimates=(estimate,))
 
 
 def revealed(results: Results) -> list[tuple[Record, EstimateRecord]]:

@@ -192,8 +192,6 @@ def test_the_gate_study_records_every_case(run):
     assert 0 < rows[len(names)]["max"] < 0.1
     (verdict,) = record.table_of().rows
     assert verdict["passed"] is record.numbers["passed"]
-    # The valve has hardly begun to close.
-    assert verdict["gap"] > 10
     assert {"gate.csv", "gate.md"} <= {path.name for path in folder.iterdir()}
     for case in GATE_CASES:
         assert f"{case.name}: max" in said.err
@@ -206,7 +204,6 @@ def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypat
     assert (record.status, record.reason) == ("failed", "it buckled")
     assert record.numbers["passed"] is False
     (verdict,) = record.table_of().rows
-    assert verdict["gap"] is None
     assert verdict["fails by"] == "reference: it buckled"
     assert len(record.table_of("variations")) == 1
     assert "it buckled" in said.err
