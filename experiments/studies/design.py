@@ -30,13 +30,7 @@ from mvest.estimation.information.design import Design, together
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.design import (
-    HALF,
-    KINDS,
-    FrameDesigns,
-    StatedErrors,
-    design_case,
-)
+from mvest.personalisation.design import FrameDesigns, StatedErrors, design_case
 from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
@@ -59,7 +53,6 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 Row = dict[str, Any]
@@ -351,7 +344,7 @@ def _compared(
         }
 
 
-# -- tables and figures ---------------------------------------------------------------------------
+# -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
     """For readers: a row for each observation, or for each design the median over patients."""
     rest = {name: results.table(name) for name in results.table_names if name}
@@ -396,42 +389,4 @@ def _medians(results: Results) -> DataFrame:
     return medians.rename(columns=lambda n: f"{n} closed")
 
 
-def figure(results: Results) -> Figure | None:
-    """What is left against the number of frames; of one valve the tables say it all."""
-    return _left_figure(results) if "left" in results.table().values else None
-
-
-def _left_figure(results: Results) -> Figure:
-    """A panel for each kind of error of the pressures and each geometry."""
-    from mvest.reporting.figures import SMALL, levels, panels
-
-    medians = _medians(results)
-    geometries = list(medians.index.unique("geometry"))
-    drawn, grid = panels(
-        len(geometries), len(KINDS), 2.5 * len(geometries), sharex=True, sharey=True
-    )
-    for (row, geometry), (column, kind) in product(enumerate(geometries), enumerate(KINDS)):
-        axes, own = grid[row, column], medians.loc[geometry, kind].xs("", level="known")
-        for (error, left), colour in zip(own.iterrows(), levels(len(own)), strict=True):
-            counts = range(1, len(left) + 1)
-            axes.plot(counts, left, "o-", color=colour, ms=3, label=f"{error:g} mmHg")
-        axes.axhline(100 * HALF, color="0.5", lw=0.9, ls="--")
-        axes.set_ylim(0, None)
-        axes.set_title(f"{KINDS[kind]}, geometry {geometry}", fontsize=SMALL)
-    for axes in grid[-1]:
-        axes.set_xlabel("closed frames")
-    drawn.supylabel("left of the generic guess's error (%)", fontsize=SMALL)
-    grid[-1, -1].legend(fontsize=SMALL - 1.5, frameon=False, ncols=2)
-    return drawn
-
-
-STUDY = Study(
-    settings=Settings,
-    run=run,
-    summary=summary,
-    figure=figure,
-    captions={
-        "": "What closed frames are expected to leave of the generic guess's error, before any "
-        "data are taken; dashed: half. Simulated."
-    },
-)
+STUDY = Study(settings=Settings, run=run, summary=summary)

@@ -97,34 +97,8 @@ class Settings:
     external: ExternalSettings = field(default_factory=ExternalSettings)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Task:
-    """What every estimate of a run has in common.
-
-    Attributes
-    ----------
-    about : ExternalSettings
-    problem : Problem
-        With a model that predicts nothing.
-    truth : mapping
-        True values by parameter, as far as they are known.
-    folder : Path
-    """
-
-    about: ExternalSettings
-    problem: Problem
-    truth: dict[str, float]
-    folder: Path
-
-    @property
-    def noise_mm(self) -> float:
-        """Standard deviation of a coordinate."""
-        assert self.about.noise_mm is not None
-        return self.about.noise_mm
-
-
-def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
-    """The task of a configuration.
+def problem_of(about: ExternalSettings, values: Values) -> Problem:
+    """What is estimated, with a model that predicts nothing.
 
     Raises
     ------
@@ -149,13 +123,13 @@ def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
             f"external.noise_mm = {about.noise_mm}, expected a number > 0 (mm)"
         )
     settings = {**values["filter"], "P0": [std**2 for std in about.prior_std]}
-    truth = dict(zip(names, map(float, values["truth"]["values"]), strict=False))
     filter_, transform, prior = build_filter(settings, names, positive=True)
-    problem = Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
-    return Task(about, problem, truth, folder)
+    return Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
 
 
-def model_of(task: Task, name: str, count: int) -> ObservationModel:
+def model_of(
+    about: ExternalSettings, parameters: tuple[str, ...], name: str, count: int, folder: Path
+) -> ObservationModel:
     """One of the configured models, of ``count`` observed points.
 
     Raises
@@ -163,7 +137,6 @@ def model_of(task: Task, name: str, count: int) -> ObservationModel:
     MvestError
         If the program, a file or a setting is inadmissible.
     """
-    about = task.about
     source = about.models.get(name, about)
     settings, command = {**about.settings, **source.settings}, source.command
     if source.python is not None:
@@ -188,8 +161,8 @@ def model_of(task: Task, name: str, count: int) -> ObservationModel:
     steps = source.relative_step, source.floor, source.processes
     return ProcessModel(
         Command(command, source.environment, source.time_limit_s),
-        task.folder / "runs" if about.folder is None else Path(about.folder),
-        task.problem.parameters,
+        folder / "runs" if about.folder is None else Path(about.folder),
+        parameters,
         count,
         units=about.units or None,
         points=None if about.points is None else _points(about.points, "points"),
@@ -223,21 +196,31 @@ def _points(file: str | None, what: str) -> FloatArray:
 def run(job: Job[Settings]) -> Result:
     """Estimate with each model from each observation."""
     about = job.settings.external
-    task = task_of(about, job.values, job.folder)
+    problem = problem_of(about, job.values)
+    names, noise_mm = problem.parameters, float(about.noise_mm or 0.0)
+    true = list(map(float, job.values["truth"]["values"]))
     (job.folder / FITTED).unlink(missing_ok=True)
     data = {} if about.data else {"observation": _points(about.observation, "observation")}
     for name in about.data:
-        exact = predict(model_of(task, name, 0), np.array([*task.truth.values()]))
+        exact = predict(model_of(about, names, name, 0, job.folder), np.array(true))
         if not exact.converged:
             return Result(status="failed", reason=f"{name}: {exact.reason}")
         # The same errors for all, so that estimates differ by the models alone.
         errors = np.random.default_rng(job.values["seed"]).standard_normal(exact.y.size)
-        data[name] = (exact.y + task.noise_mm * errors).reshape(-1, 3)
+        data[name] = (exact.y + noise_mm * errors).reshape(-1, 3)
     estimates, rows = list[EstimateRecord](), list[dict[str, Any]]()
-    for (seen, y), name in product(data.items(), about.models or ("model",)):
-        model = model_of(task, name, len(y))
-        record = _estimate(f"{name}, from {seen}", model, y, task)
-        whole = {"data": seen, "model": name}
+    for (source, y), name in product(data.items(), about.models or ("model",)):
+        model, title = model_of(about, names, name, len(y), job.folder), f"{name}, from {source}"
+        seen = Observation(POINTS, y[None], np.array(noise_mm**2), predicted=POINTS)
+        with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
+            found = estimate(replace(problem, model=model), seen, on_iterate=bar.iterate)
+        if found.fitted is not None and not about.models:
+            write_points(job.folder / FITTED, found.fitted[-1])
+        record = record_of(found, case=title).with_truth(dict(zip(names, true, strict=False)))
+        units = zip(record.unknowns, about.units or [""] * len(names), strict=True)
+        unknowns = tuple(one.model_copy(update={"unit": unit}) for one, unit in units)
+        record = record.model_copy(update={"unknowns": unknowns})
+        whole: dict[str, Any] = {"data": source, "model": name}
         if isinstance(model, ProcessModel):
             whole |= {"runs": model.runs, "served again": model.reused}
         rows += [{**whole, **{key: row.get(key) for key in COLUMNS}} for row in record.rows()]
@@ -266,20 +249,6 @@ COLUMNS: dict[str, Column | str] = {
 """What the table takes of the rows of a record."""
 
 
-def _estimate(title: str, model: ObservationModel, y: FloatArray, task: Task) -> EstimateRecord:
-    """The record of one estimate from positions ``(n, 3)`` mm."""
-    names = task.problem.parameters
-    seen = Observation(POINTS, y[None], np.array(task.noise_mm**2), predicted=POINTS)
-    with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
-        found = estimate(replace(task.problem, model=model), seen, on_iterate=bar.iterate)
-    if found.fitted is not None and not task.about.models:
-        write_points(task.folder / FITTED, found.fitted[-1])
-    record = record_of(found, case=title).with_truth(task.truth)
-    units = zip(record.unknowns, task.about.units or [""] * len(names), strict=True)
-    unknowns = tuple(one.model_copy(update={"unit": unit}) for one, unit in units)
-    return record.model_copy(update={"unknowns": unknowns})
-
-
 def check_external(values: Values, folder: Path) -> str:
     """Run the program once at the initial values, and compare its derivatives with differences.
 
@@ -288,10 +257,10 @@ def check_external(values: Values, folder: Path) -> str:
     MvestError
         If a setting or a file is inadmissible, or the program gives no prediction.
     """
-    task = task_of(build(ExternalSettings, values["external"]), values, folder)
-    y, problem = _points(task.about.observation, "observation"), task.problem
-    m = problem.prior.mean
-    model = model_of(task, "model", len(y))
+    about = build(ExternalSettings, values["external"])
+    problem = problem_of(about, values)
+    y, m = _points(about.observation, "observation"), problem.prior.mean
+    model = model_of(about, problem.parameters, "model", len(y), folder)
     found = predict(model, m)
     if not found.converged:
         raise InputError(f"at the initial values: {found.reason}")

@@ -1,8 +1,8 @@
 """Valves from outside: imported, closed, gated and estimated from.
 
 A recorded closure (``donor``) is fitted from its closed frame, from several starts. The shape of a
-reference heart (``heart``) is measured, meshed and closed, and moduli that were put in are
-estimated on it. Neither is part of this project; ``conf/experiment`` says where they are from.
+reference heart (``heart``) is meshed and closed, and moduli that were put in are estimated on it.
+Neither is part of this project; ``conf/experiment`` says where they are from.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from experiments.common.building.gate import (
     anatomy_digest,
     ask_gate,
     closures_of,
-    gate_cases,
     gate_rows,
 )
 from experiments.common.building.twin import build_twin, estimate_twin
@@ -32,9 +31,8 @@ from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import InputFile, Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
-from mvest.cases.case import Role, ValveCase
+from mvest.cases.case import ValveCase
 from mvest.cases.folder import write_case
-from mvest.cases.plausibility import free_orifice
 from mvest.cases.tissue import (
     CLOSED_DEPTH,
     LeafletBand,
@@ -42,7 +40,6 @@ from mvest.cases.tissue import (
     lay_out_chordae,
 )
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GATE_CASES
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction, Remembered
@@ -61,7 +58,6 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.measure.clinical import clinical_measurements
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import layered_wedges
 
@@ -129,16 +125,13 @@ class HeartSettings:
     muscles: Annotated[tuple[str, ...], Reads(contents)] = ()
     units: str = "mm"
     name: str = "imported valve"
-    description: str = ""
     citation: str = ""
-    licence: str = ""
     smoothing_mm: Length = 4.0  # round the valve: a spike is sharper than leaflets are thick
     # Thickness is kept within bounds, as parts are no leaflet.
     min_thickness_mm: Thickness = 0.3
     max_thickness_mm: Thickness = 3.0
     # Of the free edges below the annulus, closed over open, for which chordae are long enough.
     closed_depth: Share = 0.5
-    gate: tuple[str, ...] = ()  # variations of the gate
     # Of each twin, what its truth has otherwise than the estimator's model (settings of truth).
     twins: dict[str, Any] = field(default_factory=dict)
 
@@ -333,9 +326,7 @@ def import_heart(heart: HeartSettings) -> ValveCase:
     return replace(
         case,
         name=heart.name,
-        description=heart.description,
         source=heart.citation,
-        licence=heart.licence,
         chordae=lay_out_chordae(band, tips, closed, tips, ChordLayout()),
         derived=tuple(line.replace(*stated) for line in case.derived),
     )
@@ -343,21 +334,18 @@ def import_heart(heart: HeartSettings) -> ValveCase:
 
 def _heart(job: Job[Settings]) -> Result:
     heart, values = job.settings.heart, job.values
-    variations = gate_cases(heart.gate)
     case = import_heart(heart)
     own = _on_case(values, case, job.folder / "case")
     closing = close_valve(own)
-    gate = ask_gate(own, variations)
+    gate = ask_gate(own)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
     states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
     failed = [one.reason for one in records if not one.converged]
     steps = closing.result.simulation
     failed += [] if steps.converged else [steps.reason.value]
-    left = len(GATE_CASES) - len(variations)
     return Result(
         tables={
             "": table({"state": state, **row} for state, row in states),
-            "shape": table(_sizes(case)),
             "gate": gate_rows(gate),
             "moduli": estimates_table("estimation", records),
             "derived": table([{"what follows from the source": text} for text in case.derived]),
@@ -370,7 +358,7 @@ def _heart(job: Job[Settings]) -> Result:
         mesh=Mesh.of(closing.model.mesh),
         forward_solves=1 + closures_of(gate),
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
-        f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
+        f"{values['mesh']['rows']} hex18",
     )
 
 
@@ -381,21 +369,6 @@ def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
     write_case(place, case)
     own = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
     return {**values, "valve": {**values["valve"], **own}}
-
-
-def _sizes(case: ValveCase) -> list[dict[str, Any]]:
-    """Sizes of the open valve; the unit ends the name."""
-    surface, frame, chordae = case.surface, case.frame(Role.REFERENCE), case.chordae
-    tips = frame.papillary_tips
-    span = np.linalg.norm(chordae.insertion - tips[chordae.tip], axis=1)
-    measured = clinical_measurements(surface.vertices, surface, frame.annulus, tips, 0.0)
-    sizes = measured | {
-        "median_thickness_mm": float(np.median(surface.thickness)),
-        "open_orifice_mm2": free_orifice(case, frame),
-        "chordae": len(chordae),
-        "median_tip_to_insertion_mm": float(np.median(span)),
-    }
-    return [{"name": name, "value": value} for name, value in sizes.items()]
 
 
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:

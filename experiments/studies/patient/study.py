@@ -8,11 +8,9 @@ which breaks one assumption of the estimator: there it is seen what a verdict is
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import mean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -173,21 +171,17 @@ def summary(results: Results) -> dict[str, Table]:
     patients, which = _patients(results), results.first.table
     estimates = [estimate for _, estimate in patients]
     if which == CALIBRATION:
-        scenarios, nees = _by_scenario(patients), _nees_by_scenario(patients)
-        skill = verdicts_and_skill("scenario", scenarios, stated=False)
-        rows = [row | nees[row["scenario"]] for row in skill.rows]
-        about = {"NEES": Column(digits=".2f", low="NEES low", high="NEES high")}
+        scenarios = _by_scenario(patients)
         trusted = {
             name: [one for one in group if one[1] == TRUSTWORTHY]
             for name, group in scenarios.items()
         }
         moduli = unknowns_of(scenarios, by_name=True, stated=False)
         return {
-            "": table(rows, **skill.columns, **about),
+            "": _with_nees(verdicts_and_skill("scenario", scenarios, stated=False), patients),
             "trusted": skill_table("scenario", unknowns_of(trusted)),
             "verdicts": verdict_table(estimates),
             "moduli": skill_table("scenario, modulus", moduli),
-            "grounds": _grounds(estimates),
             "estimates": _estimates(patients),
         }
     ways = _by_way(estimates)
@@ -347,33 +341,21 @@ def _estimates(patients: Patients) -> Table:
     )
 
 
-def _nees_by_scenario(patients: Patients) -> dict[str, dict[str, float | None]]:
-    """The mean squared error in the posterior's covariance over the number of unknowns.
+def _with_nees(skill: Table, patients: Patients) -> Table:
+    """The skill of scenarios, and the mean of their squared errors in the posterior's covariance.
 
-    If posteriors are right, 95 % of such means lie between its bounds.
+    Over the number of unknowns; if posteriors are right, 95 % of such means lie between the bounds.
     """
-    known: dict[str, list[tuple[float, int]]] = {}
-    for record, _ in patients:
-        one, numbers = known.setdefault(_scenario(record), []), record.numbers
-        if numbers.get("nees") is not None:
-            one.append((float(numbers["nees"]), int(numbers["unknowns"])))  # type: ignore[arg-type]
-    found = {}
-    for name, pairs in known.items():
-        freedom = sum(size for _, size in pairs)
-        low, high = (float(chi2.ppf(q, freedom)) / freedom if freedom else None for q in TAILS)
-        nees = mean(value for value, _ in pairs) if pairs else None
-        found[name] = {"NEES": nees, "NEES low": low, "NEES high": high}
-    return found
+    import pandas as pd
 
-
-def _grounds(estimates: Sequence[EstimateRecord]) -> Table:
-    """What spoke against estimates, and how often."""
-    verdicts = [one.verdict for one in estimates if one.verdict is not None]
-    counts = Counter(
-        check for verdict in verdicts for check in {ground.check for ground in verdict.grounds}
-    )
-    rows = [{"against": check, "estimates": n} for check, n in counts.most_common()]
-    return table(rows, against=Column(label="what spoke against estimates"), estimates="")
+    nees = pd.DataFrame([{"scenario": _scenario(one), **one.numbers} for one, _ in patients])
+    nees = nees[["scenario", "nees", "unknowns"]].dropna()
+    nees = nees.astype({"nees": float}).groupby("scenario")
+    found = nees.agg(NEES=("nees", "mean"), freedom=("unknowns", "sum"))
+    freedom = found.pop("freedom").astype(float)
+    found["NEES low"], found["NEES high"] = (chi2.ppf(q, freedom) / freedom for q in TAILS)
+    about = {"NEES": Column(digits=".2f", low="NEES low", high="NEES high")}
+    return table(skill.frame.join(found, on="scenario"), **skill.columns, **about)
 
 
 # -- figures --------------------------------------------------------------------------------------
