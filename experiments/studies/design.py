@@ -137,7 +137,7 @@ def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
             "": table(rows, **units),
             "confounded": table(_confounded(settings, whole)),
         },
-        numbers={"typical_mm": settings.typical_mm, "target_percent": 100 * settings.target},
+        numbers={"typical_mm": settings.typical_mm},
         mesh=Mesh.of(model.mesh),
         forward_solves=len(frames),
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import linregress, sem
@@ -57,6 +58,9 @@ from mvest.simulation.motion import MotionSettings
 from mvest.simulation.population import draw_tip_motion
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, how it was imaged, and how many anatomies were drawn for it."""
@@ -269,19 +273,22 @@ def summary(results: Results) -> dict[str, Table]:
     return {name: one for name, one in tables.items() if len(one)}
 
 
-def _by_source(results: Results) -> Groups:
-    """Estimates by what they are from."""
-    better = [estimate.alternatives | {"": estimate} for _, estimate in revealed(results)]
-    sources = ((SOURCES[name], one[name]) for one in better for name in SOURCES)
-    return grouped((source, estimate, estimate) for source, estimate in sources)
+def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
+    """Estimates by what they are from; each has its own verdict, or that on the volume's."""
+    return grouped(
+        (source, estimate, own if verdict_of_volume else estimate)
+        for _, own in revealed(results)
+        for name, source in SOURCES.items()
+        for estimate in (own.alternatives[name] if name else own,)
+    )
+
+
+def _figure(results: Results) -> dict[str, Figure]:
+    return {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))}
 
 
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each patient and modulus.
-
-    Errors have a sign: that from the known geometry and the part from the images add up to the
-    whole.
-    """
+    """A row for each patient and modulus; errors have a sign."""
     rows = []
     for estimate in estimates:
         for own in estimate.moduli:
@@ -290,14 +297,12 @@ def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
                 better = estimate.alternatives[name]
                 error = modulus_row(better, better.unknown(own.name))["error"]
                 row[f"error, {name}"] = error
-            known = None in (row["error"], row[f"error, {KNOWN}"])
-            row["part from images"] = None if known else row["error"] - row[f"error, {KNOWN}"]
             rows.append(row)
     percent = MODULUS_COLUMNS["error"]
     about = {"patient": Column(label="patient (simulated)"), **MODULUS_COLUMNS}
     about[f"error, {SEGMENTED}"] = replace(percent, label="error from a perfect segmentation")
     about[f"error, {KNOWN}"] = replace(percent, label="error from the known geometry")
-    return table(rows, **about, **{"part from images": percent})
+    return table(rows, **about)
 
 
 def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
@@ -356,10 +361,10 @@ STUDY = Study(
     settings=Settings,
     run=run_imaged_patient,
     summary=summary,
-    figure=lambda results: {"moduli": groups_figure(_by_source(results))},
+    figure=_figure,
     captions={
-        "moduli": "Estimates with their 95 % intervals over the truth, in the colour of their "
-        "verdicts. Simulated.",
+        "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
+        "verdict on the one from the volume. Simulated.",
     },
     words=case_words,
     files=write_report,

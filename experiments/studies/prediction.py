@@ -272,27 +272,24 @@ def coverage_table(rows: Sequence[Row]) -> Table:
     Where all samples and the truth are one number (no gap at all) there is no uncertainty that
     could be right or wrong: such an interval is not counted.
     """
-    out: list[dict[str, Any]] = []
-    for measure, label in PREDICTED.items():
-        line: dict[str, Any] = {"measure": label}
-        for kind, (low, high, truth, inside) in KINDS.items():
+    out = {name: {"measure": label} for name, label in [*PREDICTED.items(), ("all", "all")]}
+    for kind, (low, high, truth, inside) in KINDS.items():
+        for name, line in out.items():
             held = [
                 row[inside]
                 for row in rows
-                if row["measure"] == measure
+                if (row["measure"] == name or (name == "all" and row["measure"] in PREDICTED))
                 and row[inside] is not None
                 and not row[low] == row[high] == row[truth]
             ]
             line |= {kind: sum(held), f"{kind}_of": len(held)}
-        out.append(line)
-    counts = {name: sum(line[name] for line in out) for name in out[0] if name != "measure"}
-    return table([*out, {"measure": "all", **counts}])
+    return table(out.values())
 
 
 def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> Iterator[Row]:
     """Valves that were not estimated or did not close, and why."""
     for seed, (result, compared) in patients.items():
-        whole = {"patient": seed, "scenario": "", "valve": "estimate", "count": 1}
+        whole: dict[str, Any] = {"patient": seed, "scenario": "", "valve": "estimate", "count": 1}
         if not compared:
             yield whole | {"reason": result.reason}
         for title, (found, own, _) in compared.items():

@@ -318,8 +318,8 @@ def error_rows(trials: DataFrame) -> DataFrame:
     sizes = errors.assign(size=errors["size"].abs()).groupby(["error", "kind"], sort=False)["size"]
     rows = sizes.agg(volumes="size", mean="mean", median="median")
     rows["percentile_90"] = sizes.quantile(0.9)
-    rows = rows.reset_index()
-    return rows.assign(unit=rows["error"].map(ERRORS))
+    plain = rows.reset_index()
+    return plain.assign(unit=plain["error"].map(ERRORS))
 
 
 def figure(results: Results) -> Figure | None:

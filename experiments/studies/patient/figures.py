@@ -13,11 +13,15 @@ from mvest.errors import InputError
 from mvest.problem.record import Spread
 from mvest.problem.verdict import TRUSTWORTHY
 from mvest.reporting.skill import score
+from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mvest.problem.fields import CaseFields
+
+MODELS = {"generic": "generic", "personalised": "fitted"}
+"""What Figure 3 calls models -> their fields of a case."""
 
 AT = np.linspace(0.0, 1.0, 101)[1:-1]
 """Where distributions of the truth's place in the posterior are drawn."""
@@ -49,42 +53,43 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
     from mvest.reporting.case.figures import corner_colours, distance_top
     from mvest.reporting.figures import ATRIUM, DISTANCE_MAP
 
-    distances = []
-    for valve in fields.values():
-        if valve.distance_generic is None or valve.distance_fitted is None:
-            raise InputError("Figure 3 needs the distances of the generic and personalised valves")
-        distances += [valve.distance_generic[valve.closed], valve.distance_fitted[valve.closed]]
+    closed = {
+        name: {label: _closed(valve, which) for label, which in MODELS.items()}
+        for name, valve in fields.items()
+    }
+    distances = [distance for models in closed.values() for _, distance in models.values()]
     scale = ScalarMappable(Normalize(0.0, distance_top(*distances)), DISTANCE_MAP)
-    columns = len(fields)
-    drawn = Figure(figsize=(2.6 * columns + 0.6, 5.4), layout="constrained")
-    grid = drawn.subplots(2, columns, squeeze=False)
-    for column, (name, valve) in enumerate(fields.items()):
-        k, shapes = valve.closed, []
-        for row, (which, positions, distance) in enumerate(
-            (
-                ("generic", valve.generic, valve.distance_generic),
-                ("personalised", valve.fitted, valve.distance_fitted),
-            )
-        ):
-            assert positions is not None
-            assert distance is not None
-            axes = grid[row, column]
-            colours = corner_colours(scale, distance[k], valve.triangles)
-            draw_valve(axes, valve, positions[k], colours, ATRIUM, k + 1, strength=0.3)
-            paint_leak(axes, valve, positions[k], k + 1)
-            above = name.replace("_", " ") if row == 0 else "NO ESTIMATE" * (name in denied)
-            axes.set_title(f"{above}\n{Spread.of(distance[k])} mm".strip(), fontsize=9)
-            if column == 0:
-                axes.text(
-                    -0.06, 0.5, which, transform=axes.transAxes, rotation=90, va="center",
-                    ha="right", fontsize=11,
-                )  # fmt: skip
-            shapes.append(positions[k])
-        same_scale(list(grid[:, column]), shapes, ATRIUM)
+    drawn = Figure(figsize=(2.6 * len(fields) + 0.6, 5.4), layout="constrained")
+    grid = drawn.subplots(2, len(fields), squeeze=False)
+    for column, (name, valve) in zip(grid.T, fields.items(), strict=True):
+        above = {
+            "generic": name.replace("_", " "),
+            "personalised": "NO ESTIMATE" * (name in denied),
+        }
+        k = valve.closed + 1
+        for axes, (label, (shape, distance)) in zip(column, closed[name].items(), strict=True):
+            colours = corner_colours(scale, distance, valve.triangles)
+            draw_valve(axes, valve, shape, colours, ATRIUM, k, strength=0.3)
+            paint_leak(axes, valve, shape, k)
+            axes.set_title(f"{above[label]}\n{Spread.of(distance)} mm".strip(), fontsize=9)
+        same_scale(list(column), [shape for shape, _ in closed[name].values()], ATRIUM)
+    for axes, label in zip(grid[:, 0], MODELS, strict=True):
+        axes.text(
+            -0.06, 0.5, label, transform=axes.transAxes, rotation=90, va="center", ha="right",
+            fontsize=11,
+        )  # fmt: skip
     bar = drawn.colorbar(scale, ax=grid, shrink=0.7, pad=0.01, extend="max")
     bar.set_label("distance from the observed closed valve [mm]")
     drawn.suptitle("Closed valves of virtual patients (simulated), seen from the atrium")
     return drawn
+
+
+def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
+    """Closed positions and distances of a model."""
+    positions, distance = getattr(valve, which), getattr(valve, f"distance_{which}")
+    if positions is None or distance is None:
+        raise InputError("Figure 3 needs the distances of the generic and personalised valves")
+    return positions[valve.closed], distance[valve.closed]
 
 
 def ranks_figure(scenarios: Groups) -> Figure:

@@ -137,15 +137,13 @@ def _to_truth(
     frames: Sequence[FrameFit], arrays: Mapping[str, NDArray[Any]]
 ) -> tuple[FrameFit, ...]:
     """Frames with distances to where the valve truly was."""
-
-    def off(shape: str, k: int) -> Spread:
-        return Spread.of(np.linalg.norm(arrays[shape][k] - arrays["truth"][k], axis=1))
-
     shapes = {"generic": "generic", "registered": "registered", "personalised": "fitted"}
+    off = {
+        f"{which}_to_truth": np.linalg.norm(arrays[shape] - arrays["truth"], axis=2)
+        for which, shape in shapes.items()
+    }
     return tuple(
-        frame.model_copy(
-            update={f"{which}_to_truth": off(shape, k) for which, shape in shapes.items()}
-        )
+        frame.model_copy(update={name: Spread.of(each[k]) for name, each in off.items()})
         for k, frame in enumerate(frames)
     )
 
@@ -348,10 +346,9 @@ def _with_nees(skill: Table, patients: Patients) -> Table:
     """
     import pandas as pd
 
-    nees = pd.DataFrame([{"scenario": _scenario(one), **one.numbers} for one, _ in patients])
-    nees = nees[["scenario", "nees", "unknowns"]].dropna()
-    nees = nees.astype({"nees": float}).groupby("scenario")
-    found = nees.agg(NEES=("nees", "mean"), freedom=("unknowns", "sum"))
+    numbers = pd.DataFrame([{"scenario": _scenario(one), **one.numbers} for one, _ in patients])
+    known = numbers[["scenario", "nees", "unknowns"]].dropna().astype({"nees": float})
+    found = known.groupby("scenario").agg(NEES=("nees", "mean"), freedom=("unknowns", "sum"))
     freedom = found.pop("freedom").astype(float)
     found["NEES low"], found["NEES high"] = (chi2.ppf(q, freedom) / freedom for q in TAILS)
     about = {"NEES": Column(digits=".2f", low="NEES low", high="NEES high")}
