@@ -272,7 +272,8 @@ def coverage_table(rows: Sequence[Row]) -> Table:
     Where all samples and the truth are one number (no gap at all) there is no uncertainty that
     could be right or wrong: such an interval is not counted.
     """
-    out = {name: {"measure": label} for name, label in [*PREDICTED.items(), ("all", "all")]}
+    labels = [*PREDICTED.items(), ("all", "all")]
+    out: dict[str, dict[str, Any]] = {name: {"measure": label} for name, label in labels}
     for kind, (low, high, truth, inside) in KINDS.items():
         for name, line in out.items():
             held = [

@@ -71,7 +71,7 @@ def estimated(tmp_path, place, monkeypatch):
         monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda *asked: place)
         monkeypatch.setattr(blind, "estimate_blindly", blindly)
         one = PatientSettings(name="one", description="")
-        priors = dict.fromkeys(("E_f.anterior", "E_f.posterior"), {"mean": 1.0, "std": 1.0})
+        priors = {key: {"mean": 1.0, "std": 1.0} for key in ("E_f.anterior", "E_f.posterior")}
         personal = build(PersonalSettings, {"unknowns": priors})
         settings = SimpleNamespace(patient=one, echo=None, personal=personal)
         job = Job({"imaged": {}, "seed": 7}, settings, tmp_path)
