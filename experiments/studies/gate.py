@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,9 +21,8 @@ from experiments.common.building.gate import (
     gate_of,
     gate_rows,
 )
-from experiments.common.records.record import Mesh, Record
+from experiments.common.records.record import Mesh
 from experiments.common.study import Job, Result, Results, Study
-from mvest.closure.robustness import GateReport
 from mvest.reporting.tables import Column, Table, joined, table
 from mvest.typing import FloatArray
 
@@ -55,13 +53,8 @@ def _gate(job: Job[Settings]) -> Result:
     values = job.values
     report = ask_gate(values)
     model = closure_model(values)
-    closures = closures_of(report)
-    verdict = {
-        "passed": report.passed,
-        "closures": closures,
-        "fails by": "; ".join(_failures(report)),
-    }
-    reference = report.rows[0]
+    reference, closures = report.rows[0], closures_of(report)
+    verdict = {"passed": report.passed, "closures": closures}
     return Result(
         tables={"": table([verdict], passed=""), "variations": gate_rows(report)},
         # By these others look the verdict up.
@@ -71,15 +64,6 @@ def _gate(job: Job[Settings]) -> Result:
         mesh=Mesh.of(model.mesh),
         forward_solves=closures,
     )
-
-
-def _failures(report: GateReport) -> list[str]:
-    rows = [
-        f"{row.case}: " + (f"{row.max_mm:.2g} mm off" if row.max_mm > 0 else row.reason)
-        for row in report.rows
-        if not row.passed
-    ]
-    return [*rows, *(f"{p.name}: {p.reason}" for p in report.paths if not p.passed)]
 
 
 def _closing(job: Job[Settings]) -> Result:
@@ -126,19 +110,16 @@ CURVES = {
 
 
 def figure(results: Results) -> Figure | None:
-    """Four moments of a closing valve from the atrium and from the side, above four curves."""
-    name, record = next(iter(results.records.items()))
-    return draw_steps(record, results.arrays[name]) if name in results.arrays else None
-
-
-def draw_steps(record: Record, arrays: Path) -> Figure:
-    """A closing valve from its record and its arrays (`Closing.arrays`).
+    """Four moments of a closing valve from the atrium and from the side, above four curves.
 
     Raises
     ------
     InputError
-        If the arrays cannot be read.
+        If the arrays (`Closing.arrays`) cannot be read.
     """
+    name, record = next(iter(results.records.items()))
+    if name not in results.arrays:
+        return None
     from matplotlib.figure import Figure
 
     values = record.table_of().values
@@ -151,7 +132,7 @@ def draw_steps(record: Record, arrays: Path) -> Figure:
     }
     drawn = Figure(figsize=(11, 8.4), layout="constrained")
     parts: Any = drawn.subfigures(2, 1, height_ratios=[2.2, 1.0])
-    draw_closing(parts[0], arrays, titles, ("anterior", "posterior"))
+    draw_closing(parts[0], results.arrays[name], titles, ("anterior", "posterior"))
     _draw_curves(parts[1], values, moments, at_rest)
     drawn.suptitle(
         "A simulated valve closing, from the atrium and from the posterior side"

@@ -268,7 +268,6 @@ def summary(results: Results) -> dict[str, Table]:
         "bias": _bias(unknowns_of(groups, by_name=True, stated=False)),
         "verdicts": verdict_table(estimates),
         "chordae": _chordae(results),
-        "shares": _shares(estimates),
     }
     return {name: one for name, one in tables.items() if len(one)}
 
@@ -345,18 +344,6 @@ def _chordae(results: Results) -> Table:
     return table(rows, family="", ratio=replace(three, std="SD"), **{"laid out": three})
 
 
-def _shares(estimates: Sequence[EstimateRecord]) -> Table:
-    """Where the variance of each modulus' logarithm comes from, to first order: medians."""
-    import pandas as pd
-
-    rows = [row for estimate in estimates for row in estimate.detail_rows("shares")]
-    if not rows:
-        return table([])
-    sources = pd.DataFrame(rows).groupby(["source", "parameter"], sort=False)
-    medians = sources[["share"]].median().reset_index()
-    return table(medians, source="", parameter="::modulus", share=":.3f")
-
-
 STUDY = Study(
     settings=Settings,
     run=run_imaged_patient,
@@ -368,6 +355,6 @@ STUDY = Study(
     },
     words=case_words,
     files=write_report,
-    keep=lambda record: short(record, "shares"),
+    keep=short,
     keeps_failures=True,
 )

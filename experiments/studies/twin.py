@@ -15,7 +15,6 @@ from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin, estimate_twin, expect_twin
 from experiments.common.records.record import Mesh, model_of_values
 from experiments.common.study import Job, Result, Results, Study
-from mvest.errors import ConfigurationError
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import valve_fields
@@ -99,9 +98,6 @@ def require_twin(values: Mapping[str, Any]) -> None:
     """
     build_filter(values["filter"], tuple(values["parameters"]))
     observation_variance(values["filter"]["R"])
-    noise = values["observation"]["noise_mm"]
-    if noise < 0:
-        raise ConfigurationError(f"observation.noise_mm = {noise}, expected at least 0")
 
 
 def _row(

@@ -145,16 +145,13 @@ MODULUS_COLUMNS: Mapping[str, Column] = {
 """Columns of `modulus_row`."""
 
 
-def short(record: Record, *details: str, nuisances: bool = False) -> Record:
-    """A record with what tables and figures of estimates need, and these details.
-
-    The record in the folder of the run has all of it.
-    """
+def short(record: Record, *, nuisances: bool = False) -> Record:
+    """A record with what tables and figures of estimates need; the run's folder has all of it."""
 
     def shortened(estimate: EstimateRecord) -> EstimateRecord:
         others = {name: shortened(other) for name, other in estimate.alternatives.items()}
         few = estimate.parameters if nuisances else estimate.moduli
         return estimate.model_copy(update={"unknowns": few, "alternatives": others})
 
-    kept = tuple(shortened(estimate.without_details(*details)) for estimate in record.estimates)
+    kept = tuple(shortened(estimate.without_details()) for estimate in record.estimates)
     return record.model_copy(update={"estimates": kept})

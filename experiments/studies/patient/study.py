@@ -37,6 +37,7 @@ from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
 from experiments.studies.patient.figures import figure_3, ranks_figure
 from mvest.cases.folder import read_case
+from mvest.estimation.information.consistency import nees
 from mvest.problem.record import EstimateRecord, FrameFit, Spread
 from mvest.problem.verdict import TRUSTWORTHY
 from mvest.reading.npz import read_npz
@@ -153,8 +154,7 @@ def _nees(estimate: EstimateRecord) -> float | None:
     scores = [score(unknown) for unknown in estimate.parameters]
     if not estimate.correlation or None in scores:
         return None
-    z = np.array(scores, dtype=np.float64)
-    return float(z @ np.linalg.solve(np.array(estimate.correlation), z)) / len(z)
+    return nees(np.array(scores), np.array(estimate.correlation)) / len(scores)
 
 
 def check_patient(values: Values, folder: Path) -> str:

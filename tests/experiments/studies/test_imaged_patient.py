@@ -221,28 +221,6 @@ def test_lengths_of_chordae_are_of_all_patients_that_have_them():
     assert (row["ratio"], row["SD"]) == pytest.approx((1.00667, 0.03055), abs=1e-5)
 
 
-def shares(scale: float) -> dict[str, Any]:
-    return {
-        "shares": tuple(
-            {"source": source, "parameter": name, "share": share}
-            for name in ("E_f.anterior", "E_f.posterior")
-            for source, share in (("images", 1.0 - 0.2 * scale), ("pressure", 0.2 * scale))
-        )
-    }
-
-
-def test_where_the_variance_comes_from_is_a_median_over_patients():
-    records = [
-        record(f"p{k}", MODULI, (5.0, 2.0), (5.0, 2.0), details=shares(scale))
-        for k, scale in enumerate((1.0, 2.0, 1.1))
-    ]
-    records.append(FIRST)
-    found = {(row["source"], row["parameter"]): row for row in rows(records, "shares")}
-    assert found["pressure", "E_f.posterior"]["share"] == pytest.approx(0.22)
-    assert "shares" not in summary(Results({"one": FIRST}))
-    assert set(STUDY.figure(Results({"one": FIRST}))) == {"moduli"}
-
-
 def test_the_table_is_that_of_all_patients(tmp_path):
     for one in (FIRST, LOST, FIRST):
         # Run again, a patient takes its own place.
@@ -251,6 +229,6 @@ def test_the_table_is_that_of_all_patients(tmp_path):
     assert kept is not None
     assert list(kept.records) == ["volumes-one", "volumes-two"]
     assert (tmp_path / "volume.csv").read_text().count("E_f.anterior") == 2
-    full = record("one", MODULI, (5.0, 2.0), (5.0, 2.0), details=shares(1.0), correlation=((1.0,),))
+    full = record("one", MODULI, (5.0, 2.0), (5.0, 2.0), correlation=((1.0,),))
     for name, own in summary(Results({"one": full})).items():
         assert summary(Results({"one": STUDY.keep(full)}))[name].csv() == own.csv()
