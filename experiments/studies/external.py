@@ -1,4 +1,4 @@
-"""Any model behind the filters: a program asked through files, or a function in a file of Python.
+"""Any model behind the filters: a program called through files, or a Python function.
 
 It estimates its parameters from observed positions. Of several models each estimates from what the
 first ones predict for known parameters.

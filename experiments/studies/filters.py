@@ -78,10 +78,10 @@ def run(job: Job[Settings]) -> Result:
     settings, seed = job.settings.filters, job.values["seed"]
     rows: list[dict[str, Any]] = []
     references: list[dict[str, Any]] = []
-    meshes, solves = [], 0
+    mesh, solves = None, 0
     for name, about in settings.problems.items():
         problem = build_problem(job.values, name, about)
-        meshes.append(Mesh.of(problem.closure.mesh))
+        mesh = mesh or Mesh.of(problem.closure.mesh)
         # All are made before any is run: a wrong setting is refused at once.
         filters = {method: problem.filter(values) for method, values in settings.methods.items()}
         reference = problem.estimate(filter_of(settings.reference), seed)
@@ -99,7 +99,7 @@ def run(job: Job[Settings]) -> Result:
             say(f"{name}, {method}: {found.forward_solves} runs")
     return Result(
         tables={"": table(rows, **COLUMNS), "reference": table(references, **COLUMNS)},
-        mesh=meshes[0],
+        mesh=mesh,
         forward_solves=solves,
     )
 

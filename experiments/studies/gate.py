@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class GateSettings:
     """What is done with the valve."""
 
-    every_step: bool = False  # measure one closure step by step, and ask no gate
+    every_step: bool = False  # measure one closure step by step, without the gate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class Settings:
 
 
 def run(job: Job[Settings]) -> Result:
-    """Measure one closure, or ask the gate."""
+    """Measure one closure, or run the gate."""
     return _closing(job) if job.settings.gate.every_step else _gate(job)
 
 

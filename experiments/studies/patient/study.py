@@ -182,24 +182,20 @@ def summary(results: Results) -> dict[str, Table]:
             "moduli": skill_table("scenario, modulus", moduli),
             "estimates": _estimates(patients),
         }
-    ways = _by_way(estimates)
-    distances = _table3(patients)
-    moduli_table = skill_table("estimation", unknowns_of(ways))
+    ways, frames = _by_way(estimates), _table3(patients)
+    both = {
+        "moduli": skill_table("estimation", unknowns_of(ways)),
+        "distances": _distances(frames),
+    }
     if which == POPULATION:
         each = unknowns_of(ways, by_name=True, nuisances=True)
         return {
             "": skill_table("estimation, unknown", each),
-            "moduli": moduli_table,
+            **both,
             "verdicts": verdict_table(estimates),
-            "distances": _distances(distances),
             "estimates": _estimates(patients),
         }
-    return {
-        "table_2": _table2(estimates),
-        "table_3": distances,
-        "moduli": moduli_table,
-        "distances": _distances(distances),
-    }
+    return {"table_2": _table2(estimates), "table_3": frames, **both}
 
 
 def _patients(results: Results) -> Patients:
