@@ -104,9 +104,8 @@ OWN = ("experiment=own_valve", "case=examples/case")
 STRUCTURED = "personal.mesh.source=structured"
 
 RUNS = {
-    # Neither confirming nor measuring the closed valve changes an estimate.
-    "table1": Run(("experiment=table1", "confirm=false")),
-    "table1_independent": Run(("experiment=table1_independent", "confirm=false"), slow=True),
+    "table1": Run(("experiment=table1",)),
+    "table1_independent": Run(("experiment=table1_independent",), slow=True),
     "sweep": Run(
         (
             "sweep=debug",

@@ -201,7 +201,6 @@ class Config:
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: Logarithm | None = None  # unless the log of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes
-    confirm: bool = True  # close the fitted valve anew from the open state
     seed: Seed = 1
     repeats: Repeats = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
     figures: Switch = True  # draw the run; a sweep need not draw every job

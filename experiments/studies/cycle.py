@@ -24,24 +24,25 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol, compare_time_steps, with_mesh_error
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
-from mvest.estimation.information.consistency import nees
 from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.prediction import Remembered, predict
 from mvest.observation.vertices import Observation
-from mvest.problem.estimate import Problem, StudyResult, estimate
-from mvest.problem.record import finite, record_of
+from mvest.problem.estimate import Problem, estimate
+from mvest.problem.record import EstimateRecord, finite, record_of
 from mvest.problem.synthetic import Truth
-from mvest.quantities import AxisCount, Count, Length, Logarithm, Share, TimeStep, Tolerance
+from mvest.quantities import AxisCount, Count, Length, TimeStep, Tolerance
 from mvest.reporting.expectation import expectation_text
-from mvest.reporting.tables import Column, Table, table
+from mvest.reporting.skill import estimates_table
+from mvest.reporting.tables import table
 from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Row = dict[str, Any]
 EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
 """Observations that parameters are estimated from; all but the second are of all frames."""
+
+WIDER = f"{OTHER}, with the mesh's error"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,10 +62,8 @@ class CycleSettings:
     objective_tolerance: Tolerance = 0.02
     finer: tuple[AxisCount, ...] = (32, 4, 96, 21)  # mesh of a truth that is not the estimator's
     check: tuple[AxisCount, ...] = (40, 5, 120, 26)  # mesh that shows what the estimator's does
-    finer_dt_factor: Share = 0.5  # of the time step on both
     time_steps: tuple[TimeStep, ...] = ()  # s, each half of the last, to be compared
     path_steps: Count = 16  # along which frames are looked at for jumps
-    path_change: Logarithm = -0.3  # of the first parameter along it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,14 +73,9 @@ class Settings:
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """An estimate from errors of a seed; ``shift (p,)`` by its mesh, in parts of the truth."""
-
-    label: str
-    seed: int
-    result: StudyResult
-    shift: FloatArray | None = None
+FINER_STEP, PATH_CHANGE = 0.5, -0.3
+"""Time step on other meshes in parts of the estimator's, and how far the first parameter changes
+along the path on which frames are looked at for jumps."""
 
 
 def run_cycle(job: Job[Settings]) -> Result:
@@ -100,30 +94,26 @@ def run_cycle(job: Job[Settings]) -> Result:
     if not true.converged:
         raise InputError(f"the truth has no cycle: {true.reason}")
     frames = true.y.reshape(len(settings.protocol.times), -1, 3)
-    bounds = list(_bounds(settings, true.jacobian.reshape(*frames.shape, -1), model.names, truth))
+    bounds = _bounds(settings, true.jacobian.reshape(*frames.shape, -1), model.names, truth)
     tables = {"": table(bounds, frames="", count="", parameter="", bound="%")}
     numbers: dict[str, Number] = {"vertices": frames.shape[1], "noise_mm": settings.noise_mm}
-    fits, solves = list[Fit](), 1
+    solves = 1
     if dts := settings.time_steps:
         path = np.tile(truth, (settings.path_steps + 1, 1))
-        path[:, 0] *= np.linspace(1.0, 1.0 + settings.path_change, len(path))
+        path[:, 0] *= np.linspace(1.0, 1.0 + PATH_CHANGE, len(path))
         with _bar("time steps", model, len(dts) * len(path)):
             steps = compare_time_steps(model, dts, path)
         tables["time_steps"] = table(steps, dt="s", change="mm", unevenness=":.1f")
         solves += len(dts) * len(path)
-    if settings.estimated:
-        fits = _estimates(values, settings, frames, truth, numbers)
-        rows = list(_rows(fits, bounds))
-        tables |= {"estimates": table(rows, **ESTIMATES), "over_seeds": _over_seeds(rows)}
-        own = (one.result.filtered for one in fits if one.shift is None)
-        solves += sum(found.forward_solves for found in own if found is not None)
-    failed = [f"{one.label}: {one.result.reason}" for one in fits if not one.result.converged]
+    estimates = tuple(_estimates(values, settings, frames, truth, numbers))
+    if estimates:
+        tables["estimates"] = estimates_table("estimate from", estimates)
+    solves += sum(one.forward_solves or 0 for one in estimates if one.case != WIDER)
+    failed = [f"{one.case}: {one.reason}" for one in estimates if not one.converged]
     return Result(
         tables=tables,
         numbers=numbers,
-        estimates=tuple(
-            record_of(one.result, seed=one.seed, case=one.label, simulated=True) for one in fits
-        ),
+        estimates=estimates,
         status="failed" if failed else "converged",
         reason="; ".join(failed) or "completed",
         mesh=Mesh.of(model.closure.mesh),
@@ -134,25 +124,17 @@ def run_cycle(job: Job[Settings]) -> Result:
 
 def _bounds(
     settings: CycleSettings, H: FloatArray, names: Sequence[str], truth: FloatArray
-) -> Iterator[Row]:
-    """Cramér-Rao bounds of sets of frames, and which other parameter each is correlated with.
+) -> Iterator[dict[str, Any]]:
+    """Cramér-Rao bounds of sets of frames.
 
     ``H (f, n, 3, p)`` are the derivatives of the frames at the truth ``(p,)``.
     """
     for label, chosen in settings.protocol.frame_sets().items():
         rows = H[chosen].reshape(-1, len(truth))
         bound = identifiability(rows, settings.noise_mm**2, truth, names=names)
-        others = np.nan_to_num(bound.correlation * (1.0 - np.eye(len(names))))
-        for k, name in enumerate(names):
-            most = int(np.argmax(np.abs(others[k])))
-            yield {
-                "frames": label,
-                "count": len(chosen),
-                "parameter": name,
-                "bound": finite(100 * bound.std[k] / truth[k]),
-                "largest correlation": float(others[k, most]),
-                "with": names[most],
-            }
+        for name, percent in zip(names, 100 * bound.std / truth, strict=True):
+            about = {"frames": label, "count": len(chosen), "parameter": name}
+            yield {**about, "bound": finite(percent)}
 
 
 def _estimates(
@@ -161,7 +143,7 @@ def _estimates(
     frames: FloatArray,
     truth: FloatArray,
     numbers: dict[str, Number],
-) -> list[Fit]:
+) -> Iterator[EstimateRecord]:
     """Estimates of all parameters from observations of one true cycle."""
     if not set(settings.estimated) <= {EXACT, TWO, WHOLE, OTHER}:
         known = f"{EXACT}, {TWO}, {WHOLE}, {OTHER}"
@@ -169,7 +151,6 @@ def _estimates(
             f"cycle.estimated = {settings.estimated}, expected some of {known}"
         )
     model, problem = _problem(values, settings)
-    fits = list[Fit]()
     for what in settings.estimated:
         at = settings.protocol.frame_sets()[TWO if what == TWO else WHOLE]
         shown, noise = frames, 0.0 if what == EXACT else settings.noise_mm
@@ -185,34 +166,25 @@ def _estimates(
             with _bar(label, model, TYPICAL_SOLVES, problem.parameters) as bar:
                 result = estimate(problem, seen, on_iterate=bar.iterate)
             result = result.against(Truth(problem.parameters, truth, frames[at]))
-            fits.append(Fit(label, seed, result))
+            yield record_of(result, seed=seed, case=label, simulated=True)
             found, search = result.filtered, problem.filter
-            first = what == WHOLE and not k and result.converged
-            if first and found is not None and isinstance(search, IteratedFilter):
+            if found is None:
+                continue
+            if what == WHOLE and not k and result.converged and isinstance(search, IteratedFilter):
                 # The mode does not depend on where its search starts.
                 start, enough = tuple(found.mean.tolist()), settings.objective_tolerance
                 nearer = replace(search, start=start, objective_tolerance=enough)
                 problem = replace(problem, filter=nearer)
             if what == OTHER:
-                fits += _with_mesh_error(values, settings, fits[-1], numbers)
-    return fits
-
-
-def _with_mesh_error(
-    values: Values, settings: CycleSettings, one: Fit, numbers: dict[str, Number]
-) -> Iterator[Fit]:
-    """An estimate with what its own mesh may have done to it, from one run on a third mesh."""
-    found, seen, truth = one.result.filtered, one.result.observation, one.result.truth
-    if found is None or seen is None or truth is None:
-        return
-    finer = _on_mesh(values, settings, settings.check)
-    try:
-        wider, shift, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
-    except InputError as error:
-        numbers["check_mesh"] = str(error)
-        return
-    result, label = replace(one.result, filtered=wider), f"{OTHER}, with the mesh's error"
-    yield Fit(label, one.seed, result, shift / truth.values)
+                # What its own mesh may have done to it, from one run on a third mesh.
+                finer = _on_mesh(values, settings, settings.check)
+                try:
+                    wider, _, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
+                except InputError as error:
+                    numbers["check_mesh"] = str(error)
+                    continue
+                changed = replace(result, filtered=wider)
+                yield record_of(changed, seed=seed, case=WIDER, simulated=True)
 
 
 def _on_mesh(values: Values, settings: CycleSettings, mesh: tuple[int, ...]) -> CycleModel:
@@ -223,7 +195,7 @@ def _on_mesh(values: Values, settings: CycleSettings, mesh: tuple[int, ...]) -> 
         "mesh": {**values["mesh"], "columns": columns, "rows": rows},
         "mechanics": {**values["mechanics"], "contact_points": {"columns": around, "rows": along}},
     }
-    dt = settings.protocol.dt * settings.finer_dt_factor
+    dt = settings.protocol.dt * FINER_STEP
     return CycleModel(closure_model(changed), replace(settings.protocol, dt=dt))
 
 
@@ -264,73 +236,18 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
         return expectation_text(f"{values['name']}, {values['row']}", problem, seen, noise)
 
 
-ESTIMATES: dict[str, Column | str] = {
-    "estimate from": "",
-    "parameter": "",
-    "estimate": Column(std="SD"),
-    "error": Column("%", std="relative SD"),
-    "relative SD": "%",
-    "shift": "%",
-    "bound": "%",
-    "prior SD": "%",
-    "residual": "mm",
-}
-
-
-def _rows(fits: Sequence[Fit], bounds: Sequence[Row]) -> Iterator[Row]:
-    """A row for each estimate and parameter; relative values in percent."""
-    best = {(row["frames"], row["parameter"]): row["bound"] for row in bounds}
-    for one in fits:
-        found, truth = one.result.filtered, one.result.truth
-        if found is None or truth is None or one.result.observation is None:
-            continue
-        z, true = found.transformed, truth.values
-        # In filter coordinates, where the posterior is nearly normal.
-        squared = nees(z.mean - found.transform.forward(true), z.covariance)
-        for k, name in enumerate(found.names):
-            yield {
-                "estimate from": one.label,
-                "parameter": name,
-                "truth": true[k],
-                "start": found.prior.mean[k],
-                "prior SD": 100 * found.prior.std[k] / found.prior.mean[k],
-                "estimate": found.mean[k],
-                "SD": found.std[k],
-                "error": 100 * (found.mean[k] / true[k] - 1),
-                "relative SD": 100 * found.std[k] / found.mean[k],
-                "shift": None if one.shift is None else 100 * one.shift[k],
-                "bound": best[TWO if one.label == TWO else WHOLE, name],
-                "NEES": squared,
-                "runs": found.forward_solves,
-                "residual": found.innovation and found.innovation.residual_rms,
-                "status": "converged" if one.result.converged else "failed",
-            }
-
-
-def _over_seeds(rows: Sequence[Row]) -> Table:
-    """Root mean square error over the seeds of the whole cycle in parts of the bound."""
-    found: dict[str, list[float]] = {}
-    for row in rows:
-        if row["estimate from"].startswith(f"{WHOLE},") and row["status"] == "converged":
-            found.setdefault(row["parameter"], []).append(row["error"] / row["bound"])
-    return table(
-        {"parameter": name, "seeds": len(v), "RMS error / bound": np.sqrt(np.mean(np.square(v)))}
-        for name, v in found.items()
-    )
-
-
 def figure(results: Results) -> Figure:
     """What sets of frames could tell, beside the estimates if there are any."""
     from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 
-    estimated = "estimates" in results.table_names
-    drawn, (axes,) = panels(1, 1 + estimated, 4.6)
+    estimates = results.first.estimates
+    drawn, (axes,) = panels(1, 1 + bool(estimates), 4.6)
     for k, (name, own) in enumerate(results.table().frame.groupby("parameter", sort=False)):
         style = {"color": COLOURS[k % 6], "marker": MARKERS[k % 6], "ms": 5}
         axes[0].plot(own["bound"], own["frames"], ls="", label=name, **style)
     axes[0].set(xscale="log", xlabel="smallest possible SD (%)")
-    if estimated:
-        _draw_estimates(axes[1], results.table("estimates").frame)
+    if estimates:
+        _draw_estimates(axes[1], estimates)
     for one in axes:
         one.invert_yaxis()
         log_axis(one.xaxis)
@@ -339,25 +256,24 @@ def figure(results: Results) -> Figure:
     return drawn
 
 
-def _draw_estimates(axes: Any, rows: Any) -> None:
+def _draw_estimates(axes: Any, estimates: Sequence[EstimateRecord]) -> None:
     """Errors ± 2 standard deviations, a group for each parameter."""
     from mvest.reporting.figures import COLOURS
 
-    kinds: list[str] = []
-    groups = list(rows.groupby("estimate from", sort=False))
-    for j, (label, own) in enumerate(groups):
-        kind = label.partition(", errors")[0]
-        kinds += [] if kind in kinds else [kind]
-        y = np.arange(len(own)) + 0.7 * ((j + 0.5) / len(groups) - 0.5)
-        axes.errorbar(
-            own["error"], y, xerr=2 * own["relative SD"], fmt="o", ms=3, lw=1,
-            color=COLOURS[kinds.index(kind) % 6],
-        )  # fmt: skip
+    kinds = list(dict.fromkeys(one.case.partition(", errors")[0] for one in estimates))
+    for j, one in enumerate(estimates):
+        own = [unknown for unknown in one.parameters if unknown.estimate]
+        colour = COLOURS[kinds.index(one.case.partition(", errors")[0]) % 6]
+        y = np.arange(len(own)) + 0.7 * ((j + 0.5) / len(estimates) - 0.5)
+        error = [100 * (unknown.relative_error or 0.0) for unknown in own]
+        two = [200 * (unknown.std or 0.0) / (unknown.estimate or 1.0) for unknown in own]
+        axes.errorbar(error, y, xerr=two, fmt="o", ms=3, lw=1, color=colour)
     for colour, kind in zip(COLOURS, kinds, strict=False):
         axes.plot([], [], "o", color=colour, label=kind)
     axes.axvline(0.0, color="black", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
-    axes.set_yticks(range(len(own)), own["parameter"])
+    names = [unknown.name for unknown in estimates[0].parameters]
+    axes.set_yticks(range(len(names)), names)
     axes.set_xlabel("error ± 2 SD (%)")
 
 

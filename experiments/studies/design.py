@@ -8,7 +8,6 @@ pressures, and estimates some of them.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -27,17 +26,11 @@ from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.cycle import CycleModel, CycleProtocol
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError
-from mvest.estimation.information.design import Design, needed, together
+from mvest.estimation.information.design import Design, together
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.design import (
-    HALF,
-    KINDS,
-    FrameDesigns,
-    StatedErrors,
-    design_case,
-)
+from mvest.personalisation.design import FrameDesigns, StatedErrors, design_case
 from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
@@ -64,7 +57,6 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 Row = dict[str, Any]
@@ -84,7 +76,6 @@ class DesignsSettings:
     # Relative standard deviations of the nuisances, by what is assumed to be known of them: 0
     # for what is known, and nothing is known of what is not named.
     knowledge: dict[str, dict[str, Factor]] = field(default_factory=dict)
-    believed: str = ""  # which of these holds where it is asked how well pressure must be known
     known: tuple[str, ...] = ()  # parameters taken as known where confounded ones are looked for
 
 
@@ -126,10 +117,6 @@ def run(job: Job[Settings]) -> Result:
         return Result(status="failed", reason=str(error))
 
 
-KNOWN = (1e-5, 1e2)
-"""Relative standard deviations between which a needed knowledge is looked for."""
-
-
 # -- one configured valve -------------------------------------------------------------------------
 def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
     """Derivatives of one run for each set of frames, and all designs from them.
@@ -146,19 +133,15 @@ def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
     designs = list(_designs(values, settings, model, frames, truth))
     whole = [(about, design) for about, design in designs if about["vertices"] == ALL_VERTICES]
     rows = [{**about, **row} for about, design in designs for row in _expected(settings, design)]
-    needed = [row for about, design in whole for row in _pressures(settings, about, design)]
     units = dict.fromkeys(next(iter(rows), ()), "")
     units |= {name: "%" for name in units if name.startswith("std")}
     units |= {name: "mm" for name in units if name.startswith("noise")}
     return Result(
         tables={
             "": table(rows, **units),
-            "knowledge_of_pressure": table(
-                needed, frames="", errors="", parameter="", **{"known to": "%"}
-            ),
             "confounded": table(_confounded(settings, whole)),
         },
-        numbers={"typical_mm": settings.typical_mm, "target_percent": 100 * settings.target},
+        numbers={"typical_mm": settings.typical_mm},
         mesh=Mesh.of(model.mesh),
         forward_solves=len(frames),
     )
@@ -218,14 +201,10 @@ def _designs(
             yield about, together(*parts)
 
 
-def _moduli(design: Design) -> list[str]:
-    return [name for name in design.names if name.startswith("E_f.")]
-
-
 def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
     """Each modulus with each knowledge of the nuisances."""
-    target, typical = f"{100 * settings.target:g} %", f"{settings.typical_mm:g} mm"
-    for (knowledge, stds), name in product(settings.knowledge.items(), _moduli(design)):
+    moduli = [name for name in design.names if name.startswith("E_f.")]
+    for (knowledge, stds), name in product(settings.knowledge.items(), moduli):
         noise = design.needed_noise(name, settings.target, stds)
         yield {
             "knowledge of the nuisances": knowledge,
@@ -234,32 +213,8 @@ def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
                 f"std at {mm:g} mm": finite(100 * design.std(name, mm, stds))
                 for mm in settings.noise_mm
             },
-            f"noise for {target}": finite(noise),
-            f"observations of {typical} for {target}": finite(
-                (settings.typical_mm / noise) ** 2 if noise else np.inf
-            ),
+            f"noise for {100 * settings.target:g} %": finite(noise),
         }
-
-
-def _pressures(settings: DesignsSettings, about: Row, design: Design) -> Iterator[Row]:
-    """How well the pressure must be known for each modulus, the rest as it is believed.
-
-    Nothing: need not be known; 0: not even if it is known exactly.
-    """
-    if "pressure_scale" in design.names:
-        half = settings.knowledge.get(settings.believed, {})
-        for name in _moduli(design):
-
-            def relative(std: float, name: str = name) -> float:
-                known = {**half, "pressure_scale": std}
-                return design.std(name, settings.typical_mm, known) / settings.target
-
-            yield {
-                "frames": about["frames"],
-                "errors": about["errors"],
-                "parameter": name,
-                "known to": finite(100 * needed(relative, KNOWN)),
-            }
 
 
 def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) -> Iterator[Row]:
@@ -393,7 +348,7 @@ def _compared(
         }
 
 
-# -- tables and figures ---------------------------------------------------------------------------
+# -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
     """For readers: a row for each observation, or for each design the median over patients."""
     rest = {name: results.table(name) for name in results.table_names if name}
@@ -438,80 +393,4 @@ def _medians(results: Results) -> DataFrame:
     return medians.rename(columns=lambda n: f"{n} closed")
 
 
-def figure(results: Results) -> Figure:
-    """Deviations as tables in colours, or what is left against the number of frames."""
-    patients = "left" in results.table().values
-    return _left_figure(results) if patients else _deviations_figure(results)
-
-
-SHADES = ("#0072B2", "#9ECAE1", "#F6E3C5", "#E8A87C")
-"""From within the target to far from it; blue is what all figures show as good."""
-
-MULTIPLES = (1.0, 2.0, 6.0)
-"""Of the target: where a deviation's colour changes."""
-
-
-def _deviations_figure(results: Results) -> Figure:
-    """A panel for each knowledge of the nuisances: what is seen against frames."""
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-
-    from mvest.reporting.figures import SMALL, panels, plain_number
-
-    worse, target = _worse(results), float(results.first.numbers["target_percent"] or 0.0)
-    norm = BoundaryNorm([0.0, *(m * target for m in MULTIPLES), np.inf], len(SHADES))
-    drawn, (grid,) = panels(1, len(worse.columns), 5.6, sharey=True)
-    for axes, knowledge in zip(grid, worse, strict=True):
-        shown = worse[knowledge].unstack()[worse.index.unique("frames")]
-        axes.imshow(shown, cmap=ListedColormap(SHADES), norm=norm, aspect="auto")
-        for (row, column), value in np.ndenumerate(shown.to_numpy()):
-            text = plain_number(value) if np.isfinite(value) else "∞"
-            colour = "white" if value <= target else "black"
-            axes.text(
-                column, row, text, ha="center", va="center", fontsize=SMALL - 1.5, color=colour
-            )
-        axes.set_title(textwrap.fill(str(knowledge), 13), fontsize=SMALL)
-        axes.set_xticks(
-            range(shown.shape[1]), [textwrap.fill(str(f), 22) for f in shown], rotation=90
-        )
-        axes.grid(visible=False)
-    grid[0].set_yticks(range(len(shown)), [", ".join(seen) for seen in shown.index])
-    return drawn
-
-
-def _left_figure(results: Results) -> Figure:
-    """A panel for each kind of error of the pressures and each geometry."""
-    from mvest.reporting.figures import SMALL, levels, panels
-
-    medians = _medians(results)
-    geometries = list(medians.index.unique("geometry"))
-    drawn, grid = panels(
-        len(geometries), len(KINDS), 2.5 * len(geometries), sharex=True, sharey=True
-    )
-    for (row, geometry), (column, kind) in product(enumerate(geometries), enumerate(KINDS)):
-        axes, own = grid[row, column], medians.loc[geometry, kind]
-        for (error, _), colour in zip(own.index, levels(len(own)), strict=True):
-            counts = range(1, own.shape[1] + 1)
-            axes.plot(
-                counts, own.loc[error].iloc[0], "o-", color=colour, ms=3, label=f"{error:g} mmHg"
-            )
-        axes.axhline(100 * HALF, color="0.5", lw=0.9, ls="--")
-        axes.set_ylim(0, None)
-        axes.set_title(f"{KINDS[kind]}, geometry {geometry}", fontsize=SMALL)
-    for axes in grid[-1]:
-        axes.set_xlabel("closed frames")
-    drawn.supylabel("left of the generic guess's error (%)", fontsize=SMALL)
-    grid[-1, -1].legend(fontsize=SMALL - 1.5, frameon=False, ncols=2)
-    return drawn
-
-
-STUDY = Study(
-    settings=Settings,
-    run=run,
-    summary=summary,
-    figure=figure,
-    captions={
-        "": "What is expected of designs, before any data are taken: the standard deviation [%] of "
-        "the worse modulus with each observation, dark where the target is met; or what closed "
-        "frames leave of the generic guess's error, dashed: half. Simulated."
-    },
-)
+STUDY = Study(settings=Settings, run=run, summary=summary)

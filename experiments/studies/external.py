@@ -1,4 +1,4 @@
-"""Any model behind the filters: a program asked through files, or a function in a file of Python.
+"""Any model behind the filters: a program called through files, or a Python function.
 
 It estimates its parameters from observed positions. Of several models each estimates from what the
 first ones predict for known parameters.
@@ -9,11 +9,11 @@ from __future__ import annotations
 import runpy
 import sys
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
 from experiments.common.building.filters import build_filter
 from experiments.common.places import CHECKOUT
@@ -32,6 +32,7 @@ from mvest.exchange.external.model import Differences, ProcessModel
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate
 from mvest.problem.record import EstimateRecord, record_of
+from mvest.quantities import Length, Processes, TimeLimit, Tolerance, Value, within
 from mvest.reporting.tables import Column, table
 from mvest.typing import FloatArray
 
@@ -67,11 +68,11 @@ class ModelSettings:
     environment: dict[str, str] = field(default_factory=dict)  # beside what this process has
     # Files and folders after whose change runs are done anew, beside those in the command.
     inputs: Annotated[tuple[str, ...], Reads(contents)] = ()
-    time_limit_s: Annotated[float, Field(ge=0.01, le=2_592_000)] = 600.0  # of one run
+    time_limit_s: TimeLimit = 600.0  # of one run
     differences: str = "central"  # or forward, or none: the program must give jacobian.csv
-    relative_step: Annotated[float, Field(ge=1e-15, le=1)] = 1e-3  # of a parameter
-    floor: Annotated[float, Field(ge=0, le=1e12)] = 0.0  # size of a parameter that may be zero
-    processes: Annotated[int, Field(ge=1, le=1024), NOT_HASHED] = 1  # runs at a time
+    relative_step: Tolerance = 1e-3  # of a parameter
+    floor: Annotated[float, within(0, 1e12, "", "in the units of any model")] = 0.0  # if it is zero
+    processes: Annotated[Processes, NOT_HASHED] = 1  # runs at a time
     reuse: bool = True  # finished runs serve again
 
 
@@ -83,9 +84,8 @@ class ExternalSettings(ModelSettings):
     observation: InputFile = None  # .csv x,y,z (mm), one row per observed point
     points: InputFile = None  # .csv x,y,z (mm), reference positions that programs are given
     units: tuple[str, ...] = ()  # of the parameters; empty: not stated
-    prior_std: tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...] = ()  # of the parameters
-    # SD of the error of each observed coordinate
-    noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
+    prior_std: tuple[Value, ...] = ()  # of the parameters
+    noise_mm: Length | None = None  # SD of the error of each observed coordinate
     models: dict[str, ModelSettings] = field(default_factory=dict)  # several, with their settings
     data: tuple[str, ...] = ()  # those of them that predict observations from truth.values
 
@@ -97,31 +97,8 @@ class Settings:
     external: ExternalSettings = field(default_factory=ExternalSettings)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Task:
-    """What every estimate of a run has in common.
-
-    Attributes
-    ----------
-    about : ExternalSettings
-    problem : Problem
-        With a model that predicts nothing.
-    truth : mapping
-        True values by parameter, as far as they are known.
-    variance : float
-        Of a coordinate, mm².
-    folder : Path
-    """
-
-    about: ExternalSettings
-    problem: Problem
-    truth: dict[str, float]
-    variance: float
-    folder: Path
-
-
-def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
-    """The task of a configuration.
+def problem_of(about: ExternalSettings, values: Values) -> Problem:
+    """What is estimated, with a model that predicts nothing.
 
     Raises
     ------
@@ -136,22 +113,23 @@ def task_of(about: ExternalSettings, values: Values, folder: Path) -> Task:
         raise ConfigurationError(
             f"external.units = {list(about.units)}, expected one for each of {', '.join(names)}"
         )
-    std, noise = np.array(about.prior_std, dtype=float), about.noise_mm
-    if std.shape != (len(names),) or not np.all(np.isfinite(std) & (std > 0)):
+    if len(about.prior_std) != len(names) or min(about.prior_std) <= 0:
         raise ConfigurationError(
             f"external.prior_std = {list(about.prior_std)}, expected one standard deviation > 0 "
             f"for each of {', '.join(names)}"
         )
-    if noise is None or not (np.isfinite(noise) and noise > 0):
-        raise ConfigurationError(f"external.noise_mm = {noise}, expected a number > 0 (mm)")
-    settings = {**values["filter"], "P0": (std**2).tolist()}
-    truth = dict(zip(names, map(float, values["truth"]["values"]), strict=False))
+    if not about.noise_mm:
+        raise ConfigurationError(
+            f"external.noise_mm = {about.noise_mm}, expected a number > 0 (mm)"
+        )
+    settings = {**values["filter"], "P0": [std**2 for std in about.prior_std]}
     filter_, transform, prior = build_filter(settings, names, positive=True)
-    problem = Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
-    return Task(about, problem, truth, float(noise) ** 2, folder)
+    return Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
 
 
-def model_of(task: Task, name: str, count: int) -> ObservationModel:
+def model_of(
+    about: ExternalSettings, parameters: tuple[str, ...], name: str, count: int, folder: Path
+) -> ObservationModel:
     """One of the configured models, of ``count`` observed points.
 
     Raises
@@ -159,7 +137,6 @@ def model_of(task: Task, name: str, count: int) -> ObservationModel:
     MvestError
         If the program, a file or a setting is inadmissible.
     """
-    about = task.about
     source = about.models.get(name, about)
     settings, command = {**about.settings, **source.settings}, source.command
     if source.python is not None:
@@ -184,8 +161,8 @@ def model_of(task: Task, name: str, count: int) -> ObservationModel:
     steps = source.relative_step, source.floor, source.processes
     return ProcessModel(
         Command(command, source.environment, source.time_limit_s),
-        task.folder / "runs" if about.folder is None else Path(about.folder),
-        task.problem.parameters,
+        folder / "runs" if about.folder is None else Path(about.folder),
+        parameters,
         count,
         units=about.units or None,
         points=None if about.points is None else _points(about.points, "points"),
@@ -219,38 +196,38 @@ def _points(file: str | None, what: str) -> FloatArray:
 def run(job: Job[Settings]) -> Result:
     """Estimate with each model from each observation."""
     about = job.settings.external
-    task = task_of(about, job.values, job.folder)
+    problem = problem_of(about, job.values)
+    names, noise_mm = problem.parameters, float(about.noise_mm or 0.0)
+    true = list(map(float, job.values["truth"]["values"]))
     (job.folder / FITTED).unlink(missing_ok=True)
     data = {} if about.data else {"observation": _points(about.observation, "observation")}
     for name in about.data:
-        exact = predict(model_of(task, name, 0), np.array([*task.truth.values()]))
+        exact = predict(model_of(about, names, name, 0, job.folder), np.array(true))
         if not exact.converged:
             return Result(status="failed", reason=f"{name}: {exact.reason}")
         # The same errors for all, so that estimates differ by the models alone.
         errors = np.random.default_rng(job.values["seed"]).standard_normal(exact.y.size)
-        data[name] = (exact.y + np.sqrt(task.variance) * errors).reshape(-1, 3)
-    records: dict[tuple[str, str], EstimateRecord] = {}
-    programs: dict[tuple[str, str], dict[str, Any]] = {}
-    for seen, y in data.items():
-        for name in about.models or ("model",):
-            model = model_of(task, name, len(y))
-            records[seen, name] = _estimate(f"{name}, from {seen}", model, y, task)
-            if isinstance(model, ProcessModel):
-                about_runs = {"runs": model.runs, "served again": model.reused}
-                programs[seen, name] = about_runs | {"own derivatives": model.own_jacobian}
-    rows = [
-        {"data": seen, "model": name}
-        | {key: row.get(key) for key in SHOWN}
-        | {"apart": _apart(row["estimate"], records.get((seen, seen)), k)}
-        | {"residual": record.innovation and record.innovation.residual_rms}
-        | programs.get((seen, name), {})
-        for (seen, name), record in records.items()
-        for k, row in enumerate(record.rows())
-    ]
-    estimates = tuple(records.values())
+        data[name] = (exact.y + noise_mm * errors).reshape(-1, 3)
+    estimates, rows = list[EstimateRecord](), list[dict[str, Any]]()
+    for (source, y), name in product(data.items(), about.models or ("model",)):
+        model, title = model_of(about, names, name, len(y), job.folder), f"{name}, from {source}"
+        seen = Observation(POINTS, y[None], np.array(noise_mm**2), predicted=POINTS)
+        with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
+            found = estimate(replace(problem, model=model), seen, on_iterate=bar.iterate)
+        if found.fitted is not None and not about.models:
+            write_points(job.folder / FITTED, found.fitted[-1])
+        record = record_of(found, case=title).with_truth(dict(zip(names, true, strict=False)))
+        units = zip(record.unknowns, about.units or [""] * len(names), strict=True)
+        unknowns = tuple(one.model_copy(update={"unit": unit}) for one, unit in units)
+        record = record.model_copy(update={"unknowns": unknowns})
+        whole: dict[str, Any] = {"data": source, "model": name}
+        if isinstance(model, ProcessModel):
+            whole |= {"runs": model.runs, "served again": model.reused}
+        rows += [{**whole, **{key: row.get(key) for key in COLUMNS}} for row in record.rows()]
+        estimates.append(record)
     return Result(
-        tables={"": table(rows, **(dict.fromkeys(rows[0], "") | COLUMNS))},
-        estimates=estimates,
+        tables={"": table(rows, data="", model="", **COLUMNS)},
+        estimates=tuple(estimates),
         status="converged" if any(one.converged for one in estimates) else "failed",
         reason=estimates[0].reason,
         detail=estimates[0].detail,
@@ -258,44 +235,18 @@ def run(job: Job[Settings]) -> Result:
     )
 
 
-SHOWN = (
-    *("parameter", "unit", "prior_mean", "prior_std", "estimate", "std", "truth", "relative_error"),
-    *("reason", "iterations", "forward_solves", "distance_mean", "distance_max", "nis"),
-)
-"""What the table takes of the rows of a record."""
-
 COLUMNS: dict[str, Column | str] = {
+    **dict.fromkeys(("parameter", "unit", "truth"), ""),
     "prior_mean": Column(std="prior_std", label="prior"),
+    "prior_std": "",
     "estimate": Column(digits=".3f", std="std"),
+    "std": "",
     "relative_error": Column(digits="+.2%", label="error"),
     "reason": Column(hidden=True),
     "forward_solves": Column(label="predictions"),
     "distance_mean": Column("mm"),
-    "distance_max": Column("mm"),
-    "apart": Column(digits="+.2%", label="apart from the data's own model"),
-    "residual": "mm",
 }
-"""The residual is the root mean square of a coordinate."""
-
-
-def _apart(value: float | None, own: EstimateRecord | None, k: int) -> float | None:
-    """By what share an estimate is off what the model that made the data finds."""
-    other = None if own is None else own.unknowns[k].estimate
-    return value / other - 1 if value is not None and other else None
-
-
-def _estimate(title: str, model: ObservationModel, y: FloatArray, task: Task) -> EstimateRecord:
-    """The record of one estimate from positions ``(n, 3)`` mm."""
-    names = task.problem.parameters
-    seen = Observation(POINTS, y[None], np.array(task.variance), predicted=POINTS)
-    with SolveBar(title, 0, TYPICAL_SOLVES, names) as bar:
-        found = estimate(replace(task.problem, model=model), seen, on_iterate=bar.iterate)
-    if found.fitted is not None and not task.about.models:
-        write_points(task.folder / FITTED, found.fitted[-1])
-    record = record_of(found, case=title).with_truth(task.truth)
-    units = zip(record.unknowns, task.about.units or [""] * len(names), strict=True)
-    unknowns = tuple(one.model_copy(update={"unit": unit}) for one, unit in units)
-    return record.model_copy(update={"unknowns": unknowns})
+"""What the table takes of the rows of a record."""
 
 
 def check_external(values: Values, folder: Path) -> str:
@@ -306,10 +257,10 @@ def check_external(values: Values, folder: Path) -> str:
     MvestError
         If a setting or a file is inadmissible, or the program gives no prediction.
     """
-    task = task_of(build(ExternalSettings, values["external"]), values, folder)
-    y, problem = _points(task.about.observation, "observation"), task.problem
-    m = problem.prior.mean
-    model = model_of(task, "model", len(y))
+    about = build(ExternalSettings, values["external"])
+    problem = problem_of(about, values)
+    y, m = _points(about.observation, "observation"), problem.prior.mean
+    model = model_of(about, problem.parameters, "model", len(y), folder)
     found = predict(model, m)
     if not found.converged:
         raise InputError(f"at the initial values: {found.reason}")

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import scipy
-from pydantic import Field
 
 from experiments.common.building.filters import filter_of
 from experiments.common.building.twin import build_twin
@@ -23,7 +21,7 @@ from mvest.estimation.prediction import ObservationModel, predict
 from mvest.estimation.run import Filter
 from mvest.estimation.transform import Log
 from mvest.observation.vertices import observed_frames
-from mvest.quantities import Length, Logarithm, PointsAlong, PointsAround, Value
+from mvest.quantities import AxisCount, Length, Logarithm, PointsAlong, PointsAround, Value
 from mvest.reporting.tables import Column, table
 
 if TYPE_CHECKING:
@@ -40,16 +38,14 @@ TARGET = 0.1
 class FilterProblem:
     """One problem on which filters are compared; unknowns are normal in their logarithms."""
 
-    title: str
     parameters: tuple[str, ...]
     truth: tuple[Value, ...]
     initial: tuple[Value, ...]  # prior median
-    # Prior standard deviation of the logarithms.
-    log_std: tuple[Logarithm, ...]
+    log_std: tuple[Logarithm, ...]  # prior standard deviation of the logarithms
     fixed: Annotated[dict[str, float], BY_PARAMETER] = field(default_factory=dict)  # known
     columns: PointsAround = 28
     rows: PointsAlong = 8
-    every: Annotated[int, Field(ge=1, le=100_000)] = 1  # of so many vertices one is seen
+    every: AxisCount = 1  # of so many vertices one is seen
     noise_mm: Length  # of each coordinate of the closed frame
 
 
@@ -82,10 +78,10 @@ def run(job: Job[Settings]) -> Result:
     settings, seed = job.settings.filters, job.values["seed"]
     rows: list[dict[str, Any]] = []
     references: list[dict[str, Any]] = []
-    meshes, solves = [], 0
+    mesh, solves = None, 0
     for name, about in settings.problems.items():
         problem = build_problem(job.values, name, about)
-        meshes.append(Mesh.of(problem.closure.mesh))
+        mesh = mesh or Mesh.of(problem.closure.mesh)
         # All are made before any is run: a wrong setting is refused at once.
         filters = {method: problem.filter(values) for method, values in settings.methods.items()}
         reference = problem.estimate(filter_of(settings.reference), seed)
@@ -103,7 +99,7 @@ def run(job: Job[Settings]) -> Result:
             say(f"{name}, {method}: {found.forward_solves} runs")
     return Result(
         tables={"": table(rows, **COLUMNS), "reference": table(references, **COLUMNS)},
-        mesh=meshes[0],
+        mesh=mesh,
         forward_solves=solves,
     )
 
@@ -115,33 +111,18 @@ COLUMNS: dict[str, Column | str] = {
     "width ratio": ":.2f",
     "lower end off": "%:+.0f",
     "upper end off": "%:+.0f",
-    **dict.fromkeys(("log mean", "log std", "shift"), Column(hidden=True)),
-    "skewness": ":.2f",
+    **dict.fromkeys(("log mean", "log std"), Column(hidden=True)),
     "runs": "",
     "check": ":.2g",
     "check limit": "",
     "ended": Column(hidden=True),
-    "detail": Column(hidden=True),
 }
-"""Widths and ends of 95 % intervals are of logarithms, relative to the width of the reference; the
-shift of the mean is relative to its standard deviation."""
+"""Widths and ends of 95 % intervals are of logarithms, relative to the width of the reference."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """What is estimated from what, for every filter.
-
-    Attributes
-    ----------
-    name : str
-    about : FilterProblem
-        Its truth is that of the one observation that every filter is given. No filter is.
-    closure : ClosureModel
-    model : ObservationModel
-        Predicts the observation ``y (n,)`` mm.
-    prior : Gaussian
-        Of the parameters; normal in their logarithms.
-    """
+    """What every filter estimates: the parameters of one observation of the closed frame."""
 
     name: str
     about: FilterProblem
@@ -182,38 +163,28 @@ class Problem:
 
     def rows(self, method: str, found: Estimate, reference: Estimate) -> list[dict[str, Any]]:
         """A row for each unknown, its interval relative to that of the reference."""
-        low, high = found.interval()
-        ends, own = (np.log(one.interval()) for one in (reference, found))
-        width = ends[1] - ends[0]
-        draws = reference.transformed_samples
-        assert draws is not None
-        check, by = found.check, reference.transformed
+        ends, own = np.log(reference.interval()), np.log(found.interval())
+        off, check = (own - ends) / (ends[1] - ends[0]), found.check
+        whole = {"problem": self.name, "filter": method, "runs": found.forward_solves}
+        whole |= {"check": check and check.value, "check limit": check and check.limit}
+        truths = zip(self.about.parameters, self.about.truth, strict=True)
         return [
             {
-                "problem": self.name,
-                "filter": method,
+                **whole,
                 "parameter": name,
                 "truth": truth,
                 "estimate": found.mean[k],
-                "low": low[k],
-                "high": high[k],
+                "low": np.exp(own[0, k]),
+                "high": np.exp(own[1, k]),
                 "error": 100 * (found.mean[k] / truth - 1),
-                "width ratio": (own[1, k] - own[0, k]) / width[k],
-                "lower end off": 100 * (own[0, k] - ends[0, k]) / width[k],
-                "upper end off": 100 * (own[1, k] - ends[1, k]) / width[k],
+                "width ratio": 1 + off[1, k] - off[0, k],
+                "lower end off": 100 * off[0, k],
+                "upper end off": 100 * off[1, k],
                 "log mean": found.transformed.mean[k],
                 "log std": found.transformed.std[k],
-                "shift": (found.transformed.mean[k] - by.mean[k]) / by.std[k],
-                "skewness": scipy.stats.skew(draws[:, k]),
-                "runs": found.forward_solves,
-                "check": check and check.value,
-                "check limit": check and check.limit,
                 "ended": found.why,
-                "detail": found.detail,
             }
-            for k, (name, truth) in enumerate(
-                zip(self.about.parameters, self.about.truth, strict=True)
-            )
+            for k, (name, truth) in enumerate(truths)
         ]
 
 
@@ -269,17 +240,16 @@ def figure(results: Results) -> Figure:
         axes.axvspan(*in_std(by, "low", "high"), color="0.88")
         (truth,) = in_std(by, "truth")
         axes.axvline(truth, color="black", linewidth=1.0)
-        mine = (r for r in rows if all(r[k] == by[k] for k in ("problem", "parameter")))
-        for row in mine:
-            ends, off, at = in_std(row, "low", "high"), row["width ratio"] - 1, row["filter"]
-            colour = GOOD if abs(off) <= TARGET else BAD
-            middle = sum(ends) / 2, methods.index(at)
-            axes.plot(ends, [middle[1]] * 2, color=colour, linewidth=2.2)
-            axes.plot(*middle, marker="o", markersize=4, color=colour)
-            if colour == BAD:
+        for row in (r for r in rows if all(r[k] == by[k] for k in ("problem", "parameter"))):
+            ends, off = in_std(row, "low", "high"), row["width ratio"] - 1
+            good, at = abs(off) <= TARGET, methods.index(row["filter"])
+            colour = GOOD if good else BAD
+            axes.plot(ends, [at, at], color=colour, linewidth=2.2)
+            axes.plot(sum(ends) / 2, at, marker="o", markersize=4, color=colour)
+            if not good:
                 axes.annotate(
-                    f"{100 * off:+.0f} %", middle, (0, 4), ha="center", color=colour,
-                    textcoords="offset points", fontsize=SMALL - 1.5,
+                    f"{100 * off:+.0f} %", (sum(ends) / 2, at), (0, 4), ha="center",
+                    color=colour, textcoords="offset points", fontsize=SMALL - 1.5,
                 )  # fmt: skip
         axes.set_xlim(min(-4.2, truth - 0.5), max(4.2, truth + 0.5))
         axes.set_xticks([-2, 0, 2])

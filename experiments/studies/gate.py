@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,14 +21,10 @@ from experiments.common.building.gate import (
     gate_of,
     gate_rows,
 )
-from experiments.common.records.record import Mesh, Record
+from experiments.common.records.record import Mesh
 from experiments.common.study import Job, Result, Results, Study
-from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GateReport
 from mvest.reporting.tables import Column, Table, joined, table
-from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
-from mvest.valve.measure.coaptation import find_gap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +34,7 @@ if TYPE_CHECKING:
 class GateSettings:
     """What is done with the valve."""
 
-    every_step: bool = False  # measure one closure step by step, and ask no gate
+    every_step: bool = False  # measure one closure step by step, without the gate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +45,7 @@ class Settings:
 
 
 def run(job: Job[Settings]) -> Result:
-    """Measure one closure, or ask the gate."""
+    """Measure one closure, or run the gate."""
     return _closing(job) if job.settings.gate.every_step else _gate(job)
 
 
@@ -58,16 +53,10 @@ def _gate(job: Job[Settings]) -> Result:
     values = job.values
     report = ask_gate(values)
     model = closure_model(values)
-    closures = closures_of(report)
-    verdict = {
-        "passed": report.passed,
-        "gap": None if report.closed is None else _gap(model, report.closed),
-        "closures": closures,
-        "fails by": "; ".join(_failures(report)),
-    }
-    reference = report.rows[0]
+    reference, closures = report.rows[0], closures_of(report)
+    verdict = {"passed": report.passed, "closures": closures}
     return Result(
-        tables={"": _verdicts([verdict]), "variations": gate_rows(report)},
+        tables={"": table([verdict], passed=""), "variations": gate_rows(report)},
         # By these others look the verdict up.
         numbers={"anatomy": anatomy_digest(values), "passed": report.passed},
         status="converged" if reference.passed else "failed",
@@ -75,26 +64,6 @@ def _gate(job: Job[Settings]) -> Result:
         mesh=Mesh.of(model.mesh),
         forward_solves=closures,
     )
-
-
-def _verdicts(rows: list[dict[str, Any]]) -> Table:
-    return table(rows, passed="", gap="mm²:.2g")
-
-
-def _failures(report: GateReport) -> list[str]:
-    rows = [
-        f"{row.case}: " + (f"{row.max_mm:.2g} mm off" if row.max_mm > 0 else row.reason)
-        for row in report.rows
-        if not row.passed
-    ]
-    return [*rows, *(f"{p.name}: {p.reason}" for p in report.paths if not p.passed)]
-
-
-def _gap(model: ClosureModel, vertices: FloatArray) -> float:
-    """Gap (mm²) of a closed valve."""
-    valve, annulus = model.valve, vertices[model.valve.annulus]
-    seen = vertices, valve.surface.triangles, annulus, plane_of(valve, annulus)
-    return find_gap(*seen, model.contact_reach_mm).area
 
 
 def _closing(job: Job[Settings]) -> Result:
@@ -141,19 +110,16 @@ CURVES = {
 
 
 def figure(results: Results) -> Figure | None:
-    """Four moments of a closing valve from the atrium and from the side, above four curves."""
-    name, record = next(iter(results.records.items()))
-    return draw_steps(record, results.arrays[name]) if name in results.arrays else None
-
-
-def draw_steps(record: Record, arrays: Path) -> Figure:
-    """A closing valve from its record and its arrays (`Closing.arrays`).
+    """Four moments of a closing valve from the atrium and from the side, above four curves.
 
     Raises
     ------
     InputError
-        If the arrays cannot be read.
+        If the arrays (`Closing.arrays`) cannot be read.
     """
+    name, record = next(iter(results.records.items()))
+    if name not in results.arrays:
+        return None
     from matplotlib.figure import Figure
 
     values = record.table_of().values
@@ -166,7 +132,7 @@ def draw_steps(record: Record, arrays: Path) -> Figure:
     }
     drawn = Figure(figsize=(11, 8.4), layout="constrained")
     parts: Any = drawn.subfigures(2, 1, height_ratios=[2.2, 1.0])
-    draw_closing(parts[0], arrays, titles, ("anterior", "posterior"))
+    draw_closing(parts[0], results.arrays[name], titles, ("anterior", "posterior"))
     _draw_curves(parts[1], values, moments, at_rest)
     drawn.suptitle(
         "A simulated valve closing, from the atrium and from the posterior side"

@@ -7,26 +7,34 @@ geometries: from where the valve truly was (known geometry), and from that with 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
-from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.own_case import case_words, write_report
+from experiments.common.cases.revealed import (
+    MODULUS_COLUMNS,
+    Groups,
+    estimate_hidden,
+    grouped,
+    groups_figure,
+    modulus_row,
+    revealed,
+    short,
+    unknowns_of,
+)
 from experiments.common.cases.settings import ImagedInput, PersonalSettings
-from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.cases.from_images.build import CaseFrames, case_of_sequence
 from mvest.cases.tissue import SEEN_CLOSURE
-from mvest.errors import InputError
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.imaging.simulator.acquisition import Probe, draw_acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
@@ -37,17 +45,7 @@ from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.stored import Store
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
-from mvest.reporting.skill import (
-    GENERIC,
-    generic_guess,
-    interval,
-    interval_columns,
-    moduli_figure,
-    skill_table,
-    stated,
-    trust_of,
-    verdict_table,
-)
+from mvest.reporting.skill import skill_table, verdict_table
 from mvest.reporting.tables import Column, Table, joined, table
 from mvest.simulation.imaged_patient import (
     IMAGED,
@@ -112,61 +110,37 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_imaged_patient(job: Job[Settings]) -> Result:
-    """Simulate, estimate from the volume and from better geometries, reveal.
-
-    Raises
-    ------
-    InputError
-        If neither the volume nor the known geometry left an estimation.
-    """
-    values, folder = job.values, job.folder
+    """Simulate, estimate from the volume and from better geometries, reveal."""
+    values, folder, personal = job.values, job.folder, job.settings.personal
     place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
     hidden = read_mapping(place / TRUTH / REVEALED)
     given = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
-    found = {"": estimated_or_reason(given, folder, place / VOLUME, place / HIDDEN)}
+    found = estimate_hidden(given, folder, place / VOLUME, place / HIDDEN, personal)
+    better = {}
     for name in (KNOWN, SEGMENTED):
         (folder / name).mkdir(exist_ok=True)
-        found[name] = estimated_or_reason(
-            values, folder / name, place / HIDDEN / name, place / TRUTH
-        )
-    main = found[""]
-    run = found[KNOWN] if isinstance(main, str) else main
-    if isinstance(run, str):
-        raise InputError(run)
-    estimates = {name: _estimate(each, run.estimates[0]) for name, each in found.items()}
-    better = {name: estimates[name] for name in (KNOWN, SEGMENTED)}
-    estimate = estimates[""].model_copy(
-        update={
-            "case": job.settings.patient.name,
-            "seed": values["seed"],
-            "alternatives": {**estimates[""].alternatives, **better},
-        }
-    )
+        case = place / HIDDEN / name
+        result = estimate_hidden(values, folder / name, case, place / TRUTH, personal)
+        better[name] = _numbers_if_converged(result.estimates[0])
+    estimate = _numbers_if_converged(found.estimates[0])
+    about = {"case": job.settings.patient.name, "seed": values["seed"]}
+    others = {"alternatives": {**estimate.alternatives, **better}}
     ratios = [
         {"family": name, "ratio": one}
         for name, each in hidden["chord_ratios"].items()
         for one in each
     ]
-    lost = main if isinstance(main, str) else ""
-    return run.changed(
+    return found.changed(
         tables={"chordae": table(ratios)} if ratios else {},
         numbers={"anatomies_drawn": hidden["anatomies_drawn"]},
-        arrays={} if lost else run.arrays,
-        estimates=(estimate.with_truth(hidden["values"]),),
-        status="failed" if lost else run.status,
-        reason=lost or run.reason,
-        detail="" if lost else run.detail,
+        estimates=(estimate.model_copy(update=about | others).with_truth(hidden["values"]),),
         row="",
         gate=None,
     )
 
 
-def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
-    """What an estimation left; unknowns have no numbers where it did not converge."""
-    if isinstance(found, str):
-        record = EstimateRecord(status="failed", reason=found, unknowns=other.parameters)
-    else:
-        record = found.estimates[0]
+def _numbers_if_converged(record: EstimateRecord) -> EstimateRecord:
+    """An estimate; its unknowns have no numbers where it did not converge."""
     if record.converged:
         return record
     nothing = dict.fromkeys(("estimate", "std", "low", "high", "bound"))
@@ -288,107 +262,58 @@ def _segmented(
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
     """Moduli beside the truth, what they are worth, and what costs them how much."""
-    estimates = _estimates(results)
-    shares = _shares(estimates)
+    groups = _by_source(results)
+    skill = unknowns_of(groups) | unknowns_of(groups, by_name=True)
+    estimates = [estimate for _, estimate in revealed(results)]
     tables = {
         "": _moduli_table(estimates),
-        "skill": _skill(estimates),
-        "bias": _bias(estimates),
+        "skill": skill_table("estimated from", skill),
+        "bias": _bias(unknowns_of(groups, by_name=True, stated=False)),
         "verdicts": verdict_table(estimates),
         "chordae": _chordae(results),
-        "shares": _medians(shares),
-        "shares_of_patients": table(shares),
     }
     return {name: one for name, one in tables.items() if len(one)}
 
 
-def _estimates(results: Results) -> list[EstimateRecord]:
-    return [one.estimates[0] for one in results.records.values() if one.estimates]
+def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
+    """Estimates by what they are from; each has its own verdict, or that on the volume's."""
+    return grouped(
+        (source, estimate, own if verdict_of_volume else estimate)
+        for _, own in revealed(results)
+        for name, source in SOURCES.items()
+        for estimate in (own.alternatives[name] if name else own,)
+    )
 
 
-def _by_source(
-    estimates: Sequence[EstimateRecord],
-) -> Iterator[tuple[str, EstimateRecord, EstimateRecord]]:
-    """What was estimated from, the estimate from that, and the patient's own."""
-    for estimate in estimates:
-        for name, source in SOURCES.items():
-            yield source, estimate.alternatives[name] if name else estimate, estimate
+def _figure(results: Results) -> dict[str, Figure]:
+    return {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))}
 
 
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each patient and modulus.
-
-    Errors have a sign: that from the known geometry and the part from the images add up to the
-    whole.
-    """
+    """A row for each patient and modulus; errors have a sign."""
     rows = []
     for estimate in estimates:
         for own in estimate.moduli:
-            better = {
-                name: estimate.alternatives[name].unknown(own.name) for name in (SEGMENTED, KNOWN)
-            }
-            error, of_known = _percent(own), _percent(better[KNOWN])
-            rows.append(
-                {
-                    "patient": estimate.case,
-                    "modulus": own.name,
-                    "truth": own.truth,
-                    "stated": own.estimate if estimate.is_stated else None,
-                    **interval("estimate", own),
-                    "verdict": trust_of(estimate),
-                    "error": error,
-                    **{f"error, {name}": _percent(one) for name, one in better.items()},
-                    "part from images": None
-                    if error is None or of_known is None
-                    else error - of_known,
-                    f"error, {GENERIC}": _percent(generic_guess(own)),
-                }
-            )
-    about = {"patient": Column(label="patient (simulated)"), "modulus": Column()}
-    about |= {"truth": Column("MPa")} | interval_columns("estimate", hidden=True)
-    about["stated"] = replace(about["estimate"], label="estimate", hidden=False)
-    percent = Column("%", "+.1f")
-    about |= {"verdict": Column(), "error": percent}
+            row = {"patient": estimate.case, **modulus_row(estimate, own)}
+            for name in (SEGMENTED, KNOWN):
+                better = estimate.alternatives[name]
+                error = modulus_row(better, better.unknown(own.name))["error"]
+                row[f"error, {name}"] = error
+            rows.append(row)
+    percent = MODULUS_COLUMNS["error"]
+    about = {"patient": Column(label="patient (simulated)"), **MODULUS_COLUMNS}
     about[f"error, {SEGMENTED}"] = replace(percent, label="error from a perfect segmentation")
     about[f"error, {KNOWN}"] = replace(percent, label="error from the known geometry")
-    about["part from images"] = percent
-    about[f"error, {GENERIC}"] = replace(percent, hidden=True)
     return table(rows, **about)
 
 
-def _percent(unknown: Unknown) -> float | None:
-    error = unknown.relative_error
-    return None if error is None else 100.0 * error
-
-
-def _moduli_by_source(estimates: Sequence[EstimateRecord]) -> dict[str, list[Unknown]]:
-    """What a modulus was estimated from, and which -> those of all patients."""
-    groups: dict[str, list[Unknown]] = {}
-    for source, one, _ in _by_source(estimates):
-        for own in one.moduli:
-            groups.setdefault(f"{source}, {own.name}", []).append(own)
-    return groups
-
-
-def _skill(estimates: Sequence[EstimateRecord]) -> Table:
-    """What moduli are worth, together and each; those from volumes as far as they are stated."""
-    each = _moduli_by_source(
-        [one.model_copy(update={"unknowns": tuple(stated(one))}) for one in estimates]
-    )
-    both = {
-        source: [own for name, moduli in each.items() if name.startswith(source) for own in moduli]
-        for source in SOURCES.values()
-    }
-    return skill_table("estimated from", both | each)
-
-
-def _bias(estimates: Sequence[EstimateRecord]) -> Table:
+def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
     """Mean error of each modulus' logarithm, and how far estimates follow the truth.
 
     Of all that converged, also of those that the verdict denies: it does not see the truth.
     """
     rows = []
-    for source, moduli in _moduli_by_source(estimates).items():
+    for source, moduli in groups.items():
         known = [(own.truth, own.estimate) for own in moduli if own.estimate is not None]
         truth, found = np.log(np.array(known, dtype=np.float64).reshape(-1, 2).T)
         row = {"estimated from": source, "n": len(known)}
@@ -411,77 +336,28 @@ def _chordae(results: Results) -> Table:
     Beside it the ratio by which estimators lay chordae out.
     """
     laid_out = {"marginal": SEEN_CLOSURE.marginal_slack, "basal": SEEN_CLOSURE.basal_slack}
-    having = {k: one for k, one in results.records.items() if "chordae" in one.tables}
-    if not having:
+    records = results.records
+    chordae = {k: one.table_of("chordae") for k, one in records.items() if "chordae" in one.tables}
+    if not chordae:
         return table([])
-    chordae = joined({name: one.table_of("chordae") for name, one in having.items()}).frame
-    by_family, by_patient = (
-        chordae.groupby(keys, sort=False)["ratio"] for keys in ("family", ["family", "run"])
-    )
-    rows = by_family.agg(ratio="mean", SD="std")
-    means = by_patient.mean().groupby("family", sort=False)
-    rows.insert(0, "patients", means.size())
-    rows["SD of patients"] = means.std().fillna(0.0)
-    rows["laid out"] = rows.index.map(laid_out)
-    about = {"family": Column(), "patients": Column(), "ratio": Column(digits=".3f", std="SD")}
-    about |= dict.fromkeys(("SD of patients", "laid out"), Column(digits=".3f"))
-    return table(rows.reset_index(), **about)
-
-
-def _shares(estimates: Sequence[EstimateRecord]) -> list[dict[str, Any]]:
-    """Where the variance of each modulus' logarithm comes from in each patient, to first order."""
-    return [
-        {"patient": estimate.case, **row}
-        for estimate in estimates
-        for row in estimate.detail_rows("shares")
-    ]
-
-
-def _medians(shares: Sequence[Mapping[str, Any]]) -> Table:
-    """Medians over patients."""
-    import pandas as pd
-
-    if not shares:
-        return table([])
-    sources = pd.DataFrame(shares).groupby(["source", "parameter"], sort=False)
-    medians = sources[["share"]].median().reset_index()
-    return table(medians, source="", parameter="::modulus", share=":.3f")
-
-
-# -- figure ---------------------------------------------------------------------------------------
-def figure(results: Results) -> dict[str, Figure]:
-    """Estimates from all sources over their truths."""
-    groups: dict[str, list[tuple[Unknown, str]]] = {source: [] for source in SOURCES.values()}
-    for source, one, own in _by_source(_estimates(results)):
-        groups[source] += [(modulus, trust_of(own)) for modulus in one.moduli]
-    return {"moduli": moduli_figure(groups)}
-
-
-def keep(record: Record) -> Record:
-    """What tables and figures need of a record."""
-    kept = []
-    for estimate in record.estimates:
-        short = estimate.without_details("shares")
-        better = {
-            name: other.model_copy(update={"unknowns": other.moduli})
-            for name, other in short.alternatives.items()
-        }
-        update = {"unknowns": short.moduli, "alternatives": better}
-        kept.append(short.model_copy(update=update))
-    return record.model_copy(update={"estimates": tuple(kept)})
+    families = joined(chordae).frame.groupby("family", sort=False)["ratio"]
+    rows = families.agg(ratio="mean", SD="std").reset_index()
+    rows["laid out"] = rows["family"].map(laid_out)
+    three = Column(digits=".3f")
+    return table(rows, family="", ratio=replace(three, std="SD"), **{"laid out": three})
 
 
 STUDY = Study(
     settings=Settings,
     run=run_imaged_patient,
     summary=summary,
-    figure=figure,
+    figure=_figure,
     captions={
         "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
         "verdict on the one from the volume. Simulated.",
     },
     words=case_words,
     files=write_report,
-    keep=keep,
+    keep=short,
     keeps_failures=True,
 )

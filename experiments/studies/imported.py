@@ -1,8 +1,8 @@
 """Valves from outside: imported, closed, gated and estimated from.
 
 A recorded closure (``donor``) is fitted from its closed frame, from several starts. The shape of a
-reference heart (``heart``) is measured, meshed and closed, and moduli that were put in are
-estimated on it. Neither is part of this project; ``conf/experiment`` says where they are from.
+reference heart (``heart``) is meshed and closed, and moduli that were put in are estimated on it.
+Neither is part of this project; ``conf/experiment`` says where they are from.
 """
 
 from __future__ import annotations
@@ -16,21 +16,14 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
-from experiments.common.building.closing import Closing, close_valve, draw_closing
-from experiments.common.building.closure import (
-    anatomy_of,
-    build_mesh,
-    folder_hash,
-    mechanics_of,
-)
+from experiments.common.building.closing import close_valve, draw_closing
+from experiments.common.building.closure import folder_hash, mechanics_of
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import (
     anatomy_digest,
     ask_gate,
     closures_of,
-    gate_cases,
     gate_rows,
 )
 from experiments.common.building.twin import build_twin, estimate_twin
@@ -38,10 +31,8 @@ from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Mesh
 from experiments.common.schema import InputFile, Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
-from mvest.cases.case import Role, ValveCase
+from mvest.cases.case import ValveCase
 from mvest.cases.folder import write_case
-from mvest.cases.frames import MM_PER
-from mvest.cases.plausibility import free_orifice
 from mvest.cases.tissue import (
     CLOSED_DEPTH,
     LeafletBand,
@@ -49,32 +40,25 @@ from mvest.cases.tissue import (
     lay_out_chordae,
 )
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GATE_CASES
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import Prediction, Remembered
 from mvest.exchange.abaqus.recording import Recording, read_recording, recording_files
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
-from mvest.exchange.surfaces import part_of, read_surface
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem, estimate
 from mvest.problem.fields import valve_fields
 from mvest.problem.record import EstimateRecord, record_of
-from mvest.quantities import Length, Share, Thickness
+from mvest.quantities import Count, Length, Share, Thickness
 from mvest.reporting.skill import estimates_table
 from mvest.reporting.tables import Column, table
-from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.geometry.surface_checks import enclosed_volume
-from mvest.valve.geometry.triangles import areas
-from mvest.valve.measure.annulus import measure_annulus
-from mvest.valve.measure.clinical import leaflet_length
-from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
+from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import layered_wedges
 
 if TYPE_CHECKING:
@@ -105,6 +89,9 @@ def _recording(value: str | None, beside: Values) -> Any:
         return value
 
 
+LARGEST_CHANGE = 0.15
+"""Of a modulus' logarithm from one closed state to the next."""
+
 WHERE_FROM = "the data are not part of this package, for where to get them see conf/experiment"
 
 
@@ -120,11 +107,9 @@ class DonorSettings:
     annulus: str = ""  # node set
     free_edge: str = ""  # node set
     # Of the midsurface that is meshed and observed, and of that on which contact is sampled.
-    vertices: Annotated[int, Field(ge=0, le=100_000)] = 430
-    contact_vertices: Annotated[int, Field(ge=0, le=100_000)] = 3000
+    vertices: Count = 430
+    contact_vertices: Count = 3000
     starts: tuple[Any, ...] = ()  # MPa, moduli from which each fit starts
-    # Of a modulus' logarithm from one closed state to the next.
-    largest_change: Annotated[float, Field(ge=0, le=10)] = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,18 +125,13 @@ class HeartSettings:
     muscles: Annotated[tuple[str, ...], Reads(contents)] = ()
     units: str = "mm"
     name: str = "imported valve"
-    description: str = ""
     citation: str = ""
-    licence: str = ""
     smoothing_mm: Length = 4.0  # round the valve: a spike is sharper than leaflets are thick
     # Thickness is kept within bounds, as parts are no leaflet.
     min_thickness_mm: Thickness = 0.3
     max_thickness_mm: Thickness = 3.0
     # Of the free edges below the annulus, closed over open, for which chordae are long enough.
     closed_depth: Share = 0.5
-    # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).
-    closures: dict[str, dict[str, Share]] = field(default_factory=dict)
-    gate: tuple[str, ...] = ()  # variations of the gate
     # Of each twin, what its truth has otherwise than the estimator's model (settings of truth).
     twins: dict[str, Any] = field(default_factory=dict)
 
@@ -191,23 +171,20 @@ class Recorded:
         valves = self.coarse, self.contact
         return ClosureModel(*valves, self.mesh, self.settings, parameters, **settings)
 
-    def distances(self, closed: FloatArray) -> dict[str, float]:
+    def distances(self, closed: FloatArray | None) -> dict[str, float | None]:
         """Distances (mm) of closed positions ``(n, 3)`` from where they were recorded.
 
         The surface's is the mean of the whole surface from the recorded one, both ways.
         """
-        d, surface = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface
+        if closed is None:
+            return dict.fromkeys(DISTANCES)
+        d, triangles = np.linalg.norm(closed - self.seen, axis=1), self.coarse.surface.triangles
         recorded = self.recording.frames[-1], self.recording.valve.surface.triangles
-        return {
-            "mean": float(d.mean()),
-            "median": float(np.median(d)),
-            "rms": float(np.sqrt(np.mean(d**2))),
-            "max": float(d.max()),
-            "surface": mean_surface_distance(closed, surface.triangles, *recorded),
-        } | {
-            name: float(d[np.unique(surface.triangles[surface.region == k])].mean())
-            for k, name in enumerate(surface.region_names)
-        }
+        surface = mean_surface_distance(closed, triangles, *recorded)
+        return dict(zip(DISTANCES, (float(d.mean()), float(d.max()), surface), strict=True))
+
+
+DISTANCES = ("mean", "max", "surface")
 
 
 def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
@@ -261,7 +238,7 @@ def _donor(job: Job[Settings]) -> Result:
         )
     valve = recorded_valve(values, donor)
     seen = Observation(("closed",), valve.seen[None], np.asarray(values["filter"]["R"]))
-    how = {"continuation": values["continuation"], "largest_change": donor.largest_change}
+    how = {"continuation": values["continuation"], "largest_change": LARGEST_CHANGE}
     steps, records, rows, shapes = len(valve.settings.protocol.steps()), [], [], {}
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(starts), parameters) as bar:
         first = valve.model(parameters, repeat=False, **how)
@@ -269,57 +246,62 @@ def _donor(job: Job[Settings]) -> Result:
         # A start is met again by rounding of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)
+<<<<<<< HEAD
         row = {"closure": "generic", "ended": generic.reason, "predictions": 1}
+=======
+>>>>>>> w-studies
         if generic.converged:
             shapes["generic"] = generic.y.reshape(2, -1, 3)[1]
-            row |= valve.distances(shapes["generic"])
-        rows.append(row)
+        row = {"closure": "generic", "ended": generic.reason}
+        rows.append(row | valve.distances(shapes.get("generic")))
         for k, start in enumerate(starts):
             # Each goes on from the generic closed valve.
+<<<<<<< HEAD
             model = copy(first)
             model_ = Remembered(model, known.runs, known.rtol)
+=======
+            model = Remembered(copy(first), known.runs, known.rtol)
+>>>>>>> w-studies
             own = replace(filter_, start=tuple(map(float, start)))
             tissue = valve.settings.tissue
-            problem = Problem(parameters, model_, prior, own, transform, tissue)
+            problem = Problem(parameters, model, prior, own, transform, tissue)
             found = estimate(problem, seen, on_iterate=bar.iterate)
             record = record_of(found, case=f"fitted, start {k + 1}", simulated=True)
+<<<<<<< HEAD
             row = {"closure": record.case, "ended": record.reason}
             row |= {"iterations": record.iterations, "predictions": record.forward_solves}
             if found.fitted is not None:
                 shapes.setdefault("fitted", found.fitted[-1])
                 row |= valve.distances(found.fitted[-1])
             rows.append(row)
+=======
+            closed = None if found.fitted is None else found.fitted[-1]
+            if closed is not None:
+                shapes.setdefault("fitted", closed)
+            row = {"closure": record.case, "ended": record.reason}
+            rows.append(row | valve.distances(closed))
+>>>>>>> w-studies
             records.append(record)
-    rest = valve.coarse.surface.vertices
-    tips = valve.recording.valve.motion.papillary_tips
-    failed = [one for one in records if not one.converged]
-    ended = f"generic: {generic.reason}" if not generic.converged else records[0].reason
+    failed = [] if generic.converged else [f"generic: {generic.reason}"]
+    failed += [one.reason for one in records if not one.converged]
+    about = {"closure": Column(), "ended": Column(hidden=True)}
     return Result(
         tables={
-            "": table(rows, **DISTANCES),
+            "": table(rows, **about, **dict.fromkeys(DISTANCES, Column("mm", ".2f"))),
             "moduli": estimates_table("estimation", records),
         },
         estimates=tuple(records),
         numbers={
             "data": donor.citation,
             "pressure_mmHg": valve.settings.protocol.pressure_mmHg,
-            "recorded_motion_mm": float(np.linalg.norm(valve.seen - rest, axis=1).mean()),
-            "tip_motion_mm": float(np.linalg.norm(tips[-1] - tips[0], axis=1).max()),
         },
         arrays=_arrays(valve, shapes) if len(shapes) == 2 else {},
-        status="failed" if failed or not generic.converged else "converged",
-        reason=ended if not failed or not generic.converged else failed[0].reason,
+        status="failed" if failed else "converged",
+        reason=failed[0] if failed else records[0].reason,
         detail=records[0].detail,
         mesh=Mesh.of(valve.mesh),
         forward_solves=1 + sum(one.forward_solves or 0 for one in records),
     )
-
-
-DISTANCES: dict[str, Column | str] = {
-    "closure": "",
-    "ended": Column(hidden=True),
-    **dict.fromkeys(("mean", "median", "rms", "max", "surface"), "mm:.2f"),
-}
 
 
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
@@ -335,8 +317,8 @@ def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]
     }
 
 
-def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, float]:
-    """The valve as a case of its open frame, and the volume (mm³) of its tissue.
+def import_heart(heart: HeartSettings) -> ValveCase:
+    """The valve as a case of its open frame.
 
     Raises
     ------
@@ -346,9 +328,6 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():
             raise InputError(f"heart: no file {file}; {WHERE_FROM}/reference_heart.yaml")
-    source = Path(str(heart.source))
-    whole = read_surface(source)
-    whole = whole if heart.leaflets is None else part_of(whole, heart.leaflets)
     known = LeafletsOptions(
         leaflets=heart.leaflets,
         units=heart.units,
@@ -356,53 +335,35 @@ def import_heart(heart: HeartSettings, closed_depth: float) -> tuple[ValveCase, 
         smoothing_mm=heart.smoothing_mm,
         thickness_range_mm=(heart.min_thickness_mm, heart.max_thickness_mm),
     )
-    case = import_leaflets(source, known)
+    case = import_leaflets(Path(str(heart.source)), known)
     surface, tips = case.surface, case.frames[0].papillary_tips
     loops = case.annulus, case.free_edge
     band = LeafletBand.of(surface.vertices, surface.triangles, surface.region, *loops, anterior=0)
-    closed = assumed_closure(band, surface.vertices[loops[0]], tips, closed_depth)
-    said = f"at {CLOSED_DEPTH:g} of their depth", f"at {closed_depth:g} of their depth"
-    case = replace(
+    closed = assumed_closure(band, surface.vertices[loops[0]], tips, heart.closed_depth)
+    stated = f"at {CLOSED_DEPTH:g} of their depth", f"at {heart.closed_depth:g} of their depth"
+    return replace(
         case,
         name=heart.name,
-        description=heart.description,
         source=heart.citation,
-        licence=heart.licence,
         chordae=lay_out_chordae(band, tips, closed, tips, ChordLayout()),
-        derived=tuple(line.replace(*said) for line in case.derived),
+        derived=tuple(line.replace(*stated) for line in case.derived),
     )
-    return case, MM_PER[heart.units] ** 3 * abs(enclosed_volume(whole.vertices, whole.triangles))
 
 
 def _heart(job: Job[Settings]) -> Result:
     heart, values = job.settings.heart, job.values
-    asked = gate_cases(heart.gate)
-    contraction = values["valve"]["annulus_contraction"]
-    usual = {"annulus_contraction": contraction, "closed_depth": heart.closed_depth}
-    closures: dict[str, Any] = {"as in gate and twins": {}, **heart.closures}
-    rows, made = list[dict[str, Any]](), list[tuple[ValveCase, float, dict[str, Any], Closing]]()
-    for name, changes in closures.items():
-        assumed = usual | changes
-        case, volume = import_heart(heart, assumed["closed_depth"])
-        there = _on_case(values, case, job.folder / f"case_{len(made)}")
-        there["valve"]["annulus_contraction"] = assumed["annulus_contraction"]
-        closing = close_valve(there, name)
-        states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
-        rows += [{"closure": name, **assumed, "state": state, **row} for state, row in states]
-        made.append((case, volume, there, closing))
-    case, volume, own, closing = made[0]
-    gate = ask_gate(own, asked)
+    case = import_heart(heart)
+    own = _on_case(values, case, job.folder / "case")
+    closing = close_valve(own)
+    gate = ask_gate(own)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
-    shape = [*_sizes(case), ("tissue enclosed by the surface of the source", volume, "mm³")]
+    states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
     failed = [one.reason for one in records if not one.converged]
     steps = closing.result.simulation
     failed += [] if steps.converged else [steps.reason.value]
-    left = len(GATE_CASES) - len(asked)
     return Result(
         tables={
-            "": table(rows, closure=""),
-            "shape": table([dict(zip(("name", "value", "unit"), r, strict=True)) for r in shape]),
-            "meshes": table(_meshes(own), volume="mm³:.0f"),
+            "": table({"state": state, **row} for state, row in states),
             "gate": gate_rows(gate),
             "moduli": estimates_table("estimation", records),
             "derived": table([{"what follows from the source": text} for text in case.derived]),
@@ -413,9 +374,9 @@ def _heart(job: Job[Settings]) -> Result:
         status="failed" if failed else "converged",
         reason=failed[0] if failed else "completed",
         mesh=Mesh.of(closing.model.mesh),
-        forward_solves=len(made) + closures_of(gate),
+        forward_solves=1 + closures_of(gate),
         gate=f"{PASSED_GATE if gate.passed else FAILED_GATE} on {values['mesh']['columns']} x "
-        f"{values['mesh']['rows']} hex18" + (f", {left} variations left out" if left else ""),
+        f"{values['mesh']['rows']} hex18",
     )
 
 
@@ -426,61 +387,6 @@ def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
     write_case(place, case)
     own = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
     return {**values, "valve": {**values["valve"], **own}}
-
-
-def _sizes(case: ValveCase) -> list[tuple[str, float | None, str]]:
-    """Sizes of the open valve: name, value, unit."""
-    valve, surface, frame = case.valve, case.surface, case.frame(Role.REFERENCE)
-    plane = plane_of(valve, frame.annulus)
-    ring = measure_annulus(frame.annulus, plane)
-    tips, chordae = frame.papillary_tips, case.chordae
-    span = np.linalg.norm(chordae.insertion - tips[chordae.tip], axis=1)
-    found: list[tuple[str, float | None, str]] = [
-        ("annulus, anteroposterior diameter", ring.anteroposterior_diameter, "mm"),
-        ("annulus, commissural diameter", ring.commissural_diameter, "mm"),
-        ("annulus, height of the saddle", ring.height, "mm"),
-        ("annulus, circumference", ring.circumference, "mm"),
-        ("annulus, projected area", ring.projected_area, "mm²"),
-    ]
-    for k, name in enumerate(surface.region_names):
-        own = surface.triangles[surface.region == k]
-        thickness = float(np.median(surface.thickness[np.unique(own)]))
-        found += [
-            (f"{name} leaflet, length", leaflet_length(surface.vertices, own, plane), "mm"),
-            (f"{name} leaflet, area", float(areas(surface.vertices, own).sum()), "mm²"),
-            (f"{name} leaflet, median thickness", thickness, "mm"),
-        ]
-    edge = float(np.median(plane.coordinates(frame.free_edge)[:, 2]))
-    depth = plane.coordinates(tips)[:, 2]
-    return [
-        *found,
-        ("open orifice", free_orifice(case, frame), "mm²"),
-        ("free edge below the annulus, median", edge, "mm"),
-        ("distance of the papillary tips", float(np.linalg.norm(tips[1] - tips[0])), "mm"),
-        ("anterolateral tip below the annulus", float(depth[0]), "mm"),
-        ("posteromedial tip below the annulus", float(depth[1]), "mm"),
-        ("chordae (laid out)", float(len(chordae)), ""),
-        ("chordae, shortest distance tip to insertion", float(span.min()), "mm"),
-        ("chordae, median distance tip to insertion", float(np.median(span)), "mm"),
-    ]
-
-
-def _meshes(values: Values) -> list[dict[str, Any]]:
-    """The mesh in layers and that of tetrahedra, with the volume of their elements."""
-    anatomy, store = anatomy_of(values), Path(values["paths"]["outputs"]) / "meshes"
-    unstructured = {**values["mesh"], "source": "tetwild"}
-    element = values["mechanics"]["element"]
-    rows = []
-    for name, how, kind in (
-        ("layers", values["mesh"], element),
-        ("pytetwild", unstructured, "tet10"),
-    ):
-        mesh = build_mesh(anatomy, how, kind, store)
-        points, weights = mesh.reference.points, mesh.reference.weights
-        size = jacobian_determinants(mesh.nodes, mesh.elements, mesh.reference, points) @ weights
-        count = {"nodes": len(mesh.nodes), "elements": len(mesh.elements)}
-        rows.append({"mesh": name, "element": kind, **count, "volume": float(size.sum())})
-    return rows
 
 
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:

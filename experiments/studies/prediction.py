@@ -8,9 +8,9 @@ its posterior. Only then are the same scenarios computed with the true parameter
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.fields import valve_fields
 from mvest.problem.record import record_of
-from mvest.quantities import AxisCount, Count, Logarithm, within
+from mvest.quantities import AxisCount, Count, Logarithm, Repeats
 from mvest.reading.npz import read_npz
 from mvest.reporting.skill import estimates_table
 from mvest.reporting.tables import Column, Table, table
@@ -56,26 +56,20 @@ MEASURED_ON = (96, 22)
 Compared = tuple[PredictedScenario, Sample, Sample]
 """A prediction, and the valve with the true parameters on its own and on the estimator's mesh."""
 
-STRESS = {
-    f"stress_{which}_{region}_mpa": f"stress, {region}, {label} (MPa)"
-    for region in ("anterior", "posterior")
-    for which, label in (("p95", "95th percentile"), ("p99", "99th percentile"), ("max", "largest"))
-}
+LARGE = {"p95": "95th percentile", "p99": "99th percentile", "max": "largest"}
 PREDICTED = {
     "gap_mm2": "regurgitant gap (mm²)",
     "coaptation_length_mm": "coaptation length (mm)",
     "coaptation_area_mm2": "coaptation area (mm²)",
     "coaptation_height_mm": "coaptation height (mm)",
     "tenting_height_mm": "tenting height (mm)",
-    **STRESS,
+    **{
+        f"stress_{which}_{region}_mpa": f"stress, {region}, {label} (MPa)"
+        for region in ("anterior", "posterior")
+        for which, label in LARGE.items()
+    },
 }
 """Measures whose intervals are counted, and what readers call them."""
-
-PRESCRIBED = {
-    "ap_diameter_mm": "AP diameter of the annulus (mm)",
-    "annulus_circumference_mm": "circumference of the annulus (mm)",
-}
-"""Measures that follow from the prescribed annulus and not from the estimate."""
 
 DRAWN = ("gap_mm2", "coaptation_length_mm", "coaptation_area_mm2", "tenting_height_mm",
          "stress_p99_anterior_mpa", "stress_p99_posterior_mpa")  # fmt: skip
@@ -94,11 +88,9 @@ class PredictionSettings:
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     samples: Count = 32  # of the first patient's posterior; a power of two
     # Simulated, with the seeds seed, seed + 1, ...
-    patients: Annotated[int, within(1, 1000, "", "things that each take their time")] = 1
+    patients: Repeats = 1
     further_samples: Count = 8  # of the posterior of every other patient
     spread: tuple[Logarithm, ...] = ()  # SD of the logarithms of true parameters
-    # Cells [around, annulus to edge] of further meshes on which peak stress is computed.
-    stress_meshes: tuple[Any, ...] = ()
     # Cells of the finer mesh on which each estimate is predicted once to measure the mesh's error;
     # empty: intervals do not include it.
     check_mesh: tuple[AxisCount, ...] = ()
@@ -143,11 +135,6 @@ def run_prediction(job: Job[Settings]) -> Result:
         for measure, row in predicted.against(own, same).items()
     ]
     first, compared = next(iter(patients.values()))
-    truth = _draw_truth(twin, settings, np.random.default_rng(config["seed"]))
-    meshes = ((cells, _mesh_of(config, cells)) for cells in settings.stress_meshes)
-    stress = [
-        _stress_row(closed_valve(_on_mesh(usual, mesh), truth)[0], cells) for cells, mesh in meshes
-    ]
     every = [predicted for _, found in patients.values() for predicted, *_ in found.values()]
     attempted = sum(len(one.samples) for one in every)
     tables = {
@@ -155,7 +142,6 @@ def run_prediction(job: Job[Settings]) -> Result:
         "parameters": estimates_table("patient", records),
         "first_patient": first_patient_table(rows),
         "coverage": coverage_table(rows),
-        "stress_by_mesh": table(stress),
         "not_closed": table(_failures(patients)),
     }
     return Result(
@@ -264,23 +250,20 @@ def first_patient_table(rows: Sequence[Row]) -> Table:
 
     Intervals are with the error of the mesh, where that is known.
     """
-    columns: dict[str, Column] = {"measure": Column()}
     cells: dict[str, dict[str, Any]] = {}
-    for measure, label in (PREDICTED | PRESCRIBED).items():
-        for row in rows:
-            if row["measure"] != measure or row["patient"] != rows[0]["patient"]:
-                continue
-            known = np.isfinite(row["wide_low"])
-            low, high, truth, _ = KINDS["with_mesh_error" if known else "without_mesh_error"]
-            ends = () if measure in PRESCRIBED else (low, high, truth)
-            title = row["scenario"]
-            names = [f"{title}, {end}" for end in ("low", "high", "truth")]
-            columns[title] = Column(low=names[0], high=names[1], truth=names[2])
-            columns[names[2]] = Column()
-            cell = cells.setdefault(measure, {"measure": label})
-            cell |= {title: row["estimate"], **dict.fromkeys(names)}
-            cell |= dict(zip(names, (row[end] for end in ends), strict=False))
-    return table(cells.values(), **columns)
+    columns: dict[str, Column] = {"measure": Column()}
+    for row in rows:
+        if row["measure"] not in PREDICTED or row["patient"] != rows[0]["patient"]:
+            continue
+        known = np.isfinite(row["wide_low"])
+        ends = KINDS["with_mesh_error" if known else "without_mesh_error"][:3]
+        title = row["scenario"]
+        low, high, truth = names = [f"{title}, {end}" for end in ("low", "high", "truth")]
+        columns |= {title: Column(low=low, high=high, truth=truth), truth: Column()}
+        cell = cells.setdefault(row["measure"], {"measure": PREDICTED[row["measure"]]})
+        cell |= {title: row["estimate"]}
+        cell |= {name: row[end] for name, end in zip(names, ends, strict=True)}
+    return table([cells[measure] for measure in PREDICTED if measure in cells], **columns)
 
 
 def coverage_table(rows: Sequence[Row]) -> Table:
@@ -289,47 +272,35 @@ def coverage_table(rows: Sequence[Row]) -> Table:
     Where all samples and the truth are one number (no gap at all) there is no uncertainty that
     could be right or wrong: such an interval is not counted.
     """
-    out: list[dict[str, Any]] = []
-    for measure, label in PREDICTED.items():
-        line: dict[str, Any] = {"measure": label}
-        for kind, (low, high, truth, inside) in KINDS.items():
+    labels = [*PREDICTED.items(), ("all", "all")]
+    out: dict[str, dict[str, Any]] = {name: {"measure": label} for name, label in labels}
+    for kind, (low, high, truth, inside) in KINDS.items():
+        for name, line in out.items():
             held = [
                 row[inside]
                 for row in rows
-                if row["measure"] == measure
+                if (row["measure"] == name or (name == "all" and row["measure"] in PREDICTED))
                 and row[inside] is not None
                 and not row[low] == row[high] == row[truth]
             ]
             line |= {kind: sum(held), f"{kind}_of": len(held)}
-        out.append(line)
-    counts = {name: sum(line[name] for line in out) for name in out[0] if name != "measure"}
-    return table([*out, {"measure": "all", **counts}])
+    return table(out.values())
 
 
-def _stress_row(sample: Sample, cells: Sequence[int]) -> Row:
-    """Peak stress of one closed valve, and the cells of its mesh."""
-    measured = {PREDICTED[name]: sample.measures.get(name) for name in ("gap_mm2", *STRESS)}
-    return {"cells": " × ".join(map(str, cells)), **measured, "not closed": sample.reason}
-
-
-def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> list[Row]:
+def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> Iterator[Row]:
     """Valves that were not estimated or did not close, and why."""
-    out: list[Row] = []
     for seed, (result, compared) in patients.items():
+        whole: dict[str, Any] = {"patient": seed, "scenario": "", "valve": "estimate", "count": 1}
         if not compared:
-            out.append({"patient": seed, "scenario": "", "valve": "estimate", "count": 1,
-                        "reason": result.reason})  # fmt: skip
+            yield whole | {"reason": result.reason}
         for title, (found, own, _) in compared.items():
-            reasons = [("at the estimate", found.at_estimate.reason), ("true", own.reason)]
+            valves = {"at the estimate": found.at_estimate, "true": own, "finer mesh": found.finer}
+            reasons = [(name, one.reason) for name, one in valves.items() if one is not None]
             reasons += [("sample", reason) for reason in found.failures]
-            reasons += [] if found.finer is None else [("finer mesh", found.finer.reason)]
-            out += [
-                {"patient": seed, "scenario": title, "valve": valve, "count": count,
-                 "reason": reason}
-                for (valve, reason), count in Counter(reasons).items()
-                if reason
-            ]  # fmt: skip
-    return out
+            for (name, reason), count in Counter(reasons).items():
+                if reason:
+                    about = {"scenario": title, "valve": name, "count": count, "reason": reason}
+                    yield whole | about
 
 
 # -- figure ---------------------------------------------------------------------------------------

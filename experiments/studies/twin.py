@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from experiments.common.building.filters import build_filter, observation_variance
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin, estimate_twin, expect_twin
-from experiments.common.progress import SolveBar
 from experiments.common.records.record import Mesh, model_of_values
 from experiments.common.study import Job, Result, Results, Study
-from mvest.errors import ConfigurationError
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult
 from mvest.problem.fields import valve_fields
@@ -48,17 +46,14 @@ def run_twin(job: Job[Settings]) -> Result:
     seeds = range(values["seed"], values["seed"] + values["repeats"])
     results = estimate_twin(twin, seeds)
     result = results[0]
-    confirmed = _confirm(twin, result) if values["confirm"] else None
     estimates = tuple(
         record_of(one, seed=seed, simulated=True) for seed, one in zip(seeds, results, strict=True)
     )
-    solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
-    row = _row(values, estimates[0], _truth_band(twin, result))
-    row |= {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}
+    solves = estimates[0].forward_solves or 0
+    row = _row(values, estimates[0], _truth_band(twin, result)) | {"forward solves": solves}
     paper = [_paper_row(values, estimates[0])] if values["paper"] else []
     return Result(
         tables={"": _table([*paper, row])},
-        numbers={"confirmed_mm": confirmed},
         estimates=estimates,
         arrays=_fields(twin, result) if values["figures"] and result.fitted is not None else {},
         status=estimates[0].status,
@@ -68,28 +63,6 @@ def run_twin(job: Job[Settings]) -> Result:
         forward_solves=solves,
         gate=gate_of(values),
     )
-
-
-def _confirm(twin: Twin, result: StudyResult) -> float | None:
-    """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
-
-    None where every closure started from the open state or the closed frame is not observed, so
-    that there is nothing to confirm, or where the new closure failed.
-    """
-    usual = twin.model.continuation, twin.model.guide
-    if result.estimate is None or result.fitted is None or usual == (False, None):
-        return None
-    fitted = dict(zip(twin.frames, result.fitted, strict=True)).get("closed")
-    if fitted is None:
-        return None
-    twin.model.continuation, twin.model.guide = False, None
-    with SolveBar("confirmation", len(twin.model.settings.protocol.steps()), 1) as bar:
-        twin.model.on_step = bar.step
-        anew = twin.model.close(result.estimate, sensitivities=False).simulation
-    twin.model.continuation, twin.model.guide = usual
-    if not anew.converged:
-        return None
-    return float(np.linalg.norm(twin.model.observed(anew.frames[-1]) - fitted, axis=1).max())
 
 
 def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:
@@ -125,9 +98,6 @@ def require_twin(values: Mapping[str, Any]) -> None:
     """
     build_filter(values["filter"], tuple(values["parameters"]))
     observation_variance(values["filter"]["R"])
-    noise = values["observation"]["noise_mm"]
-    if noise < 0:
-        raise ConfigurationError(f"observation.noise_mm = {noise}, expected at least 0")
 
 
 def _row(
@@ -142,7 +112,6 @@ def _row(
         error = own.relative_error
         row |= {
             f"truth {name}": own.truth,
-            f"start {name}": own.prior_mean,
             f"estimate {name}": own.estimate,
             f"std {name}": own.std,
             f"error {name}": None if error is None else 100.0 * abs(error),
@@ -156,12 +125,8 @@ def _row(
         "moduli error SD": 100 * float(np.std(errors)) if errors else None,
         "distance mean": distance and distance.mean,
         "distance SD": distance and distance.std,
-        "distance max": distance and distance.max,
         "element": model.element,
         "cells": " x ".join(str(n) for n in model.cells),
-        "filter": model.filter,
-        "noise": model.noise_mm,
-        "iterations": record.iterations or 0,
         "status": record.status,
         "ended": record.reason.partition(":")[0],
         "reason": record.reason,
@@ -170,31 +135,18 @@ def _row(
 
 def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, Any]:
     """What the paper reports of the same experiment."""
-    paper = values["paper"]
-    row: dict[str, Any] = {"run": f"paper, {paper['table']}", "source": "paper"}
-    for k, name in enumerate(values["parameters"]):
-        row |= {
-            f"truth {name}": record.unknown(name).truth,
-            f"estimate {name}": _at(paper["estimate"], k),
-            f"error {name}": _at(paper["error_percent"], k),
-        }
-    return row | {
-        "moduli error mean": _at(paper["moduli_error_percent"], 0),
-        "moduli error SD": _at(paper["moduli_error_percent"], 1),
-        "distance mean": _at(paper["distance_mm"], 0),
-        "distance SD": _at(paper["distance_mm"], 1),
+    paper, names = values["paper"], values["parameters"]
+    columns = {
+        "estimate": [f"estimate {name}" for name in names],
+        "error_percent": [f"error {name}" for name in names],
+        "moduli_error_percent": ["moduli error mean", "moduli error SD"],
+        "distance_mm": ["distance mean", "distance SD"],
     }
-
-
-def _at(values: Sequence[float] | None, k: int) -> float | None:
-    return None if values is None or k >= len(values) else values[k]
-
-
-HIDDEN = {
-    **dict.fromkeys(("source", "nodes", "iterations", "status", "filter", "reason"), ""),
-    **dict.fromkeys(("distance max", "noise"), "mm"),
-}
-"""Columns that only programs see, and their units."""
+    row: dict[str, Any] = {"run": f"paper, {paper['table']}", "source": "paper"}
+    row |= {f"truth {name}": record.unknown(name).truth for name in names}
+    for key, own in columns.items():
+        row |= zip(own, paper[key] or (), strict=False)
+    return row
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -204,7 +156,6 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         unit, std, band = unit_of(name), f"std {name}", f"truth of {name} known to"
         about |= {
             f"truth {name}": Column(unit, hidden=True),
-            f"start {name}": Column(unit, hidden=True),
             f"estimate {name}": Column(unit, std=std, label=name),
             std: Column(unit),
             f"error {name}": Column("%", std=band, label=f"error {name}"),
@@ -214,8 +165,9 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     about["moduli error SD"] = Column("%")
     about["distance mean"] = Column("mm", std="distance SD", label="distance")
     about["distance SD"] = Column("mm")
-    about |= {name: Column(unit, hidden=True) for name, unit in HIDDEN.items()}
-    return table(rows, **about)
+    return table(
+        rows, **about, **dict.fromkeys(("source", "status", "reason"), Column(hidden=True))
+    )
 
 
 def summary(results: Results) -> dict[str, Table]:

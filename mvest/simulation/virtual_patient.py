@@ -181,7 +181,6 @@ class PatientSettings:
     variation: Factor = 0.0  # size of the random variation of the anatomy; 0: as configured
     simulation: PatientSimulation = field(default_factory=PatientSimulation)
     deviations: Deviations = field(default_factory=Deviations)
-    paper_moduli: tuple[Modulus, ...] = ()  # MPa, of the paper's patient
     paper_distance_mm: tuple[Length, ...] = ()  # generic, personalised
 
 

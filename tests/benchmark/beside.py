@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 ONE_THREAD = {
     f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM")
 }
-OF_A_SWEEP = ("publish=false", "confirm=false", "figures=false")
+OF_A_SWEEP = ("publish=false", "figures=false")
 FARTHER = [1.3, 1 / 1.3]
 
 

@@ -74,7 +74,7 @@ def judged():
             "seed": table["seed"],
             "level": grounds.map(verdicts).map(LEVELS.index),
             "error": np.abs(np.log(table["estimate"] / table["truth"])),
-            "missed": ~table["estimate inside"].astype(bool),
+            "missed": ~table["inside"].astype(bool),
         }
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,28 +16,12 @@ from experiments.common.progress import say
 from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import Values, build
 from mvest.closure.anchors import content_digest
-from mvest.closure.robustness import GATE_CASES, GateCase, GateReport, run_gate
-from mvest.errors import ConfigurationError
+from mvest.closure.robustness import GATE_CASES, GateReport, run_gate
 from mvest.reporting.tables import Table, table
 from mvest.valve.anatomy.dimensions import TemplateParameters
 
 
-def gate_cases(names: Sequence[str]) -> tuple[GateCase, ...]:
-    """The variations of these names.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is none of a name.
-    """
-    known = {case.name: case for case in GATE_CASES}
-    for name in names:
-        if name not in known:
-            raise ConfigurationError(f"gate has {name!r}, expected some of {', '.join(known)}")
-    return tuple(known[name] for name in names)
-
-
-def ask_gate(values: Values, cases: Sequence[GateCase] = GATE_CASES) -> GateReport:
+def ask_gate(values: Values) -> GateReport:
     """Close the configured anatomy with its true moduli under variations that must not matter.
 
     Each result is printed to standard error as soon as it is known.
@@ -45,7 +29,7 @@ def ask_gate(values: Values, cases: Sequence[GateCase] = GATE_CASES) -> GateRepo
     return run_gate(
         lambda case: closure_model(values, case),
         np.array(values["truth"]["values"], dtype=float),
-        cases,
+        GATE_CASES,
         on_case=lambda row: say(f"{row.case}: max {row.max_mm:.3g} mm, {row.reason}"),
         on_path=lambda path: say(f"along {path.name}: {path.reason or 'no jump'}"),
     )

@@ -111,16 +111,6 @@ def estimate_blindly(
     return read_estimate(folder)
 
 
-def estimated_or_reason(
-    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
-) -> Result | str:
-    """What the estimation left, or why it left nothing; as `estimate_blindly` is asked."""
-    try:
-        return estimate_blindly(values, folder, case, sealed)
-    except InputError as fault:
-        return str(fault)
-
-
 def read_estimate(folder: Path) -> Result:
     """What the process left in the output folder.
 

@@ -79,7 +79,7 @@ COLUMNS: Mapping[str, Column] = {
     "percentile_90": Column(label="90th percentile"),
     **dict.fromkeys(("rms", "stated", "rms_handed_on", "stated_handed_on"), Column("mm", ".2f")),
 }
-"""Columns of all tables that have a unit. Errors of one frame have a sign, means have none."""
+"""Columns of all tables that have a unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -311,16 +311,15 @@ def kind_rows(trials: DataFrame) -> DataFrame:
 def error_rows(trials: DataFrame) -> DataFrame:
     """A row for each error and kind of volumes to test on, of those that are called a valve.
 
-    Mean, median and 90th percentile are of the size, the bias is of what has a sign.
+    Of their size: mean, median and 90th percentile.
     """
     found = trials[trials["called"] & trials["kind"].isin([*VOLUMES, *TESTED])]
-    errors = found.melt("kind", list(ERRORS), "error", "bias").dropna(subset="bias")
-    size = errors.assign(size=errors["bias"].abs()).groupby(["error", "kind"], sort=False)
-    rows = size["size"].agg(volumes="size", mean="mean", median="median")
-    rows["percentile_90"] = size["size"].quantile(0.9)
-    rows = rows.join(size["bias"].mean()).reset_index()
-    signed = rows["kind"].isin(VOLUMES) & rows["error"].isin(["annulus_area", "ap_diameter"])
-    return rows.assign(bias=rows["bias"].where(signed), unit=rows["error"].map(ERRORS))
+    errors = found.melt("kind", list(ERRORS), "error", "size").dropna(subset="size")
+    sizes = errors.assign(size=errors["size"].abs()).groupby(["error", "kind"], sort=False)["size"]
+    rows = sizes.agg(volumes="size", mean="mean", median="median")
+    rows["percentile_90"] = sizes.quantile(0.9)
+    plain = rows.reset_index()
+    return plain.assign(unit=plain["error"].map(ERRORS))
 
 
 def figure(results: Results) -> Figure | None:

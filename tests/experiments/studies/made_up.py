@@ -110,7 +110,7 @@ def made_up_twin(values: tuple[float, ...] | None = (6.2296, 2.0901), **header: 
             "status": estimate.status,
             "reason": estimate.reason,
             "estimates": (estimate,),
-            "tables": {"": _table([row | {"nodes": 1, "forward solves": 5}]).plain()},
+            "tables": {"": _table([row | {"forward solves": 5}]).plain()},
             **given,
         }
     )

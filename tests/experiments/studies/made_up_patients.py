@@ -55,16 +55,6 @@ def distances(
     return FrameFit(frame=frame, seen=seen, **off, **true)
 
 
-def narrower(leaflet: str, what: str, if_known: float) -> dict[str, Any]:
-    """What knowing something would make of a standard deviation of 0.4."""
-    return {
-        "what": f"E_f {leaflet}, {what}",
-        "parameter": f"E_f.{leaflet}",
-        "std_now": 0.4,
-        "std_if_known": if_known,
-    }
-
-
 def patient(name: str = "normal_small", table: str = "patients", **changes: Any) -> Record:
     """Inside for both moduli; without nuisances for one, by the paper's filter for none."""
     whole: dict[str, Any] = {
@@ -87,18 +77,12 @@ def patient(name: str = "normal_small", table: str = "patients", **changes: Any)
             distances("late", False, 1.0, 0.4, 0.8),
         ),
         "details": {
-            "narrower": (
-                narrower("anterior", "pressure known", 0.3),
-                narrower("posterior", "pressure known", 0.1),
-                narrower("anterior", "registration known", 0.38),
-            ),
             "measurements": ({"frame": "open", "annulus_area_mm2": 800.0},),
         },
     }
     numbers = changes.pop("numbers", {})
     estimate = EstimateRecord(**{**whole, **changes})
-    paper = {"paper_anterior_MPa": 6.28, "paper_posterior_MPa": 2.61}
-    paper |= {"paper_generic_mm": 1.5, "paper_personalised_mm": 1.47}
+    paper = {"paper_generic_mm": 1.5, "paper_personalised_mm": 1.47}
     return made_up(
         study="patient",
         experiment=table,

@@ -52,47 +52,40 @@ def bounds_of(record, frames):
     return np.array([row["bound"] or np.inf for row in rows if row["frames"] == frames])
 
 
-def rows_of(record, label):
-    return [row for row in record.table_of("estimates").rows if row["estimate from"] == label]
+def estimate_of(record, label):
+    (found,) = (one for one in record.estimates if one.case == label)
+    return found
 
 
 def test_the_joint_study_recovers_all_parameters(done):
     record, folder, _ = done("experiment=joint", *SHORT)
     # Nothing to hide behind: without noise the truth is found, from 40 % and 1 % away.
-    exact = rows_of(record, "no noise")
-    assert abs(exact[0]["start"] / exact[0]["truth"] - 1) > 0.3
-    assert max(abs(row["error"]) for row in exact) < 1
-    assert exact[0]["residual"] < 1e-3
+    exact = estimate_of(record, "no noise")
+    assert abs(exact.parameters[0].prior_mean / exact.parameters[0].truth - 1) > 0.3
+    assert max(abs(own.relative_error) for own in exact.parameters) < 0.01
+    assert exact.innovation.residual_rms < 1e-3
     two, whole = (bounds_of(record, name) for name in ("open and closed", "whole cycle"))
     assert np.all(two > whole)
-    # The estimates are those of the records, and what is left of the observation is its noise.
-    labels = [f"whole cycle, errors {seed}" for seed in (1, 2)]
-    for label in labels:
-        (estimate,) = (one for one in record.estimates if one.case == label)
-        rows = rows_of(record, label)
-        assert [row["estimate"] for row in rows] == [
-            u.estimate for u in estimate.unknowns if u.kind != "derived"
-        ]
-        assert all(0.009 < row["residual"] < 0.011 for row in rows)
-    errors = np.array([[row["error"] for row in rows_of(record, label)] for label in labels])
-    ratios = [row["RMS error / bound"] for row in record.table_of("over_seeds").rows]
-    np.testing.assert_allclose(ratios, np.sqrt(np.mean(errors**2, axis=0)) / whole)
+    # What is left of the observation is its noise.
+    for seed in (1, 2):
+        found = estimate_of(record, f"whole cycle, errors {seed}")
+        assert 0.009 < found.innovation.residual_rms < 0.011
+    labels = [row["estimate from"] for row in record.table_of("estimates").rows]
+    assert labels[3:9] == ["whole cycle, errors 1"] * 3 + ["whole cycle, errors 2"] * 3
     names = {path.name for path in folder.iterdir()}
     assert {"joint.csv", "joint.md", "joint.png", "joint_estimates.csv"} <= names
 
 
 def test_an_estimate_from_another_mesh_says_what_its_own_may_have_done(done):
     record, _, _ = done("experiment=joint", *SHORT, "cycle.estimated=[another mesh]")
-    plain = rows_of(record, "another mesh")
-    wider = rows_of(record, "another mesh, with the mesh's error")
+    plain = estimate_of(record, "another mesh").parameters
+    wider = estimate_of(record, "another mesh, with the mesh's error").parameters
     # Another mesh is another truth, and the third one differs more.
     assert record.numbers["check_mesh_apart_mm"] > record.numbers["meshes_apart_mm"] > 1e-3
     for one, other in zip(plain, wider, strict=True):
-        assert other["estimate"] == one["estimate"]
-        by = other["shift"] / 100 * one["truth"]
-        assert other["SD"] == pytest.approx(np.hypot(one["SD"], by), rel=1e-6)
-    # Meshes this coarse shift by far more than the noise.
-    assert wider[0]["NEES"] < plain[0]["NEES"]
+        assert other.estimate == one.estimate
+        # Meshes this coarse shift by far more than the noise.
+        assert other.std > one.std
 
 
 def test_a_mesh_on_which_nothing_closes_is_said_and_not_raised(done, monkeypatch):
@@ -139,11 +132,12 @@ def test_every_chordal_family_is_estimated_from_both_sets_of_frames(done):
     record, _, _ = done(
         "experiment=chord", "truth.values=[6,2,0.9,1.1,0.97,0.97]", "cycle.noise_mm=0.05"
     )
-    two, whole = (
-        np.array([row["relative SD"] for row in rows_of(record, label)])
+    first, second = (
+        estimate_of(record, label).parameters
         for label in ("open and closed", "whole cycle, errors 1")
     )
-    prior = np.array([row["prior SD"] for row in rows_of(record, "open and closed")])
+    two, whole = (np.array([u.std / u.estimate for u in each]) for each in (first, second))
+    prior = np.array([u.prior_std / u.prior_mean for u in first])
     # Data never widen the posterior by more than its change of place, and more data tell more.
     assert np.all(two < 1.2 * prior)
     assert np.sum(np.log(whole)) < np.sum(np.log(two))

@@ -118,6 +118,3 @@ def test_readers_see_medians_over_patients_and_root_mean_squares():
     (rms,) = shown["root_mean_squares"].rows
     assert rms["error"] == pytest.approx(np.sqrt(1000))
     assert rms["generic"] == pytest.approx(np.sqrt(4100))
-    assert STUDY.figure is not None
-    drawn = STUDY.figure(results)
-    assert len(drawn.axes) == len(KINDS)

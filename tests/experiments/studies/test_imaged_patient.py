@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from experiments.common.cases import blind
+from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Record
+from experiments.common.schema import build
 from experiments.common.study import Job, Results
 from experiments.results.keep import publish, records_of
 from experiments.studies import imaged_patient
@@ -18,8 +20,6 @@ from experiments.studies.imaged_patient import (
     SEGMENTED,
     STUDY,
     VOLUME,
-    figure,
-    keep,
     summary,
 )
 from experiments.studies.imaged_patient import TRUTH as TRUTH_FOLDER
@@ -71,7 +71,9 @@ def estimated(tmp_path, place, monkeypatch):
         monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda *asked: place)
         monkeypatch.setattr(blind, "estimate_blindly", blindly)
         one = PatientSettings(name="one", description="")
-        settings = SimpleNamespace(patient=one, echo=None)
+        priors = {key: {"mean": 1.0, "std": 1.0} for key in ("E_f.anterior", "E_f.posterior")}
+        personal = build(PersonalSettings, {"unknowns": priors})
+        settings = SimpleNamespace(patient=one, echo=None, personal=personal)
         job = Job({"imaged": {}, "seed": 7}, settings, tmp_path)
         return imaged_patient.run_imaged_patient(job)
 
@@ -109,11 +111,6 @@ def test_a_volume_that_is_lost_keeps_what_is_known_of_the_geometry(estimated):
     assert (result.status, result.reason) == ("failed", "no result: MemoryError")
     assert [(own.truth, own.estimate) for own in estimate.moduli] == [(6.0, None), (2.0, None)]
     assert [own.estimate for own in estimate.alternatives[KNOWN].moduli] == [5.8, 2.1]
-
-
-def test_nothing_but_a_segmentation_is_no_result(estimated):
-    with pytest.raises(InputError, match="no valve"):
-        estimated("no valve", "no valve", a_result(5.0, 2.0))
 
 
 # -- tables ---------------------------------------------------------------------------------------
@@ -164,15 +161,13 @@ def rows(records: Any, name: str = "") -> list[dict[str, Any]]:
     return summary(Results({one.row: one for one in records}))[name].rows
 
 
-def test_errors_of_moduli_add_up():
+def test_errors_of_moduli_from_all_sources():
     first, second, lost = rows([FIRST, LOST])
     assert [row["estimate inside"] for row in (first, second, lost)] == [True, False, None]
     assert first["error"] == pytest.approx(20.0)
     assert first["error, known"] == pytest.approx(4.0)
     assert first["error, segmented"] == pytest.approx(10.0)
-    assert first["part from images"] == pytest.approx(16.0)
-    assert second["part from images"] == pytest.approx(-30.0)
-    assert (lost["error"], lost["part from images"], lost["verdict"]) == (None, None, NONE)
+    assert (lost["error"], lost["verdict"]) == (None, NONE)
     found = {row["estimated from"]: row for row in rows([FIRST, LOST], "skill")}
     volume = found["the volume"]
     assert (volume["n"], volume["estimated"], volume["inside"]) == (3, 2, 1)
@@ -222,34 +217,8 @@ def test_lengths_of_chordae_are_of_all_patients_that_have_them():
         record("b", MODULI, (5.0, 2.0), (5.0, 2.0)),
         record("c", MODULI, (5.0, 2.0), (5.0, 2.0), **chordae({"marginal": [0.98]})),
     ]
-    # Of three chordae 1.0067 and 0.0306, of two means 1.02 and 0.98 (their SD 0.0283).
     (row,) = rows(records, "chordae")
-    assert (row["patients"], row["ratio"]) == (2, pytest.approx(1.00667, abs=1e-5))
-    assert row["SD"] == pytest.approx(0.03055, abs=1e-5)
-    assert row["SD of patients"] == pytest.approx(0.02828, abs=1e-5)
-
-
-def shares(scale: float) -> dict[str, Any]:
-    return {
-        "shares": tuple(
-            {"source": source, "parameter": name, "share": share}
-            for name in ("E_f.anterior", "E_f.posterior")
-            for source, share in (("images", 1.0 - 0.2 * scale), ("pressure", 0.2 * scale))
-        )
-    }
-
-
-def test_where_the_variance_comes_from_is_a_median_over_patients():
-    records = [
-        record(f"p{k}", MODULI, (5.0, 2.0), (5.0, 2.0), details=shares(scale))
-        for k, scale in enumerate((1.0, 2.0, 1.1))
-    ]
-    records.append(FIRST)
-    found = {(row["source"], row["parameter"]): row for row in rows(records, "shares")}
-    assert found["pressure", "E_f.posterior"]["share"] == pytest.approx(0.22)
-    assert len(rows(records, "shares_of_patients")) == 3 * 4
-    assert "shares" not in summary(Results({"one": FIRST}))
-    assert set(figure(Results({"one": FIRST}))) == {"moduli"}
+    assert (row["ratio"], row["SD"]) == pytest.approx((1.00667, 0.03055), abs=1e-5)
 
 
 def test_the_table_is_that_of_all_patients(tmp_path):
@@ -260,6 +229,6 @@ def test_the_table_is_that_of_all_patients(tmp_path):
     assert kept is not None
     assert list(kept.records) == ["volumes-one", "volumes-two"]
     assert (tmp_path / "volume.csv").read_text().count("E_f.anterior") == 2
-    full = record("one", MODULI, (5.0, 2.0), (5.0, 2.0), details=shares(1.0), correlation=((1.0,),))
+    full = record("one", MODULI, (5.0, 2.0), (5.0, 2.0), correlation=((1.0,),))
     for name, own in summary(Results({"one": full})).items():
-        assert summary(Results({"one": keep(full)}))[name].csv() == own.csv()
+        assert summary(Results({"one": STUDY.keep(full)}))[name].csv() == own.csv()

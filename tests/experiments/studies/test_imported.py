@@ -50,7 +50,6 @@ SMALL_HEART = [
     "mesh=coarse",
     "observation.columns=40",
     "observation.rows=10",
-    "heart.gate=[perturbed start]",
     "tracking.enabled=false",
 ]
 
@@ -129,10 +128,15 @@ def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
     assert words in err
 
 
-def gate_of_made_up(values, cases):
+def gate_of_made_up(values):
     """What the gate would say; asking it is `tests.closure.test_robustness`'s."""
+<<<<<<< HEAD
     rows = [GateRow("reference", 0.0, 0.0, True, "converged")]
     rows += [GateRow(case.name, 0.1, 0.7, False, "converged") for case in cases]
+=======
+    rows = [GateRow("reference", 0.0, 0.0, True, 1.0, "converged")]
+    rows += [GateRow("perturbed start", 0.1, 0.7, False, 1.0, "converged")]
+>>>>>>> w-studies
     return GateReport(tuple(rows), (), None, False)
 
 
@@ -149,7 +153,7 @@ def run_heart(monkeypatch, *arguments):
 
 
 @pytest.mark.slow
-def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
+def test_the_shape_is_meshed_and_closed(tmp_path, monkeypatch):
     monkeypatch.setattr("experiments.studies.imported.ask_gate", gate_of_made_up)
     monkeypatch.setattr("experiments.studies.imported._twin", twin_of_made_up)
     monkeypatch.setenv("MVEST_HRA", str(heart(tmp_path / "heart")))
@@ -157,22 +161,12 @@ def test_the_shape_is_measured_meshed_and_closed(tmp_path, monkeypatch):
     assert run_heart(monkeypatch, *SMALL_HEART) == 0
     (file,) = tmp_path.glob("outputs/reference_heart/*/result.json")
     record = read_record(file)
-    sizes = {row["name"]: row["value"] for row in record.table_of("shape").rows}
-    # The template's, 26.9 mm by 36 mm.
-    assert sizes["annulus, anteroposterior diameter"] == pytest.approx(26.9, rel=0.05)
-    assert sizes["annulus, commissural diameter"] == pytest.approx(36.0, rel=0.05)
-    # Meshes of the midsurface with its thickness hold the tissue of the source.
-    tissue = sizes["tissue enclosed by the surface of the source"]
-    for row in record.table_of("meshes").rows:
-        assert row["volume"] == pytest.approx(tissue, rel=0.1)
-    opened, closed, still, *_ = record.table_of().rows
-    assert (opened["annulus_contraction"], still["annulus_contraction"]) == (0.08, 0.0)
+    opened, closed = record.table_of().rows
     assert closed["orifice"] < 0.2 * opened["orifice"]
     gate = record.table_of("gate").rows
     assert [row["variation"] for row in gate] == ["reference", "perturbed start"]
     assert record.numbers["passed"] is False
     assert record.gate.startswith("NOT passed")
-    assert record.gate.endswith("11 variations left out")
     assert record.table_of("moduli").rows[0]["relative_error"] == pytest.approx(0.05)
     assert list(file.parent.glob("*.png"))
 
@@ -185,10 +179,3 @@ def test_without_the_heart_it_says_where_to_get_it(tmp_path, monkeypatch, capsys
     assert "the data are not part of this package" in said
     assert "conf/experiment/reference_heart.yaml" in said
     assert "Traceback" not in said
-
-
-def test_an_unknown_variation_of_the_gate_is_refused(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("MVEST_HRA", str(heart(tmp_path / "heart")))
-    monkeypatch.chdir(tmp_path)
-    assert run_heart(monkeypatch, *SMALL_HEART, "heart.gate=[nothing]") == 2
-    assert "'nothing', expected some of" in capsys.readouterr().err

@@ -106,73 +106,19 @@ def _on_grid(x, at):
     return (1 - q) * low + q * ((1 - p) * cells[j + 1, i] + p * cells[j + 1, i + 1])
 
 
-def with_cell_data(suffix):
-    def save(folder, name, points, triangles, region):
-        file = folder / f"{name}{suffix}"
-        if suffix == ".vtp":
-            write_surface(file, points, triangles, None, {"region": region})
-        else:
-            meshio.Mesh(points, [("triangle", triangles)], cell_data={"region": [region]}).write(
-                file
-            )
-        return file.name
-
-    return save
+def with_cell_data(folder, name, points, triangles, region):
+    write_surface(folder / f"{name}.vtp", points, triangles, None, {"region": region})
+    return f"{name}.vtp"
 
 
-def one_file_each(suffix):
-    def save(folder, name, points, triangles, region):
-        files = {}
-        for number, leaflet in enumerate(REGIONS):
-            used, corners = np.unique(triangles[region == number], return_inverse=True)
-            files[leaflet] = f"{name}_{leaflet}{suffix}"
-            mesh = meshio.Mesh(points[used], [("triangle", corners.reshape(-1, 3).astype("int32"))])
-            mesh.write(folder / files[leaflet])
-        return files
-
-    return save
-
-
-def with_groups(word, own_vertices):
-    """OBJ with groups that share their vertices, or with objects that have their own."""
-
-    def save(folder, name, points, triangles, region):
-        vertices, faces, first = [], [], 1
-        for number, leaflet in enumerate(REGIONS):
-            mine = triangles[region == number]
-            faces.append(f"{word} {leaflet}")
-            faces += [f"f {a} {b} {c}" for a, b, c in (mine + first).tolist()]
-            if own_vertices:
-                first += len(points)
-            if own_vertices or not number:
-                vertices += [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
-        (folder / f"{name}.obj").write_text("\n".join(vertices + faces) + "\n")
-        return f"{name}.obj"
-
-    return save
-
-
-def text_ply(folder, name, points, triangles, region):
-    """With the label as a property of the faces."""
-    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
-    lines += [f"property double {axis}" for axis in "xyz"]
-    lines += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
-    lines += ["property int region", "end_header"]
-    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
-    lines += [f"3 {a} {b} {c} {r}" for (a, b, c), r in zip(triangles.tolist(), region, strict=True)]
-    (folder / f"{name}.ply").write_text("\n".join(lines) + "\n")
-    return f"{name}.ply"
-
-
-FORMATS = {
-    "vtp": with_cell_data(".vtp"),
-    "vtu": with_cell_data(".vtu"),
-    "stl": one_file_each(".stl"),
-    "ply": one_file_each(".ply"),
-    "text ply": text_ply,
-    "obj groups": with_groups("g", own_vertices=False),
-    "obj objects": with_groups("o", own_vertices=True),
-}
+def one_file_each(folder, name, points, triangles, region):
+    files = {}
+    for number, leaflet in enumerate(REGIONS):
+        used, corners = np.unique(triangles[region == number], return_inverse=True)
+        files[leaflet] = f"{name}_{leaflet}.stl"
+        mesh = meshio.Mesh(points[used], [("triangle", corners.reshape(-1, 3).astype("int32"))])
+        mesh.write(folder / files[leaflet])
+    return files
 
 
 def write(folder, seen, save, place, corresponds, **more):
@@ -209,32 +155,29 @@ def run(run):
     return lambda folder, *arguments: run(*own, f"case={folder}", *arguments)
 
 
-@pytest.mark.parametrize(
-    ("kind", "corresponds"),
-    # Merged vertices are numbered anew, which two frames must be alike.
-    [*((kind, False) for kind in FORMATS), ("stl", True), ("obj objects", True)],
-)
-def test_every_format_is_read_alike(tmp_path, seen, kind, corresponds):
+# Merged vertices are numbered anew, which two frames must be alike.
+@pytest.mark.parametrize("corresponds", [False, True])
+def test_one_file_for_each_leaflet_is_read_as_labels_are(tmp_path, seen, corresponds):
     # A closed leaflet lies across the annulus' axis: without a table of chordae its own angle round
     # the valve is needed, and an angle about that axis has the wrong period.
     case, reference = (
-        read_case(write(tmp_path / at, seen, FORMATS[name], Scanner(3), corresponds))
-        for at, name in (("own", kind), ("reference", "vtp"))
+        read_case(write(tmp_path / save.__name__, seen, save, Scanner(3), corresponds))
+        for save in (one_file_each, with_cell_data)
     )
     assert [frame.corresponds for frame in case.frames] == [True, corresponds]
     assert len(case.chordae) == 34
     for one, other in zip(case.frames, reference.frames, strict=True):
         assert len(one.triangles) == len(other.triangles)
         nearest = cKDTree(other.vertices).query(one.vertices)[0]
-        # STL and PLY hold single precision.
+        # STL holds single precision.
         assert nearest.max() < 1e-4
 
 
-@pytest.mark.parametrize(("kind", "corresponds"), [("text ply", False), ("stl", True)])
-def test_a_case_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, kind, corresponds):
+@pytest.mark.parametrize("corresponds", [False, True])
+def test_a_case_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, corresponds):
     # What is read is tested here, not what a closure would tell of it.
     monkeypatch.setattr(ClosureModel, "__call__", lambda *_: Prediction.failed("not closed here"))
-    folder = write(tmp_path / "mine", seen, FORMATS[kind], Scanner(3), corresponds)
+    folder = write(tmp_path / "mine", seen, one_file_each, Scanner(3), corresponds)
     status, out, err = run(folder, "check=true", "figures=false")
     assert status == 0, err
     told = "same vertices as the reference" if corresponds else "without correspondence"
@@ -257,7 +200,7 @@ def test_a_finished_case_is_shown_again_until_its_files_change(run, tmp_path, mo
         return []
 
     monkeypatch.setattr(case, "STUDY", replace(case.STUDY, run=estimate, files=report))
-    folder = write(tmp_path / "mine", seen, FORMATS["vtp"], Scanner(3), True)
+    folder = write(tmp_path / "mine", seen, with_cell_data, Scanner(3), True)
     here = ("time_limit_s=null", "tracking.enabled=false")
     status, first, err = run(folder, *here)
     assert status == 0, err
@@ -279,7 +222,7 @@ def test_a_finished_case_is_shown_again_until_its_files_change(run, tmp_path, mo
 def test_the_moduli_are_found_wherever_the_valve_lies(run, tmp_path, seen):
     found = []
     for k, place in enumerate((Scanner(5), Scanner(6, 1e-3))):
-        folder = write(tmp_path / f"mine {k}", seen, FORMATS["vtp"], place, corresponds=True)
+        folder = write(tmp_path / f"mine {k}", seen, with_cell_data, place, corresponds=True)
         status, _, err = run(f"'{folder}'", "figures=false")
         assert status == 0, err
         records = (tmp_path / "outputs" / "own_valve").glob("*/result.json")

@@ -71,6 +71,33 @@ def run(run, monkeypatch, volume):
     return call
 
 
+@pytest.fixture
+def asked(monkeypatch):
+    """Cases and images that would be personalised."""
+    given = []
+
+    def personalised(values, personal, case, images):
+        given.append((case, images))
+        raise InputError("not tried here")
+
+    monkeypatch.setattr("experiments.common.cases.own_case.run_case", personalised)
+    return given
+
+
+def finds(monkeypatch, found):
+    """Let the detectors find this, or fail with it; what confidence they are told."""
+    told = []
+
+    def detect(volume, model, *, min_confidence, landmarks=None, progress=None):
+        told.append(min_confidence)
+        if isinstance(found, NoValveError):
+            raise found
+        return found
+
+    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", detect)
+    return told
+
+
 def test_the_image_step_is_checked_written_and_drawn(run, volume, tmp_path):
     status, out, err = run("check=true")
     assert status == 0, err
@@ -181,10 +208,7 @@ def test_what_is_missing_or_wrong_is_one_line(run, arguments, pressure, message)
 def test_a_volume_without_a_valve_and_a_model_without_accuracy_end_in_their_reason(
     run, monkeypatch
 ):
-    def nothing(*arguments, **more):
-        raise NoValveError("my_tee.seq.nrrd: no valve found")
-
-    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", nothing)
+    finds(monkeypatch, NoValveError("my_tee.seq.nrrd: no valve found"))
     status, _, err = run("check=true")
     assert status == 2
     assert "no valve found" in err
@@ -194,14 +218,7 @@ def test_a_volume_without_a_valve_and_a_model_without_accuracy_end_in_their_reas
     assert "accuracy was never measured" in err
 
 
-def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume, monkeypatch):
-    asked = []
-
-    def personalised(values, personal, case, images):
-        asked.append((case, images))
-        raise InputError("not tried here")
-
-    monkeypatch.setattr("experiments.common.cases.own_case.run_case", personalised)
+def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume, asked):
     status, _, err = run("figures=false", "tracking.enabled=false")
     assert status == 2
     assert "not tried here" in err
@@ -215,16 +232,8 @@ def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume,
     assert json.dumps(images, allow_nan=False)
 
 
-def test_a_volume_unlike_those_of_training_is_said_to_be_and_its_errors_are_wider(
-    run, monkeypatch, tmp_path
-):
-    asked, seen = [], sequence().confidence
-
-    def personalised(values, personal, case, images):
-        asked.append((case, images))
-        raise InputError("not tried here")
-
-    monkeypatch.setattr("experiments.common.cases.own_case.run_case", personalised)
+def test_a_volume_unlike_those_of_training_is_said_to_be_and_its_errors_are_wider(run, asked):
+    seen = sequence().confidence
     measured = run.model.accuracy
     for like_from, widening in ((seen - 0.05, (1.0, 0.0)), (seen + 0.05, (1.0, 7.0))):
         run.model.accuracy = replace(measured, like_from=like_from, widening=widening)
@@ -259,15 +268,12 @@ def test_a_check_without_a_pressure_draws_and_says_what_the_estimate_needs(run, 
 
 
 def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp_path):
-    def nothing(*arguments, **more):
-        raise NoValveError("no valve found; 0.31, expected at least 0.6", sequence())
-
     titles = []
 
     def titled(figure, title, note):
         titles.append(title)
 
-    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", nothing)
+    finds(monkeypatch, NoValveError("no valve found; 0.31, expected at least 0.6", sequence()))
     monkeypatch.setattr("mvest.reporting.images.headline", titled)
     status, _, err = run("check=true")
     assert status == 2
@@ -280,15 +286,9 @@ def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp
 
 
 def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypatch):
-    asked = []
-
-    def detect(volume, model, *, min_confidence, landmarks=None, progress=None):
-        asked.append(min_confidence)
-        return sequence()
-
-    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", detect)
+    told = finds(monkeypatch, sequence())
     assert run("check=true", "imaged.min_confidence=0.1")[0] == 0
-    assert asked == [0.1]
+    assert told == [0.1]
 
 
 def test_one_frame_is_no_cycle(run, volume, tmp_path):

@@ -1,0 +1,157 @@
+"""Virtual patients with a truth: estimated, then grouped, counted, drawn and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from experiments.common.cases import blind
+from experiments.common.cases.settings import PersonalSettings
+from experiments.common.records.record import Record
+from experiments.common.study import Result, Results
+from mvest.errors import InputError
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.verdict import NONE
+from mvest.reporting.skill import (
+    VERDICTS,
+    interval,
+    interval_columns,
+    moduli_figure,
+    skill_table,
+    trust_of,
+)
+from mvest.reporting.tables import Column, Table, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Judged: TypeAlias = tuple[EstimateRecord, str]
+"""An estimate, and the verdict that counts for it, in a word."""
+
+Groups: TypeAlias = Mapping[str, Sequence[Judged]]
+"""Estimates by what tables call their scenario, data or filter."""
+
+NOTHING = dict.fromkeys(("estimate", "std", "low", "high"))
+
+
+def estimate_hidden(
+    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, personal: PersonalSettings
+) -> Result:
+    """Estimate a case or volume in a process that cannot see its truth.
+
+    Where that left nothing the result has failed, and its moduli are as they were believed before.
+    """
+    try:
+        return blind.estimate_blindly(values, folder, case, sealed)
+    except InputError as fault:
+        believed = tuple(
+            Unknown(name=name, unit="MPa", prior_mean=about.mean, prior_std=about.std)
+            for name, about in personal.unknowns.items()
+            if name.startswith("E_f.")
+        )
+        estimate = EstimateRecord(status="failed", reason=str(fault), unknowns=believed)
+        return Result(status="failed", reason=str(fault), estimates=(estimate,))
+
+
+def revealed(results: Results) -> list[tuple[Record, EstimateRecord]]:
+    """Record and estimate of each patient; runs that ended without either are left out."""
+    return [(one, one.estimates[0]) for one in results.records.values() if one.estimates]
+
+
+def grouped(estimates: Iterable[tuple[str, EstimateRecord, EstimateRecord]]) -> Groups:
+    """Groups from names, estimates, and the estimates whose verdicts count for them."""
+    groups: dict[str, list[Judged]] = {}
+    for name, estimate, own in estimates:
+        groups.setdefault(name, []).append((estimate, trust_of(own)))
+    return groups
+
+
+def unknowns_of(
+    groups: Groups, *, by_name: bool = False, nuisances: bool = False, stated: bool = True
+) -> dict[str, list[Unknown]]:
+    """The moduli of each group.
+
+    Parameters
+    ----------
+    groups : mapping
+    by_name : bool
+        Whether each group is divided into ``GROUP, UNKNOWN``.
+    nuisances : bool
+        Whether all other unknowns are included.
+    stated : bool
+        Whether numbers are left out where the verdict is that there is no estimate.
+    """
+    found: dict[str, list[Unknown]] = {}
+    for name, group in groups.items():
+        for estimate, trust in group:
+            for own in estimate.parameters if nuisances else estimate.moduli:
+                known = own.model_copy(update=NOTHING) if stated and trust == NONE else own
+                found.setdefault(f"{name}, {own.name}" if by_name else name, []).append(known)
+    return found
+
+
+def verdicts_and_skill(by: str, groups: Groups, *, stated: bool = True) -> Table:
+    """How many estimates of each group have which verdict, and what their moduli are worth.
+
+    Parameters
+    ----------
+    by : str
+        Name of the first column.
+    groups : mapping
+    stated : bool
+        See `unknowns_of`.
+    """
+    skill = skill_table(by, unknowns_of(groups, stated=stated))
+    rows = []
+    for row in skill.rows:
+        trust = [one for _, one in groups[row[by]]]
+        rows.append(row | {verdict: trust.count(verdict) for verdict in VERDICTS})
+    return table(rows, **skill.columns)
+
+
+def groups_figure(groups: Groups) -> Figure:
+    """Moduli over their truths, a band for each group (`mvest.reporting.skill.moduli_figure`)."""
+    return moduli_figure(
+        {
+            name: [(own, trust) for estimate, trust in group for own in estimate.moduli]
+            for name, group in groups.items()
+        }
+    )
+
+
+def modulus_row(estimate: EstimateRecord, own: Unknown) -> dict[str, Any]:
+    """A modulus with its interval and verdict; the error also where no number may be stated."""
+    error = own.relative_error
+    return {
+        "modulus": own.name,
+        "truth": own.truth,
+        "stated": own.estimate if estimate.is_stated else None,
+        **interval("estimate", own),
+        "verdict": trust_of(estimate),
+        "error": None if error is None else 100.0 * error,
+    }
+
+
+MODULUS_COLUMNS: Mapping[str, Column] = {
+    "modulus": Column(),
+    "truth": Column("MPa"),
+    **interval_columns("estimate", hidden=True),
+    "stated": replace(interval_columns("estimate")["estimate"], label="estimate"),
+    "verdict": Column(),
+    "error": Column("%", "+.1f"),
+}
+"""Columns of `modulus_row`."""
+
+
+def short(record: Record, *, nuisances: bool = False, details: Sequence[str] = ()) -> Record:
+    """A record with what tables and figures of estimates need; the run's folder has all of it."""
+
+    def shortened(estimate: EstimateRecord) -> EstimateRecord:
+        others = {name: shortened(other) for name, other in estimate.alternatives.items()}
+        few = estimate.parameters if nuisances else estimate.moduli
+        return estimate.model_copy(update={"unknowns": few, "alternatives": others})
+
+    kept = tuple(shortened(estimate.without_details(*details)) for estimate in record.estimates)
+    return record.model_copy(update={"estimates": kept})

@@ -1,0 +1,1 @@
+"""Virtual patients: the study, and its figures."""
