@@ -246,41 +246,23 @@ def _donor(job: Job[Settings]) -> Result:
         # A start is met again by rounding of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)
-<<<<<<< HEAD
-        row = {"closure": "generic", "ended": generic.reason, "predictions": 1}
-=======
->>>>>>> w-studies
         if generic.converged:
             shapes["generic"] = generic.y.reshape(2, -1, 3)[1]
         row = {"closure": "generic", "ended": generic.reason}
         rows.append(row | valve.distances(shapes.get("generic")))
         for k, start in enumerate(starts):
             # Each goes on from the generic closed valve.
-<<<<<<< HEAD
-            model = copy(first)
-            model_ = Remembered(model, known.runs, known.rtol)
-=======
             model = Remembered(copy(first), known.runs, known.rtol)
->>>>>>> w-studies
             own = replace(filter_, start=tuple(map(float, start)))
             tissue = valve.settings.tissue
             problem = Problem(parameters, model, prior, own, transform, tissue)
             found = estimate(problem, seen, on_iterate=bar.iterate)
             record = record_of(found, case=f"fitted, start {k + 1}", simulated=True)
-<<<<<<< HEAD
-            row = {"closure": record.case, "ended": record.reason}
-            row |= {"iterations": record.iterations, "predictions": record.forward_solves}
-            if found.fitted is not None:
-                shapes.setdefault("fitted", found.fitted[-1])
-                row |= valve.distances(found.fitted[-1])
-            rows.append(row)
-=======
             closed = None if found.fitted is None else found.fitted[-1]
             if closed is not None:
                 shapes.setdefault("fitted", closed)
             row = {"closure": record.case, "ended": record.reason}
             rows.append(row | valve.distances(closed))
->>>>>>> w-studies
             records.append(record)
     failed = [] if generic.converged else [f"generic: {generic.reason}"]
     failed += [one.reason for one in records if not one.converged]

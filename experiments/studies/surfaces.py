@@ -33,13 +33,8 @@ from mvest.cases.folder import read_case, write_case
 from mvest.problem.record import EstimateRecord
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.tables import Column, Table, table
-<<<<<<< HEAD
-from mvest.simulation.arrival import KINDS, DoorSettings, arrive
-from mvest.simulation.virtual_patient import PatientSettings
-=======
 from mvest.simulation.arrival import KINDS, Arrived, DoorSettings, arrive
-from mvest.simulation.drawn_patient import PatientSettings
->>>>>>> w-studies
+from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import closest_points
 

@@ -256,23 +256,14 @@ def _with_second_derivatives(
 ) -> "tuple[_Point, FloatArray] | None":
     """The minimum of J and the covariance that its own curvature gives, in coordinates x.
 
-    <<<<<<< HEAD
-    Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``, which of thousands of
-    observations may amount to as much as what is kept, though the model is all but linear over a
-    standard deviation. Here the Hessian is that of differences of J's exact gradients over ± one
-    standard deviation along conjugate directions of a Gaussian, first of Gauss-Newton's (Nocedal
-    and Wright 2006, section 8.1); its inverse is the covariance (Laplace). The directions are the
-    columns of Cholesky's factor: the last ones change the last parameters alone. Newton steps with
-    it lead to the minimum; where that is more than a standard deviation away, the Hessian is found
-    anew there.
-    =======
     Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``. With thousands of observations
     this may be as large as the rest, though the model is nearly linear over a standard deviation.
     Here the Hessian comes from differences of J's exact gradients over ± one standard deviation
-    along the principal axes of a Gaussian, first of Gauss-Newton's (Nocedal and Wright 2006,
-    section 8.1); its inverse is the covariance (Laplace). Newton steps with it lead to the minimum.
-    If that is more than a standard deviation away, the Hessian is found again there.
-    >>>>>>> w-imaging
+    along conjugate directions of a Gaussian, first of Gauss-Newton's (Nocedal and Wright 2006,
+    section 8.1); its inverse is the covariance (Laplace). The directions are the columns of
+    Cholesky's factor: the last ones change the last parameters alone. Newton steps with the Hessian
+    lead to the minimum. If that is more than a standard deviation away, the Hessian is found again
+    there.
 
     Returns None where a run fails, J is not convex, or its minimum is not reached.
     """

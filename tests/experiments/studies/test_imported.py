@@ -130,13 +130,8 @@ def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
 
 def gate_of_made_up(values):
     """What the gate would say; asking it is `tests.closure.test_robustness`'s."""
-<<<<<<< HEAD
     rows = [GateRow("reference", 0.0, 0.0, True, "converged")]
-    rows += [GateRow(case.name, 0.1, 0.7, False, "converged") for case in cases]
-=======
-    rows = [GateRow("reference", 0.0, 0.0, True, 1.0, "converged")]
-    rows += [GateRow("perturbed start", 0.1, 0.7, False, 1.0, "converged")]
->>>>>>> w-studies
+    rows += [GateRow("perturbed start", 0.1, 0.7, False, "converged")]
     return GateReport(tuple(rows), (), None, False)
 
 

@@ -12,14 +12,9 @@ import pytest
 from experiments.common.records.record import read_record
 from experiments.common.study import Results
 from experiments.studies import prediction
-<<<<<<< HEAD
-from experiments.studies.prediction import DRAWN, PREDICTED, PRESCRIBED, coverage_table
+from experiments.studies.prediction import DRAWN, PREDICTED, coverage_table
 from mvest.closure.anchors import ClosedState
 from mvest.closure.model import ClosureModel
-=======
-from experiments.studies.prediction import DRAWN, PREDICTED, coverage_table
-from mvest.closure.model import ClosedState, ClosureModel
->>>>>>> w-studies
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import build_system
 
