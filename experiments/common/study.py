@@ -160,11 +160,6 @@ def study_names() -> tuple[str, ...]:
     return tuple(sorted([*modules, *packages]))
 
 
-def load_settings(name: str) -> type:
-    """The settings of a study."""
-    return load_study(name).settings
-
-
 def load_study(name: str) -> Study[Any]:
     """The study of that name; no other study is imported.
 
