@@ -92,7 +92,7 @@ def run_alone(config: DictConfig) -> float:
         If the computation found no estimate; the run is recorded all the same.
     """
     # Imports every study, for seconds: not where only help is asked for.
-    from experiments.results.publish import publish_run
+    from experiments.results.published import publish_run
     from experiments.runner.compared import metrics
     from experiments.runner.job import require_admissible, require_checks, run_job
     from experiments.runner.plan import Plan, earlier

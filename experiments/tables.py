@@ -16,7 +16,7 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from experiments.results.keep import RECORDS, regenerate
+from experiments.results.published import RECORDS, regenerate
 from experiments.sweeps.collected import read_sweeps
 from experiments.sweeps.report import write_sweep
 from mvest.files import write_atomically

@@ -20,7 +20,7 @@ from study_pages import comment_of
 from experiments.common.config import Config
 from experiments.common.schema import hints_of
 from experiments.common.study import load_study, study_names
-from experiments.results.keep import records_of
+from experiments.results.published import records_of
 from mvest.mechanics.parameters import KINDS
 from mvest.quantities import Within
 from mvest.reporting.skill import GENERIC, skill_table, stated

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.common.records.record import Record, read_record
-from experiments.results.keep import RECORDS, records_of
+from experiments.results.published import RECORDS, records_of
 from experiments.sweeps.collected import SWEEPS, Sweep, read_sweep
 from mvest.errors import InputError
 from mvest.files import write_atomically

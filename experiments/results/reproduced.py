@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.results.keep import records_of
+from experiments.results.published import records_of
 from mvest.errors import InputError, MvestError
 from mvest.problem.record import EstimateRecord
 from mvest.reporting.markup import number

@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from tqdm import tqdm
 
 from experiments.common.config import hash_of, plain
-from experiments.results.publish import as_configured, publish_as
+from experiments.results.published import as_configured, publish_as
 from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
 from experiments.runner.plan import Plan, earlier
 from mvest.errors import ConfigurationError

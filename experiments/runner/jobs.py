@@ -27,7 +27,7 @@ from omegaconf import DictConfig
 from experiments.common.config import hash_of, plain, require_in_range, without_places
 from experiments.common.records.record import Record, adopt_arrays, read_record, stamp, write_record
 from experiments.common.study import Result
-from experiments.results.publish import publish_as
+from experiments.results.published import publish_as
 from mvest.errors import InputError, message_of
 from mvest.files import remove_parts, require_writable, sha256_of, write_atomically
 from mvest.provenance import write_json

@@ -17,7 +17,7 @@ from experiments.common.progress import PartBar, announce_compilation, say
 from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
 from experiments.results.estimates import sweep_table
-from experiments.results.publish import publish_runs, publish_sweep
+from experiments.results.published import publish_runs, publish_sweep
 from experiments.runner.cluster import EngineSettings, require_engine
 from experiments.runner.compared import metrics
 from experiments.runner.compose import make_plan

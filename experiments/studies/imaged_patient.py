@@ -17,8 +17,12 @@ from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.cases.blind import estimated_or_reason
-from experiments.common.cases.own_case import case_words, write_report
-from experiments.common.cases.settings import ImagedInput, PersonalSettings
+from experiments.common.cases.own_case import (
+    ImagedInput,
+    PersonalSettings,
+    case_words,
+    write_report,
+)
 from experiments.common.records.record import Record
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study

@@ -23,9 +23,7 @@ from scipy.stats import binom, chi2, norm
 from experiments.common.building.gate import gate_of
 from experiments.common.building.patient_store import PatientPlace, make_patient
 from experiments.common.cases.blind import estimate_blindly
-from experiments.common.cases.check import check
-from experiments.common.cases.own_case import case_words, write_report
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings, case_words, check, write_report
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study

@@ -16,8 +16,7 @@ import numpy as np
 
 from experiments.common.building.patient_store import make_patient
 from experiments.common.cases.blind import estimated_or_reason
-from experiments.common.cases.own_case import case_words
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings, case_words
 from experiments.common.records.record import Number, Record
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Frame, Role, ValveCase

@@ -21,8 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.cases.own_case import read_configured, run_case, run_volume
-from experiments.common.cases.settings import ImagedInput, PersonalSettings
+from experiments.common.cases.own_case import (
+    ImagedInput,
+    PersonalSettings,
+    read_configured,
+    run_case,
+    run_volume,
+)
 from experiments.common.records.record import NOT_GATED
 from experiments.common.schema import build
 from experiments.common.study import Result

@@ -6,7 +6,7 @@ import pytest
 
 from experiments.cli import main
 from experiments.common.records.record import Record
-from experiments.results.keep import publish, records_of, regenerate
+from experiments.results.published import publish, records_of, regenerate
 from experiments.studies.twin import STUDY
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import made_up_twin

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from experiments.cli import main
-from experiments.results.keep import publish
+from experiments.results.published import publish
 from experiments.studies.twin import STUDY
 from experiments.sweeps.collected import Sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from experiments.results.keep import records_of
+from experiments.results.published import records_of
 from experiments.runner import engine, jobs, plugins, sweep
 from experiments.runner.plan import Plan
 from experiments.studies import twin

@@ -20,10 +20,16 @@ from experiments.cli import main
 from experiments.common.records.record import Record, write_record
 from experiments.runner import compared, tracking
 from experiments.runner.compared import implausible, metrics
-from experiments.runner.dashboard import last_sweep
 from experiments.runner.jobs import Request, mark_done
 from experiments.runner.plan import Plan
-from experiments.runner.tracking import log_run, log_sweep, opened, require_no_password, runs_of
+from experiments.runner.tracking import (
+    last_sweep,
+    log_run,
+    log_sweep,
+    opened,
+    require_no_password,
+    runs_of,
+)
 from experiments.sweeps.collected import Sweep, SweptJob, write_sweep_file
 from mvest.errors import ConfigurationError, InputError
 from mvest.problem.record import EstimateRecord, Spread, Unknown
@@ -374,7 +380,7 @@ def test_the_comparison_hides_what_failed_or_makes_no_sense(tmp_path, monkeypatc
     assert [name for name, run in jobs.items() if run.info.run_id in page] == ["b", "a"]
     assert "60" in jobs["c"].data.params.get("x", "60"), "it stays in the store"
     # Too many are listed, by the same choice.
-    monkeypatch.setattr("experiments.runner.dashboard.MOST", 1)
+    monkeypatch.setattr("experiments.runner.tracking.MOST", 1)
     assert "plausible%20%3D%20%27yes%27" in last_sweep(tmp_path)[1]
 
 

@@ -10,7 +10,7 @@ import pytest
 from experiments.common.cases import blind
 from experiments.common.records.record import Record
 from experiments.common.study import Job, Results
-from experiments.results.keep import publish, records_of
+from experiments.results.published import publish, records_of
 from experiments.studies import imaged_patient
 from experiments.studies.imaged_patient import (
     HIDDEN,
