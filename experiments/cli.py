@@ -72,10 +72,10 @@ def _list(rest: list[str]) -> int:
 
 
 def _tables(rest: list[str]) -> int:
-    from experiments.tables import write_everything
+    from experiments.results.published import regenerate
 
     results = _parsed("tables", rest, folder={"nargs": "?", "default": "results"}).folder
-    print(*write_everything(results), sep="\n")
+    print(*regenerate(results), sep="\n")
     return 0
 
 
@@ -249,7 +249,7 @@ COMMANDS: dict[str, tuple[str, str | Callable[[list[str]], int]]] = {
         "a case or a result for another program: export NAME SOURCE TARGET",
         "experiments.exchange.export_command",
     ),
-    "tables": ("every table and figure of results/ again, from the records in it", _tables),
+    "tables": ("every table, figure and page of results/ again, from the records in it", _tables),
     "table": (
         "all estimates of a folder as one table for statistics: table outputs estimates.csv",
         _table,

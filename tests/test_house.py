@@ -151,7 +151,7 @@ RUNNER = "experiments.runner"
 ORDINARY_WORDS = {"case", "volume", "gate", "closure", "external", "filters", "patient"}
 """Names of studies that are also parts of a configuration, or words."""
 RUNNER_ROOMS = (
-    "jobs", "plan", "compose", "compared", "tracking", "dashboard", "cluster", "engine", "job",
+    "jobs", "plan", "compose", "compared", "tracking", "cluster", "engine", "job",
 )  # fmt: skip
 """In the runner a module imports none that comes after it; one that is not listed comes last."""
 

@@ -22,7 +22,7 @@ from experiments.common.config import is_hashed
 from experiments.common.records.record import FIELDS, Record, record_from, sealed_record
 from experiments.common.records.writer import write_results
 from experiments.common.study import Results, Study, load_study
-from experiments.sweeps.collected import SWEEPS, Sweep, write_sweep_file
+from experiments.sweeps.collected import SWEEPS, Sweep, read_sweeps, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
@@ -170,7 +170,7 @@ def publish(
 
 
 def regenerate(results: Path) -> list[Path]:
-    """Write every table and figure again that follows from kept records.
+    """Write every table, figure and page again that follows from published records and sweeps.
 
     Raises
     ------
@@ -178,7 +178,8 @@ def regenerate(results: Path) -> list[Path]:
         If there is no record, or one is damaged or not as it was written.
     """
     paths = sorted((results / RECORDS).glob("*.jsonl"))
-    if not paths:
+    sweeps = read_sweeps(results)
+    if not paths and not sweeps:
         raise InputError(
             f"{results / RECORDS} holds no record; run an experiment first, for example "
             "mvest run experiment=table1"
@@ -188,6 +189,8 @@ def regenerate(results: Path) -> list[Path]:
         found = records_of(results, path.stem)
         assert found is not None
         written += write_results(results, load_study(found.first.study), found)
+    for sweep in sweeps:
+        written += write_sweep(results, sweep)
     return written
 
 
