@@ -8,6 +8,7 @@ from typing import Any
 
 from experiments.common.config import is_hashed
 from experiments.common.records.record import Record
+from experiments.sweeps.collected import short_names
 
 Values = Mapping[str, Any]
 
@@ -19,12 +20,6 @@ HANDFUL = (
 
 LARGEST_ERROR = 1.0
 """Relative error of a modulus beyond which an estimate is no answer."""
-
-
-def short_names(names: Sequence[str]) -> list[str]:
-    """Names of parameters without a common beginning: ``E_f.anterior`` becomes ``anterior``."""
-    together = len({name.split(".")[0] for name in names}) == 1 and all("." in n for n in names)
-    return [name.split(".", 1)[1] if together else name for name in names]
 
 
 def metrics(record: Record) -> dict[int, dict[str, float]]:
