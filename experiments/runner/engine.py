@@ -19,10 +19,9 @@ from pathlib import Path
 from subprocess import PIPE, TimeoutExpired
 from typing import Any
 
-from experiments.common.records.record import Record, stamp
-from experiments.common.study import Result
+from experiments.common.records.record import Record
 from experiments.runner.cluster import EngineSettings, run_on_dask
-from experiments.runner.jobs import Request, attempt, default_memory_gb
+from experiments.runner.jobs import Request, attempt, default_memory_gb, failed_record
 from experiments.sweeps.collected import head_of
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.processes import Program, ending, environment, python
@@ -205,8 +204,7 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
         record = run_apart(request, worker, asked_ns, at_a_time)
     except (MvestError, OSError) as error:
         # Not even a record of the failure could be written.
-        result = Result(status="failed", reason=str(error))
-        record = stamp(request.values, request.config_hash, result, time.time())
+        record = failed_record(request, str(error))
     finally:
         _busy.remove(worker)
     idle.append(worker)

@@ -264,6 +264,12 @@ def write_failure(request: Request, reason: str, started: float) -> Record:
     return replace_record(request, Result(status="failed", reason=reason), started)
 
 
+def failed_record(request: Request, reason: str) -> Record:
+    """The record, written nowhere, of a job without an estimate."""
+    result = Result(status="failed", reason=reason)
+    return stamp(request.values, request.config_hash, result, time.time())
+
+
 def write_hydra(request: Request) -> None:
     """Write the resolved configuration and the overrides where Hydra's users expect them.
 

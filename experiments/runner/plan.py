@@ -16,9 +16,8 @@ from statistics import fmean
 from typing import Any
 
 from experiments.common.progress import duration
-from experiments.common.records.record import Record, here_and_now, stamp
-from experiments.common.study import Result
-from experiments.runner.jobs import Request, last_record
+from experiments.common.records.record import Record, here_and_now
+from experiments.runner.jobs import Request, failed_record, last_record
 from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import config_hash, git_state, write_json
@@ -265,14 +264,9 @@ class Plan:
 
 
 def _swept(job: Request, record: Record | None) -> SweptJob:
-    values = job.values
-    if record is None:
-        result = Result(status="failed", reason=NOT_RUN)
-        record = stamp(values, job.config_hash, result, time.time())
+    values, record = job.values, record or failed_record(job, NOT_RUN)
+    # One that was computed for another sweep has the factors of that.
+    record = record.model_copy(update={"factors": values["factors"]})
     return SweptJob(
-        hash=job.short_hash,
-        seed=values["seed"],
-        repeats=values["repeats"],
-        # One that was computed for another sweep has the factors of that.
-        record=record.model_copy(update={"factors": values["factors"]}),
+        hash=job.short_hash, seed=values["seed"], repeats=values["repeats"], record=record
     )
