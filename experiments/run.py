@@ -116,7 +116,7 @@ def run_alone(config: DictConfig) -> float:
         if not record.converged:
             detail = f" ({record.detail})" if record.detail else ""
             raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")
-        return metrics(record)[0].get(config.objective, math.nan)
+        return metrics(record).get(config.objective, math.nan)
 
 
 def _require_options(arguments: Sequence[str]) -> None:

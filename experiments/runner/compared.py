@@ -22,16 +22,14 @@ LARGEST_ERROR = 1.0
 """Relative error of a modulus beyond which an estimate is no answer."""
 
 
-def metrics(record: Record) -> dict[int, dict[str, float]]:
-    """Step -> name -> number; step 0 has all but the iterates, with the mean error (%) first.
+def metrics(record: Record) -> dict[str, float]:
+    """Name -> number, the mean error (%) first.
 
     Of a job that repeats over seeds these are means over the estimates that converged, and
     ``spread`` is their standard deviation.
     """
-    runs, short = (
-        record.estimates,
-        dict(zip(record.parameters, short_names(record.parameters), strict=True)),
-    )
+    runs = record.estimates
+    short = dict(zip(record.parameters, short_names(record.parameters), strict=True))
     pairs: list[tuple[str, float | None]] = []
     for run in (run for run in runs if run.converged):
         for one in (one for one in run.unknowns if one.name in short):
@@ -46,20 +44,15 @@ def metrics(record: Record) -> dict[int, dict[str, float]]:
     series: dict[str, list[float]] = {}
     for key, value in pairs:
         series.setdefault(key, []).extend([] if value is None else [value])
-    found = {0: {key: fmean(values) for key, values in series.items() if values}}
+    found = {key: fmean(values) for key, values in series.items() if values}
     for name in short.values():
         if len(values := series.get(f"estimate.{name}", [])) > 1:
-            found[0][f"spread.{name}"] = stdev(values)
+            found[f"spread.{name}"] = stdev(values)
     numbers = {"forward_solves": record.forward_solves, **record.numbers}
     if runs:
         numbers["failed"] = sum(not run.converged for run in runs)
         numbers["seconds"] = sum(run.seconds or 0.0 for run in runs)
-    found[0] |= {k: float(v) for k, v in numbers.items() if isinstance(v, int | float)}
-    for step, iterate in enumerate(runs[0].iterates if runs else ()):
-        for one, value in zip(runs[0].parameters, iterate, strict=False):
-            if value is not None:
-                found.setdefault(step, {})[f"iterate.{short.get(one.name, one.name)}"] = value
-    return found
+    return found | {k: float(v) for k, v in numbers.items() if isinstance(v, int | float)}
 
 
 def implausible(record: Record) -> str:

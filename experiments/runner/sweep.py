@@ -232,7 +232,7 @@ def _returned(job: Request, record: Record, objective: str) -> JobReturn:
     returned = JobReturn(overrides=job.overrides, working_dir=str(job.folder))
     returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
     returned.return_value = (
-        metrics(record)[0].get(objective, math.nan)
+        metrics(record).get(objective, math.nan)
         if record.converged
         else FailedRunError(f"{record.reason} (recorded in {job.folder})")
     )

@@ -17,7 +17,7 @@ import sys
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from statistics import fmean
@@ -57,8 +57,8 @@ FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 MANY = 1000
 """Jobs of a sweep above which only the sweep as a whole is a run."""
 
-Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
-"""Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
+Entry: TypeAlias = tuple[Path, str, Values, dict[str, float], float]
+"""Result file, name, tags (the first is no other run's), metrics, seconds computed."""
 
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
@@ -252,12 +252,12 @@ def _sweep(folder: Path, plan: Values) -> Entry:
     name, tags = f"sweep of {len(plan['jobs'])} jobs", {"sweep_id": plan["sweep_id"]}
     if (folder / SWEEP).is_file():
         result, sweep = folder / SWEEP, read_sweep(folder / SWEEP)
-        means = [one for record in sweep.records if (one := metrics(record)[0].get("error.mean"))]
+        means = [one for record in sweep.records if (one := metrics(record).get("error.mean"))]
         totals = {"error.mean": fmean(means)} | totals if means else totals
         totals["failed"] = sum(not record.converged for record in sweep.records)
         totals["seconds"] = sum(record.seconds_total for record in sweep.records)
         tags["mlflow.source.git.commit"] = sweep.provenance.git.sha
-    return result, name, tags, {0: totals}, totals.get("seconds", 0.0)
+    return result, name, tags, totals, totals.get("seconds", 0.0)
 
 
 def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tuple[str, str]:
@@ -280,8 +280,7 @@ def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tup
         about = {key: value for key, value in about.items() if value is not None}
         with mlflow.start_run(run_name=name, parent_run_id=parent, tags=about) as run:
             mlflow.log_params(texts)
-            for step, values in numbers.items():
-                mlflow.log_metrics(values, step=step)
+            mlflow.log_metrics(numbers, step=0)
             for path in sorted(path for name in FILES for path in result.parent.glob(name)):
                 if path.name != PLAN and not path.name.startswith("."):
                     mlflow.log_artifact(str(path))
