@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from experiments.common.building.closing import Closing, close_valve, draw_closing
 from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
@@ -27,9 +26,12 @@ from experiments.common.building.closure import (
 )
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import (
+    Closing,
     anatomy_digest,
     ask_gate,
+    close_valve,
     closures_of,
+    draw_closing,
     gate_cases,
     gate_rows,
 )
