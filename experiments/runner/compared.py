@@ -72,42 +72,28 @@ def implausible(record: Record) -> str:
     return ""
 
 
-def typed(overrides: Iterable[str]) -> list[str]:
-    """Names of settings that were typed (``NAME=VALUE``), each once."""
-    names = (word.lstrip("+~").partition("=")[0].replace("/", ".") for word in overrides)
-    return list(dict.fromkeys(name for name in names if name != "name"))
-
-
-def columns(config: Values, words: Iterable[str]) -> dict[str, Any]:
-    """The settings of a run that were typed, and the handful: a column for each value.
+def settings_of(config: Values, overrides: Iterable[str]) -> dict[str, Any]:
+    """The settings of a run that were typed, as they were typed, and the handful.
 
     Parameters
     ----------
     config : mapping
-        As it lies beside the result: without a name of a file, which must not reach a store.
-    words : iterable of str
-        Dotted names; of one that has settings below it all are meant.
+        As it lies beside the result: the content of a file instead of its name, which must not
+        reach a store.
+    overrides : iterable of str
+        ``NAME=VALUE``.
     """
-    chosen = tuple(f"{word}." for word in (*words, *HANDFUL))
-    return {
-        name: value
-        for name, value in leaves(config, config["parameters"]).items()
-        if f"{name}.".startswith(chosen) and is_hashed(name, config["study"])
-    }
-
-
-def leaves(value: Any, parameters: Sequence[str], name: str = "") -> dict[str, Any]:
-    """Single values by dotted names; of a list by its parameters, of a matrix the diagonal."""
-    if isinstance(value, list):
-        names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
-        square = all(isinstance(item, list) and len(item) == len(value) for item in value)
-        value = [row[k] for k, row in enumerate(value)] if square else value
-        value = dict(zip(names, value, strict=True))
-    if not isinstance(value, Mapping):
-        return {} if value in (None, "") else {name: value}
+    words = (word.lstrip("+~").partition("=") for word in overrides)
+    typed = {name.replace("/", "."): text for name, _, text in words if name != "name"}
     found: dict[str, Any] = {}
-    for key, item in value.items():
-        found |= leaves(item, parameters, f"{name}.{key}" if name else str(key))
+    for name in (*typed, *HANDFUL):
+        value: Any = config
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if isinstance(value, Mapping | list) and "sha256" not in str(value):
+            value = typed[name]
+        if value not in (None, "") and is_hashed(name, config["study"]):
+            found[name] = value
     return found
 
 
@@ -123,18 +109,11 @@ def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, 
     return [{name: values[k] for name, values in kept.items()} for k in range(len(rows))]
 
 
-def together(rows: Sequence[Values], words: Iterable[str]) -> dict[str, str]:
-    """The values that typed settings have in a sweep, as they are typed: ``[5,3],[4,2]``."""
-    found: dict[str, dict[str, None]] = {}
-    for row in rows:
-        for word in (*words, *HANDFUL):
-            own = [
-                text_of(value) for name, value in row.items() if f"{name}.".startswith(f"{word}.")
-            ]
-            if own:
-                whole = own[0] if word in row else f"[{','.join(own)}]"
-                found.setdefault(word, {})[whole] = None
-    return {word: ",".join(texts) for word, texts in found.items()}
+def together(rows: Sequence[Values]) -> dict[str, str]:
+    """The values that settings have in a sweep: ``[5,3],[4,2]``."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    each = {name: [text_of(row[name]) for row in rows if name in row] for name in names}
+    return {name: ",".join(dict.fromkeys(texts)) for name, texts in each.items()}
 
 
 def text_of(value: Any) -> str:

@@ -31,13 +31,11 @@ from tqdm import tqdm
 from experiments.common.records.record import read_record
 from experiments.runner.compared import (
     Values,
-    columns,
     implausible,
-    leaves,
     metrics,
+    settings_of,
     text_of,
     together,
-    typed,
     varied,
 )
 from experiments.runner.jobs import CONFIG, RESULT, is_done
@@ -200,7 +198,6 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
     plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
     each = len(plan["jobs"]) <= MANY
-    words = typed(word for job in plan["jobs"] for word in job["overrides"])
     entries, rows, factors = [], [], []
     for job in plan["jobs"]:
         place = folder / job["folder"]
@@ -208,15 +205,15 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
             if (place / RESULT).is_file():
                 own = read_mapping(place / CONFIG)
                 entries.append(_job(place, job.get("name")) if each else None)
-                rows.append(columns(own, words))
-                factors.append(leaves(job["factors"], own["parameters"]))
+                rows.append(settings_of(own, job["overrides"]))
+                factors.append(job["factors"])
         except MvestError as error:
             counts["left"] += _left_out(place, error)
     with opened(tracking["uri"], outputs, name):
         known = runs_of(name, "" if is_sweep else f"tags.folder = '{folder.resolve().name}'")
         parent, shown = None, zip(entries, varied(rows, factors), strict=True)
         if is_sweep:
-            parent, done = _put(_sweep(folder, plan), together(rows, words), known, None)
+            parent, done = _put(_sweep(folder, plan), together(rows), known, None)
             counts[done] += 1
         for entry, row in tqdm(list(shown), "to MLflow", disable=None, leave=False):
             if entry is not None:
