@@ -95,10 +95,6 @@ class Results:
         return joined(parts) if len(self.records) > 1 else next(iter(parts.values()))
 
 
-def _nothing(*_: Any) -> None:
-    """Nothing more is done."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study(Generic[S]):
     """How a kind of study is run and shown.
@@ -150,7 +146,7 @@ class Study(Generic[S]):
     keep_arrays: Callable[[Record, Path], Mapping[str, Any]] = lambda record, path: {}
     keeps_failures: bool = False
     checks: Callable[[], tuple[Check, ...]] = tuple
-    require: Callable[[Mapping[str, Any]], None] = _nothing
+    require: Callable[[Mapping[str, Any]], None] = lambda values: None
 
 
 def study_names() -> tuple[str, ...]:

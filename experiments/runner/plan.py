@@ -118,12 +118,12 @@ class Plan:
             | {
                 "hash": job.short_hash,
                 "folder": os.path.relpath(job.folder, self.folder),
-                "name": name,
+                "name": job.label if job.values["factors"] else job.values["row"],
                 "factors": job.values["factors"],
                 "values": {k: v for k, v in job.values.items() if v is not self.common.get(k, job)},
                 "without": [key for key in self.common if key not in job.values],
             }
-            for job, name in zip(self.jobs, self.names(), strict=True)
+            for job in self.jobs
         ]
         sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
         try:
@@ -197,13 +197,6 @@ class Plan:
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             why = one_line(error, 160)
             raise InputError(f"{place} is no plan of this version: {why}") from error
-
-    def names(self) -> list[str]:
-        """What sets each job apart, in a few words: the factors in which jobs differ."""
-        factors = [[f"{k}={v}" for k, v in job.values["factors"].items()] for job in self.jobs]
-        shared = set(factors[0]).intersection(*factors) if len(factors) > 1 else set()
-        found = [", ".join(text for text in texts if text not in shared) for texts in factors]
-        return [name or str(job.values["row"]) for name, job in zip(found, self.jobs, strict=True)]
 
     def summary(self) -> str:
         """How much is done, how much is left and how long it will take, in one line."""

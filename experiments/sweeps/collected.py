@@ -14,7 +14,7 @@ from pydantic import Field
 
 from experiments.common.records.record import Provenance, Record
 from mvest.files import write_atomically
-from mvest.problem.record import EstimateRecord, Frozen, Unknown
+from mvest.problem.record import EstimateRecord, Frozen
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping, validated
 
@@ -110,20 +110,7 @@ def head_of(record: Record) -> Record:
         )
         for one in record.estimates
     )
-    head = record.model_copy(update={"tables": {}, "estimates": estimates})
-    _forget_given(head)
-    return head
-
-
-def _forget_given(part: Any) -> None:
-    """Forget which fields of a record were given: a third of the memory of ten thousand heads."""
-    if isinstance(part, Frozen | EstimateRecord | Unknown):
-        object.__setattr__(part, "__pydantic_fields_set__", set())
-        for value in vars(part).values():
-            _forget_given(value)
-    elif isinstance(part, tuple):
-        for value in part:
-            _forget_given(value)
+    return record.model_copy(update={"tables": {}, "estimates": estimates})
 
 
 def write_sweep_file(path: Path, sweep: Sweep) -> None:
