@@ -119,9 +119,9 @@ def _dashboard(rest: list[str]) -> int:
     parsed = _parsed("dashboard", rest, outputs=outputs, **{"--port": port})
     validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], parsed.port, "--port")
     try:
-        place, page, said = last_sweep(parsed.outputs)
+        place, page, title = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):
-            print(f"{said}: {address}{page}", flush=True)
+            print(f"{title}: {address}{page}", flush=True)
             webbrowser.open(address + page)
             return server.wait()
     except KeyboardInterrupt:

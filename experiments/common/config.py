@@ -311,8 +311,10 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
 @cache
 def _kinds(study: str | None) -> dict[str, Any]:
     """Setting of a study at the top -> its type."""
-    own = hints_of(load_study(study).settings) if study in study_names() else {}
-    return {**hints_of(Config), **own}
+    if study not in study_names():
+        return hints_of(Config)
+    settings: type = load_study(study).settings
+    return {**hints_of(Config), **hints_of(settings)}
 
 
 def _package_model() -> str | None:
@@ -330,7 +332,8 @@ class Studies(dict[str, Any]):
 
     def __getitem__(self, file: str) -> ConfigNode:
         name = file.removesuffix(".yaml")
-        config = OmegaConf.structured(schema(Config, load_study(name).settings))
+        settings: type = load_study(name).settings
+        config = OmegaConf.structured(schema(Config, settings))
         config.study = name
         return ConfigNode(file, config, GROUP, "_global_", "mvest")
 

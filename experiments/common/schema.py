@@ -179,16 +179,16 @@ def validated(kind: Any, value: Any, key: str = "") -> Any:
         given = first["input"]
         match first["type"]:
             case _ if own is not None:
-                said = str(own)
+                fault = str(own)
             case "missing" if isinstance(last, str):
-                said = " has no value"
+                fault = " has no value"
             case _ if given == MISSING:
-                said = " has no value"
+                fault = " has no value"
             case "literal_error":
-                said = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
+                fault = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
             case _:
-                said = f" = {given!r}: {first['msg']}"
-        raise ConfigurationError(f"{name}{said}") from error
+                fault = f" = {given!r}: {first['msg']}"
+        raise ConfigurationError(f"{name}{fault}") from error
 
 
 def build(cls: type[T], values: Mapping[str, Any]) -> T:
@@ -220,8 +220,8 @@ def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequenc
         merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(words)))
     except OmegaConfBaseException as error:
         known = ", ".join([*others, *map(str, defaults)])
-        said = str(error).partition("\n")[0]
-        raise ConfigurationError(f"{command}: {said}; known are {known}") from error
+        fault = str(error).partition("\n")[0]
+        raise ConfigurationError(f"{command}: {fault}; known are {known}") from error
     return build(cls, typing.cast("dict[str, Any]", OmegaConf.to_container(merged)))
 
 
@@ -264,7 +264,7 @@ def _require_plain(value: Any, key: str) -> None:
 def schema(*classes: type) -> type:
     """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
 
-    Tuples become lists, nested dataclasses schemas of their own; defaults are kept.
+    Tuples become lists, nested dataclasses schemas of their own; defaults stay.
     """
     fields: dict[str, Any] = {}
     for cls in classes:

@@ -91,8 +91,8 @@ def estimate_table(folder: Path) -> DataFrame:
         place = path.relative_to(folder).as_posix()
         try:
             if path in tables:
-                kept = records_of(folder, path.stem)
-                for name, record in kept.records.items() if kept else ():
+                found = records_of(folder, path.stem)
+                for name, record in found.records.items() if found else ():
                     rows += _rows(record, f"{place}#{name}")
             elif path in sweeps:
                 rows += _of_sweep(read_sweep(path), place)

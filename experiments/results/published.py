@@ -65,22 +65,8 @@ def as_configured(config: DictConfig) -> bool:
     return sized and as_published(task, None, config.study)
 
 
-def publish_run(values: Mapping[str, Any], record: Record, folder: Path, name: str | None) -> None:
-    """Let the results take over a run, by a name; None: it has overrides, which is said.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
-    """
-    results = Path(values["paths"]["results"])
-    if name is None and values["publish"] and not values["sweep"]:
-        print(f"{results} left as it is: this run has overrides")
-    publish_runs([(name, record, folder, results)])
-
-
 def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -> None:
-    """Let the results take over the runs of a sweep that have records of their own there.
+    """Let the results take over runs that have records of their own there.
 
     Parameters
     ----------
@@ -152,11 +138,11 @@ def publish(
             records = {} if known is None else dict(known.records)
             for name, (record, folder) in runs.items():
                 own = arrays_of(folder, name)
-                kept = study.keep_arrays(record, own[name]) if own else {}
-                if kept:
+                stored = study.keep_arrays(record, own[name]) if own else {}
+                if stored:
                     (place / table).mkdir(exist_ok=True)
                     path = _arrays(results, table, name)
-                    write_atomically(path, partial(np.savez_compressed, **kept))
+                    write_atomically(path, partial(np.savez_compressed, **stored))
                 records[name] = study.keep(record)
                 arrays |= own
             write_records(results, table, records)
@@ -195,7 +181,7 @@ def regenerate(results: Path) -> list[Path]:
 
 
 def records_of(results: Path, table: str) -> Results | None:
-    """The kept records of a table, the one of its name first; None if there is none.
+    """The published records of a table, the one of its name first; None if there is none.
 
     Raises
     ------

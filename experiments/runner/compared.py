@@ -1,4 +1,4 @@
-"""What runs are compared by: the numbers of a record, and the settings that tell jobs apart."""
+"""What runs are compared by: the numbers of a record, and the settings that differ."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def metrics(record: Record) -> dict[str, float]:
 
 
 def implausible(record: Record) -> str:
-    """Why a run is not to be compared with others; empty if it is.
+    """Why a run is left out of comparisons; empty if it is not.
 
     It failed, its verdict is that there is no estimate, or a modulus is wrong by more than its
     truth, where that is known.
@@ -99,14 +99,14 @@ def settings_of(config: Values, overrides: Iterable[str]) -> dict[str, Any]:
 
 def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, Any]]:
     """Of the columns of jobs those that differ, and the handful; factors that no column repeats."""
-    kept: dict[str, list[Any]] = {}
+    shown: dict[str, list[Any]] = {}
     for source in (rows, factors):
         for name in dict.fromkeys(name for row in source for name in row):
             values = [row.get(name) for row in source]
-            shown = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
-            if shown and (source is rows or values not in kept.values()):
-                kept[name] = values
-    return [{name: values[k] for name, values in kept.items()} for k in range(len(rows))]
+            differs = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
+            if differs and (source is rows or values not in shown.values()):
+                shown[name] = values
+    return [{name: values[k] for name, values in shown.items()} for k in range(len(rows))]
 
 
 def together(rows: Sequence[Values]) -> dict[str, str]:

@@ -128,22 +128,22 @@ own_worker = cache(WorkerProcess)
 def run_apart(
     request: Request,
     worker: WorkerProcess | None = None,
-    asked_ns: int | None = None,
+    requested_ns: int | None = None,
     at_a_time: int = 1,
     *,
     aloud: bool = False,
 ) -> Record:
-    """Run a job in a worker as `attempt` does; by default in the one kept by this process.
+    """Run a job in a worker as `attempt` does; by default in the one of this process.
 
     ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
     Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
     """
     run = partial((worker or own_worker()).run, request, at_a_time, aloud=aloud)
-    return attempt(request, run, asked_ns)
+    return attempt(request, run, requested_ns)
 
 
 def run_jobs(
-    requests: Sequence[Request], settings: EngineSettings, at_a_time: int, asked_ns: int | None
+    requests: Sequence[Request], settings: EngineSettings, at_a_time: int, requested_ns: int | None
 ) -> Generator[tuple[int, Record]]:
     """Run jobs; yields the position of each and the head of its record, as they end.
 
@@ -156,7 +156,7 @@ def run_jobs(
     settings : EngineSettings
     at_a_time : int
         Jobs that run on one machine beside each other and share its memory.
-    asked_ns : int or None
+    requested_ns : int or None
         As in `run_apart`.
 
     Raises
@@ -167,11 +167,12 @@ def run_jobs(
         If dask's scheduler is lost.
     """
     if settings.elsewhere:
-        yield from run_on_dask(execute, stop_jobs, requests, settings, asked_ns)
+        yield from run_on_dask(execute, stop_jobs, requests, settings, requested_ns)
         return
     pool = ThreadPoolExecutor(min(at_a_time, len(requests)))
     futures = {
-        pool.submit(execute, request, asked_ns, at_a_time): k for k, request in enumerate(requests)
+        pool.submit(execute, request, requested_ns, at_a_time): k
+        for k, request in enumerate(requests)
     }
     try:
         for future in as_completed(futures):
@@ -189,7 +190,7 @@ _idle: dict[str, list[WorkerProcess]] = {}
 _busy: set[WorkerProcess] = set()
 
 
-def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -> Record:
+def execute(request: Request, requested_ns: int | None = None, at_a_time: int = 1) -> Record:
     """Run a job, unless it is done, in a process that this one keeps for its jobs.
 
     Whatever becomes of the job is in the head of a record that is returned.
@@ -201,7 +202,7 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
         worker = WorkerProcess()
     _busy.add(worker)
     try:
-        record = run_apart(request, worker, asked_ns, at_a_time)
+        record = run_apart(request, worker, requested_ns, at_a_time)
     except (MvestError, OSError) as error:
         # Not even a record of the failure could be written.
         record = failed_record(request, str(error))

@@ -117,7 +117,7 @@ def launch(
     ended = _run(plan, batch, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
     returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
-    # Ten thousand records are not kept while they are logged.
+    # Frees ten thousand records before they are logged.
     folder, common = plan.folder, plan.common
     del ended, found, plan, batch
     log_sweep(folder, common)
@@ -228,7 +228,7 @@ def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
 
 
 def _returned(job: Request, record: Record, objective: str) -> JobReturn:
-    """What Hydra is told of a job."""
+    """The result of a job for Hydra."""
     returned = JobReturn(overrides=job.overrides, working_dir=str(job.folder))
     returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
     returned.return_value = (

@@ -138,9 +138,9 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
                     database.execute("select * from alembic_version, experiments").fetchone()
             mlflow.set_tracking_uri(place)
             if mlflow.get_experiment_by_name(experiment) is None:
-                kept = None if place.startswith("http") else (outputs / ARTIFACTS).as_uri()
+                copies = None if place.startswith("http") else (outputs / ARTIFACTS).as_uri()
                 kind = {"mlflow.experimentKind": "custom_model_development"}
-                mlflow.create_experiment(experiment, kept, kind)
+                mlflow.create_experiment(experiment, copies, kind)
             mlflow.set_experiment(experiment)
         yield place
     except MvestError:
@@ -356,10 +356,10 @@ def serving(
     command += ["--allowed-hosts", ",".join(hosts := allowed_hosts(port))]
     command += ["--cors-allowed-origins", ",".join("http://" + host for host in hosts)]
     # Whatever the login shell has set: nobody else is let in.
-    kept = {k: v for k, v in environment().items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
+    own = {k: v for k, v in environment().items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
     streams = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL if quiet else None)
     # uvicorn looks for modules in the folder that it is started in.
-    with Program(command, stdin=subprocess.DEVNULL, env=kept, cwd="/", **streams) as server:
+    with Program(command, stdin=subprocess.DEVNULL, env=own, cwd="/", **streams) as server:
         until = time.monotonic() + 120.0  # s
         while server.process.poll() is None and time.monotonic() < until:
             with suppress(OSError):

@@ -120,7 +120,7 @@ def gate_of(values: Mapping[str, Any], records: Path = GATE_RECORDS) -> str:
     values : mapping
         The resolved configuration.
     records : Path
-        The gate's kept records, one a line.
+        Published records of the gate, one a line.
     """
     return _verdicts(records).get(anatomy_digest(values), NOT_GATED)
 

@@ -84,7 +84,7 @@ def estimate_blindly(
     sealed : Path
         Folder that the process cannot open.
     gate : str
-        What the gate said of the anatomy.
+        Verdict of the gate on the anatomy.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def estimate_blindly(
 def estimated_or_reason(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
 ) -> Result | str:
-    """What the estimation left, or why it left nothing; as `estimate_blindly` is asked."""
+    """As `estimate_blindly`; the reason where there is no result."""
     try:
         return estimate_blindly(values, folder, case, sealed)
     except InputError as fault:

@@ -151,11 +151,11 @@ def run_case(
     images: Mapping[str, tuple[Row, ...]] | None = None,
     gate: str = NOT_GATED,
 ) -> Result:
-    """Personalise a case; ``gate`` is what the gate said of its anatomy."""
+    """Personalise a case; ``gate`` is the verdict of the gate on its anatomy."""
     for sentence in () if images else case.derived:
         print(f"derived: {sentence}", file=sys.stderr)
-    for doubt in doubts(case):
-        print(f"doubtful: {doubt}", file=sys.stderr)
+    for value in doubts(case):
+        print(f"implausible: {value}", file=sys.stderr)
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
@@ -297,9 +297,9 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
             expected = expect_case(case, settings, coarse)
     page = check_page(folder, case.name, lines, expected, drawn[-1])
     tables = expected_tables(expected) if expected.unknowns else {}
-    told = [f"{name}\n{one.text()}" for name, one in tables.items()]
+    texts = [f"{name}\n{one.text()}" for name, one in tables.items()]
     lacking = [f"what an estimate could tell is not known: {expected.reason}"]
-    return "\n".join([case.name, *lines, *(told or lacking), f"drawn and written: {page}"])
+    return "\n".join([case.name, *lines, *(texts or lacking), f"drawn and written: {page}"])
 
 
 def _described(case: ValveCase) -> list[str]:

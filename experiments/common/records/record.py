@@ -35,7 +35,7 @@ HASH_DIGITS = 12
 """Digits of a hash that a line of text shows."""
 
 NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
-"""What the gate has said of an anatomy begins with one of these."""
+"""The verdict of the gate on an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
 Number: TypeAlias = float | int | str | bool | None
@@ -138,7 +138,7 @@ class Result(Frozen):
     Attributes
     ----------
     tables : mapping of str to Table
-        Tidy tables by name, kept as plain data (`table_of`); the one called ``""`` is the study's
+        Tidy tables by name, stored as plain data (`table_of`); the one called ``""`` is the study's
         main table.
     numbers : mapping
         Single values by name, with the unit at the end of the name; MLflow gets those that are
@@ -158,8 +158,8 @@ class Result(Frozen):
     model : Model or None
         Likewise.
     gate : str or None
-        What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
-        study uses none of the configured anatomies.
+        Verdict of the gate on the anatomy (see `experiments.common.building.gate`); None where the
+        study uses no configured anatomy.
     """
 
     tables: Annotated[Mapping[str, Any], BeforeValidator(_plain)] = {}
