@@ -14,7 +14,7 @@ import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from subprocess import PIPE, TimeoutExpired
 from typing import Any
@@ -121,27 +121,6 @@ class WorkerProcess:
             program.end()
 
 
-own_worker = cache(WorkerProcess)
-"""The one that this process keeps for a run by itself."""
-
-
-def run_apart(
-    request: Request,
-    worker: WorkerProcess | None = None,
-    requested_ns: int | None = None,
-    at_a_time: int = 1,
-    *,
-    aloud: bool = False,
-) -> Record:
-    """Run a job in a worker as `attempt` does; by default in the one of this process.
-
-    ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
-    Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
-    """
-    run = partial((worker or own_worker()).run, request, at_a_time, aloud=aloud)
-    return attempt(request, run, requested_ns)
-
-
 def run_jobs(
     requests: Sequence[Request], settings: EngineSettings, at_a_time: int, requested_ns: int | None
 ) -> Generator[tuple[int, Record]]:
@@ -190,10 +169,13 @@ _idle: dict[str, list[WorkerProcess]] = {}
 _busy: set[WorkerProcess] = set()
 
 
-def execute(request: Request, requested_ns: int | None = None, at_a_time: int = 1) -> Record:
-    """Run a job, unless it is done, in a process that this one keeps for its jobs.
+def run_apart(
+    request: Request, requested_ns: int | None = None, at_a_time: int = 1, *, aloud: bool = False
+) -> Record:
+    """Run a job as `attempt` does, in a process that this one starts once for its jobs.
 
-    Whatever becomes of the job is in the head of a record that is returned.
+    ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
+    Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
     """
     idle = _idle.setdefault(str(Path.cwd()), [])
     try:
@@ -202,13 +184,20 @@ def execute(request: Request, requested_ns: int | None = None, at_a_time: int = 
         worker = WorkerProcess()
     _busy.add(worker)
     try:
-        record = run_apart(request, worker, requested_ns, at_a_time)
+        run = partial(worker.run, request, at_a_time, aloud=aloud)
+        return attempt(request, run, requested_ns)
+    finally:
+        _busy.remove(worker)
+        idle.append(worker)
+
+
+def execute(request: Request, requested_ns: int | None = None, at_a_time: int = 1) -> Record:
+    """Run a job as `run_apart` does; returns the head of its record, whatever becomes of it."""
+    try:
+        record = run_apart(request, requested_ns, at_a_time)
     except (MvestError, OSError) as error:
         # Not even a record of the failure could be written.
         record = failed_record(request, str(error))
-    finally:
-        _busy.remove(worker)
-    idle.append(worker)
     return head_of(record)
 
 

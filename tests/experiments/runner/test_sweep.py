@@ -34,15 +34,12 @@ def run(run, monkeypatch):
     monkeypatch.setattr(engine, "WORKER", (sys.executable, str(fake)))
     for name in engine.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
-    engine.own_worker.cache_clear()
 
     def call(*arguments):
         options = [one for one in arguments if one.startswith("-")]
         return run(*options, *QUICK, *(one for one in arguments if one not in options))
 
     yield call
-    engine.own_worker().close()
-    engine.own_worker.cache_clear()
     for worker in engine._idle.pop(str(Path.cwd()), ()):
         worker.close()
 
