@@ -22,11 +22,9 @@ SWEEPS = "sweeps"
 """Folder of the published sweeps within the results."""
 
 NOT_KEPT: dict[str, Any] = {
-    "detail": "", "correlation": (), "frames": (), "condition_number": None, "flat": (),
-    "confounded": (), "objective": (), "details": {}, "distance_to_truth_mm": None,
-    "iterates": (), "iterate_std": (),
+    "detail": "", "frames": (), "condition_number": None, "distance_to_truth_mm": None,
 }  # fmt: skip
-"""Parts of an estimate left out of a sweep; the job's own record has them."""
+"""Parts of an estimate left out of a sweep, besides details; the job's own record has them."""
 
 
 class SweptJob(Frozen):
@@ -105,7 +103,7 @@ class Sweep(Frozen):
 def head_of(record: Record) -> Record:
     """What a sweep keeps of a job's record: no tables, and of estimates what sweeps show."""
     estimates = tuple(
-        one.model_copy(
+        one.without_details().model_copy(
             update={**NOT_KEPT, "unknowns": tuple(u for u in one.unknowns if u.kind != "derived")}
         )
         for one in record.estimates
