@@ -14,7 +14,8 @@ from pydantic import Field
 
 from experiments.common.records.record import Provenance, Record
 from mvest.files import write_atomically
-from mvest.problem.record import EstimateRecord, Frozen
+from mvest.problem.record import EstimateRecord, Frozen, Unknown
+from mvest.problem.registration import unit_of
 from mvest.provenance import require_sealed, sealed
 from mvest.reading.documents import read_mapping, validated
 
@@ -48,13 +49,14 @@ class SweptJob(Frozen):
     @property
     def runs(self) -> tuple[EstimateRecord, ...]:
         """A run for each planned seed; one that left no estimate failed for the job's reason."""
-        known = {one.seed for one in self.record.estimates}
+        record, known = self.record, {one.seed for one in self.record.estimates}
+        unknowns = tuple(Unknown(name=name, unit=unit_of(name)) for name in record.parameters)
         lost = [
-            EstimateRecord(seed=seed, status="failed", reason=self.record.reason)
+            EstimateRecord(seed=seed, status="failed", reason=record.reason, unknowns=unknowns)
             for seed in range(self.seed, self.seed + self.repeats)
             if seed not in known
         ]
-        return (*self.record.estimates, *lost)
+        return (*record.estimates, *lost)
 
 
 class Sweep(Frozen):

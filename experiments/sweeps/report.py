@@ -56,6 +56,13 @@ COLUMNS = {
 }  # fmt: skip
 """Columns of the tidy table after the factors, and their units."""
 
+RENAMED = {
+    "truth": "true value", "prior_mean": "start", "bound": BOUND, "relative_error": ERROR,
+    "distance_mean": "distance mean", "distance_std": "distance SD",
+    "distance_max": "distance max", "forward_solves": "forward solves",
+}  # fmt: skip
+"""Columns that have another name in the rows of a record (`EstimateRecord.rows`)."""
+
 STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
     "estimate": (
         Column(UNIT, std="SD over runs", label="mean estimate ± SD over runs"),
@@ -123,13 +130,9 @@ def runs_of(sweep: Sweep) -> Table:
     rows = []
     for job in sweep.jobs:
         varied = {column: job.record.factors.get(name) for name, (column, _) in factors.items()}
-        for run in job.runs:
-            found = {row.get("parameter"): row for row in run.rows()}
-            whole = next(iter(found.values()))
-            rows += [
-                {"job": job.hash, **_cells(found.get(name, whole), name), **varied}
-                for name in sweep.parameters
-            ]
+        rows += [
+            {"job": job.hash, **_cells(row), **varied} for run in job.runs for row in run.rows()
+        ]
     return _table(sweep, rows, {name: Column(unit) for name, unit in units.items()})
 
 
@@ -142,27 +145,15 @@ def _table(sweep: Sweep, rows: list[dict[str, Any]], about: dict[str, Column]) -
     return table([{name: row.get(name) for name in about} for row in rows], **about)
 
 
-def _cells(row: Mapping[str, Any], name: str) -> dict[str, Any]:
+def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
     """Columns of a parameter from its row of a record."""
-    low, high, error = row.get("low"), row.get("high"), row.get("relative_error")
-    estimate, std = row.get("estimate"), row.get("std")
-    if low is None and estimate is not None and std is not None:
-        low, high = estimate - Z95 * std, estimate + Z95 * std
-    return {
-        **row,
-        "parameter": name,
-        "start": row.get("prior_mean"),
-        "true value": row.get("truth"),
-        "low": low,
-        "high": high,
-        BOUND: row.get("bound"),
-        ERROR: None if error is None else 100.0 * error,
-        "distance mean": row.get("distance_mean"),
-        "distance SD": row.get("distance_std"),
-        "distance max": row.get("distance_max"),
-        "forward solves": row["forward_solves"],
-        "reason": "" if row["status"] == CONVERGED else row["reason"],
-    }
+    cells = {RENAMED.get(name, name): value for name, value in row.items()}
+    estimate, std, error = (cells.get(name) for name in ("estimate", "std", ERROR))
+    if cells.get("low") is None and estimate is not None and std is not None:
+        cells |= {"low": estimate - Z95 * std, "high": estimate + Z95 * std}
+    cells[ERROR] = None if error is None else 100.0 * error
+    cells["reason"] = "" if row["status"] == CONVERGED else row["reason"]
+    return cells
 
 
 def shortened(whole: Table) -> Table:
