@@ -275,11 +275,14 @@ def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None
 
 def text_of(sweep: Sweep) -> str:
     """The table of a sweep for a terminal: what was estimated in each setting, and how well."""
+    # Imports for a second.
+    from pandas import DataFrame
+
     table = by_setting(sweep)
     if len(table) > LONGEST:
         return f"{len(table)} settings and parameters: too many for a terminal"
     shown = {name: table.values[name] for name in (*SHOWN, "SD over runs")}
-    return replace(table, values=shown).text()
+    return str(DataFrame(replace(table, values=shown).readable()).to_string(index=False))
 
 
 def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
