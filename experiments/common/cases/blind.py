@@ -157,12 +157,11 @@ def main() -> int:
         seal(place)
     values = request["values"]
     try:
+        personal = build(PersonalSettings, values["personal"])
         if values.get("volume") is None:
             case = read_configured(values["case"])
-            personal = build(PersonalSettings, values["personal"])
             result = run_case(values, personal, case, gate=request["gate"])
         else:
-            personal = build(PersonalSettings, values["personal"])
             imaged = build(ImagedInput, values["imaged"])
             result = run_volume(values, values["volume"], imaged, personal, folder)
         write_estimate(folder, result)

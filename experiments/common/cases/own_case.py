@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,7 +30,9 @@ from mvest.cases.from_images.detected import (
 )
 from mvest.cases.from_images.settings import ImagedSettings
 from mvest.cases.plausibility import doubts
+from mvest.cases.schema import files_of_case
 from mvest.errors import ConfigurationError
+from mvest.exchange.volumes import files_of_volume
 from mvest.imaging.detection.detect import NoValveError
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
@@ -58,23 +60,15 @@ TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
 
 
-def _case(value: str, _beside: Mapping[str, Any]) -> Any:
-    # Where no case is read this is not either.
-    from mvest.cases.schema import files_of_case
-
-    return contents(files_of_case(Path(value))) or value
+def _content_of(files_of: Callable[[Path], Any]) -> Reads:
+    """Marks a setting that names what ``files_of`` finds the files of."""
+    return Reads(lambda value, _: contents(files_of(Path(value))) or value)
 
 
-def _volume(value: str, _beside: Mapping[str, Any]) -> Any:
-    from mvest.exchange.volumes import files_of_volume
-
-    return contents(files_of_volume(Path(value))) or value
-
-
-CaseInput = Annotated[str | None, Reads(_case)]
+CaseInput = Annotated[str | None, _content_of(files_of_case)]
 """Type of a setting that names the folder of a case."""
 
-VolumeInput = Annotated[str | None, Reads(_volume)]
+VolumeInput = Annotated[str | None, _content_of(files_of_volume)]
 """Type of a setting that names the file of a volume over time."""
 
 
