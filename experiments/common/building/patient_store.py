@@ -70,9 +70,11 @@ def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlac
     }
     store = Store(values["paths"]["outputs"])
     entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
-    return entry.get_or_make(
-        lambda: _simulate(values, patient), lambda root, made: _write(root, *made, described)
-    )
+
+    def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
+        _write(root, *made, described)
+
+    return entry.get_or_make(lambda: _simulate(values, patient), write)
 
 
 def _place(root: Path) -> PatientPlace:
