@@ -1,20 +1,20 @@
-"""The console command ``mvest``: short words for what people do most.
+"""The console command ``mvest``.
 
-Every word is the one application (``experiments.run``), or a page of it, with the overrides that it
-takes. Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is wrong (one
-line says how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
+Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is wrong (one line says
+how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
 """
 
 from __future__ import annotations
 
 import difflib
+import pkgutil
 import re
 import resource
 import shutil
 import sys
 import textwrap
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,27 +23,11 @@ from experiments.console import Parser, interruptible
 from mvest import __version__
 from mvest.errors import ConfigurationError, InputError
 
-COMMANDS = {
-    "list": "the experiments, one sentence each",
-    "run": "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",
-    "own-valve": "moduli of a valve from a case folder",
-    "volume": "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
-    "simulate": "a simulated echo volume and the truth in it: simulate volume OUT.seq.nrrd",
-    "import": "a case folder from what another program wrote: import NAME SOURCE CASE",
-    "export": "a case or a result for another program: export NAME SOURCE TARGET",
-    "tables": "every table and figure of results/ anew, from the records that are kept there",
-    "table": "all estimates of a folder as one table for statistics: table outputs estimates.csv",
-    "worker": "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
-    "collect": "what became of the jobs of a sweep that others ran",
-    "sync": "what is on disk and not in MLflow is logged there: sync outputs",
-    "dashboard": "MLflow's pages, on the comparison of the last sweep",
-}
-
 NUMBA_SETTINGS = Path(".numba_config.yaml")
-"""Whoever writes this file has numba run the compiled code in a folder that it names."""
+"""A file that would make numba load compiled code from a folder of its choice."""
 
 LEAST_GB = 1.2
-"""Address space without which libraries cannot be loaded; they end in many ways where it lacks."""
+"""Address space that loading the libraries takes; with less they fail in many ways."""
 
 CHECK = "only read, check and draw it, in seconds, and say what an estimate would be able to tell"
 OVERRIDES = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
@@ -56,73 +40,58 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command, rest = (given[0], given[1:]) if given else ("--help", [])
     if NUMBA_SETTINGS.exists():
         raise InputError(f"{NUMBA_SETTINGS}: numba would obey this file; start from another folder")
-    match command:
-        case "-h" | "--help":
-            print(_help())
-        case "--version":
-            print(f"mvest {__version__}")
-        case "list":
-            _parsed("list", rest)
-            width = shutil.get_terminal_size().columns
-            print(listing(experiments_in(EXPERIMENTS), width))
-        case "run":
-            return _application(rest)
-        case "own-valve":
-            return _application(_one_file("own-valve", "FOLDER", "own_valve", "case", rest))
-        case "volume":
-            return _application(_one_file("volume", "FILE", "volume", "volume", rest))
-        case "simulate":
-            from experiments.simulated_volume import simulate_command
-
-            return simulate_command(rest)
-        case "import":
-            from experiments.doors import import_command
-
-            return import_command(rest)
-        case "export":
-            from experiments.doors import export_command
-
-            return export_command(rest)
-        case "tables":
-            from experiments.tables import write_everything
-
-            results = _parsed("tables", rest, folder={"nargs": "?", "default": "results"}).folder
-            print(*write_everything(results), sep="\n")
-        case "table":
-            from experiments.results.estimates import write_estimates
-
-            file = {"metavar": "FILE", "help": "NAME.csv or NAME.parquet"}
-            parsed = _parsed("table", rest, folder={"help": "of runs, or results/"}, target=file)
-            print(*write_estimates(parsed.folder, parsed.target), sep="\n")
-        case "worker":
-            return _worker(rest)
-        case "collect":
-            from experiments.runner.sweep import collect_sweep
-
-            return collect_sweep(_parsed("collect", rest, folder={}).folder)
-        case "sync":
-            return _sync(rest)
-        case "dashboard":
-            return _dashboard(rest)
-        case _:
-            close = difflib.get_close_matches(command, COMMANDS, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
-            raise ConfigurationError(f"{command}: no such command; {hint}")
-    return 0
+    if command in ("-h", "--help", "--version"):
+        print(f"mvest {__version__}" if command == "--version" else _help())
+        return 0
+    if command not in COMMANDS:
+        close = difflib.get_close_matches(command, COMMANDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
+        raise ConfigurationError(f"{command}: no such command; {hint}")
+    _, run = COMMANDS[command]
+    return int(pkgutil.resolve_name(run)(rest)) if isinstance(run, str) else run(rest)
 
 
 def _help() -> str:
     about = "Leaflet stiffness of a mitral valve, from how the valve is seen to close."
-    lines = [f"  mvest {name:<10} {text}" for name, text in COMMANDS.items()]
+    lines = [f"  mvest {name:<10} {text}" for name, (text, _) in COMMANDS.items()]
     return "\n".join([about, "", *lines, "", "mvest COMMAND --help says more of each."])
 
 
 def _parsed(command: str, rest: list[str], **arguments: dict[str, Any]) -> Namespace:
-    """The words of a command: those arguments, which are folders unless they say otherwise."""
-    parser = Parser(f"mvest {command}", description=COMMANDS[command])
+    """The arguments of a command, which are folders unless they say otherwise."""
+    parser = Parser(f"mvest {command}", description=COMMANDS[command][0])
     for name, how in arguments.items():
         parser.add_argument(name, **{"type": Path, "metavar": "FOLDER", **how})
     return parser.parse_args(rest)
+
+
+def _list(rest: list[str]) -> int:
+    _parsed("list", rest)
+    print(listing(experiments_in(EXPERIMENTS), shutil.get_terminal_size().columns))
+    return 0
+
+
+def _tables(rest: list[str]) -> int:
+    from experiments.results.published import regenerate
+
+    results = _parsed("tables", rest, folder={"nargs": "?", "default": "results"}).folder
+    print(*regenerate(results), sep="\n")
+    return 0
+
+
+def _table(rest: list[str]) -> int:
+    from experiments.results.estimates import write_estimates
+
+    file = {"metavar": "FILE", "help": "NAME.csv or NAME.parquet"}
+    parsed = _parsed("table", rest, folder={"help": "of runs, or results/"}, target=file)
+    print(*write_estimates(parsed.folder, parsed.target), sep="\n")
+    return 0
+
+
+def _collect(rest: list[str]) -> int:
+    from experiments.runner.sweep import collect_sweep
+
+    return collect_sweep(_parsed("collect", rest, folder={}).folder)
 
 
 def _sync(rest: list[str]) -> int:
@@ -142,7 +111,7 @@ def _dashboard(rest: list[str]) -> int:
     import webbrowser
 
     from experiments.common.schema import validated
-    from experiments.runner.dashboard import last_sweep, serving
+    from experiments.runner.tracking import last_sweep, serving
     from mvest.quantities import within
 
     port = {"default": 5000, "type": int, "metavar": "PORT", "help": "5000; 0: a free one"}
@@ -150,9 +119,9 @@ def _dashboard(rest: list[str]) -> int:
     parsed = _parsed("dashboard", rest, outputs=outputs, **{"--port": port})
     validated(Annotated[int, within(0, 65_535, "", "ports; 0: a free one")], parsed.port, "--port")
     try:
-        place, page, said = last_sweep(parsed.outputs)
+        place, page, title = last_sweep(parsed.outputs)
         with serving(place, parsed.port) as (address, server):
-            print(f"{said}: {address}{page}", flush=True)
+            print(f"{title}: {address}{page}", flush=True)
             webbrowser.open(address + page)
             return server.wait()
     except KeyboardInterrupt:
@@ -200,25 +169,19 @@ def _application(overrides: list[str]) -> int:
         sys.argv = before
 
 
-def _one_file(
-    command: str, metavar: str, experiment: str, setting: str, given: list[str]
-) -> list[str]:
-    """Overrides of a command that is about one file or folder."""
-    parser = Parser(f"mvest {command}", description=COMMANDS[command])
+def _one_file(command: str, metavar: str, experiment: str, setting: str, rest: list[str]) -> int:
+    """An experiment on one file or folder."""
+    parser = Parser(f"mvest {command}", description=COMMANDS[command][0])
     parser.add_argument("path", type=Path, metavar=metavar)
     parser.add_argument("--check", action="store_true", help=CHECK)
     parser.add_argument("overrides", nargs="*", metavar="NAME=VALUE", help=OVERRIDES)
-    parsed = parser.parse_intermixed_args(given)
+    parsed = parser.parse_intermixed_args(rest)
     for override in parsed.overrides:
         if "=" not in override:
             parser.error(f"{override}: expected NAME=VALUE; one {metavar} at a time")
     check = ["check=true"] if parsed.check else []
-    return [
-        f"experiment={experiment}",
-        f"{setting}={quoted(str(parsed.path))}",
-        *check,
-        *parsed.overrides,
-    ]
+    named = [f"experiment={experiment}", f"{setting}={quoted(str(parsed.path))}"]
+    return _application([*named, *check, *parsed.overrides])
 
 
 def quoted(text: str) -> str:
@@ -258,6 +221,48 @@ def listing(sentences: dict[str, str], width: int) -> str:
         )
         for name, sentence in sentences.items()
     )
+
+
+COMMANDS: dict[str, tuple[str, str | Callable[[list[str]], int]]] = {
+    "list": ("the experiments, one sentence each", _list),
+    "run": (
+        "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",
+        lambda rest: _application(rest),
+    ),
+    "own-valve": (
+        "moduli of a valve from a case folder",
+        lambda rest: _one_file("own-valve", "FOLDER", "own_valve", "case", rest),
+    ),
+    "volume": (
+        "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
+        lambda rest: _one_file("volume", "FILE", "volume", "volume", rest),
+    ),
+    "simulate": (
+        "a simulated echo volume and the truth in it: simulate volume OUT.seq.nrrd",
+        "experiments.simulated_volume.simulate_command",
+    ),
+    "import": (
+        "a case folder from what another program wrote: import NAME SOURCE CASE",
+        "experiments.exchange.import_command",
+    ),
+    "export": (
+        "a case or a result for another program: export NAME SOURCE TARGET",
+        "experiments.exchange.export_command",
+    ),
+    "tables": ("every table, figure and page of results/ again, from the records in it", _tables),
+    "table": (
+        "all estimates of a folder as one table for statistics: table outputs estimates.csv",
+        _table,
+    ),
+    "worker": (
+        "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
+        _worker,
+    ),
+    "collect": ("what became of the jobs of a sweep that workers ran", _collect),
+    "sync": ("log to MLflow what is on disk and not there: sync outputs", _sync),
+    "dashboard": ("MLflow's pages, on the comparison of the last sweep", _dashboard),
+}
+"""Command -> what it is about, and the function that runs it or, if slow to import, its name."""
 
 
 if __name__ == "__main__":

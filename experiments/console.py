@@ -1,4 +1,4 @@
-"""How a command ends: in one line where it is refused, or stopped by Ctrl-C, SIGTERM or SIGHUP."""
+"""How a command ends: one line if it is refused, or stopped by Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a process to stop."""
 
 TRACEBACKS = "HYDRA_FULL_ERROR"
-"""Environment variable with which a user asks for tracebacks."""
+"""Environment variable that turns tracebacks on."""
 
 AGAIN_S = 0.01
 """Until a signal is sent again that Python has dropped."""
 
 
 class Interruption(KeyboardInterrupt):
-    """A signal has asked this process to stop.
+    """A signal stopped this process.
 
     Parameters
     ----------
@@ -59,20 +59,20 @@ def raised() -> Iterator[None]:
     """
     unraisable = sys.unraisablehook
     before = {number: signal.getsignal(number) for number in ASKING}
-    asked = False
+    stopped = False
 
     def ask(number: int, _: FrameType | None) -> None:
-        nonlocal asked
-        if not asked:
-            asked = True
+        nonlocal stopped
+        if not stopped:
+            stopped = True
             atexit.register(_ignore)
             raise Interruption(number)
         if number == signal.SIGINT:
             os._exit(128 + number)
 
     def again(number: int) -> None:
-        nonlocal asked
-        asked = False
+        nonlocal stopped
+        stopped = False
         signal.pthread_kill(threading.main_thread().ident or 0, number)
 
     def dropped(lost: sys.UnraisableHookArgs) -> None:
@@ -89,10 +89,9 @@ def raised() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = unraisable
-        # Whoever was asked to stop, here or within, is about to end; another signal may come until
-        # then.
+        # A stopped process is about to end; until then another signal may come.
         for number, handler in before.items():
-            if not asked and signal.getsignal(number) is ask:
+            if not stopped and signal.getsignal(number) is ask:
                 signal.signal(number, handler)
 
 
@@ -103,7 +102,7 @@ def _ignore() -> None:
 
 
 def interruptible(command: Callable[P, int]) -> Callable[P, int]:
-    """A command that returns an exit status, also where it is refused or asked to stop."""
+    """A command that returns an exit status, also where it is refused or stopped."""
 
     @functools.wraps(command)
     def stopped(*given: P.args, **named: P.kwargs) -> int:
@@ -123,11 +122,8 @@ def interruptible(command: Callable[P, int]) -> Callable[P, int]:
                 print(f"error: {message_of(error).splitlines()[0]}", file=sys.stderr)
                 return 2
             except KeyboardInterrupt as error:
-                print(
-                    "interrupted: what is finished is kept, and the same command goes on from "
-                    "there",
-                    file=sys.stderr,
-                )
+                done = "finished results are on disk, and the same command goes on from there"
+                print(f"interrupted: {done}", file=sys.stderr)
                 return error.status if isinstance(error, Interruption) else 128 + signal.SIGINT
 
     return stopped

@@ -51,13 +51,13 @@ def main() -> int:
         except (MvestError, FailedRunError) as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
-            # Hydra would write lines of its own above the one that tells it here.
+            # Hydra would print lines of its own first.
             ended.append(error)
             return math.nan
 
     register()
     register_plugins()
-    # Hydra then lets exceptions through, so that they can be told in one line here.
+    # Hydra then lets exceptions through, so that they become one line here.
     os.environ[TRACEBACKS] = "1"
     try:
         _require_options(sys.argv[1:])
@@ -80,7 +80,7 @@ def main() -> int:
 
 
 def run_alone(config: DictConfig) -> float:
-    """One run by itself: plan or check it, if that is all that is asked; otherwise run and log it.
+    """One run by itself: plan or check it, if nothing else is requested; otherwise run and log it.
 
     Returns its objective; NaN where there is none.
 
@@ -91,8 +91,8 @@ def run_alone(config: DictConfig) -> float:
     FailedRunError
         If the computation found no estimate; the run is recorded all the same.
     """
-    # Imports every study, for seconds: not where only help is asked for.
-    from experiments.results.publish import publish_run
+    # Takes seconds to import, which `--help` must not.
+    from experiments.results.published import publish_runs
     from experiments.runner.compared import metrics
     from experiments.runner.job import require_admissible, require_checks, run_job
     from experiments.runner.plan import Plan, earlier
@@ -111,12 +111,15 @@ def run_alone(config: DictConfig) -> float:
                 print(check(values, folder), flush=True)
             return math.nan
         record = run_job(request)
-        publish_run(values, record, folder, request.publish_as)
+        results = Path(values["paths"]["results"])
+        if values["publish"] and not values["sweep"] and not request.publish_as:
+            print(f"{results} left as it is: this run has overrides")
+        publish_runs([(request.publish_as, record, folder, results)])
         log_run(folder, values)
         if not record.converged:
             detail = f" ({record.detail})" if record.detail else ""
             raise FailedRunError(f"{record.reason}{detail} (recorded in {folder / RESULT})")
-        return metrics(record)[0].get(config.objective, math.nan)
+        return metrics(record).get(config.objective, math.nan)
 
 
 def _require_options(arguments: Sequence[str]) -> None:
@@ -139,7 +142,7 @@ def _is_hydra_s(error: Exception) -> bool:
 
 
 def explain(error: BaseException) -> str:
-    """One line that says what is wrong and, where it can be told, what would be right."""
+    """One line: what is wrong and, if known, what would be right."""
     own = [line.strip() for line in str(error).splitlines() if line.strip()]
     if not isinstance(error, HydraException | OmegaConfBaseException):
         return f"{' '.join(sys.argv[1:])}: {own[0] if own else type(error).__name__}"

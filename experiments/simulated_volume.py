@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from argparse import RawDescriptionHelpFormatter
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from experiments.common.progress import PartBar, announce_compilation
 from experiments.common.schema import from_words
 from experiments.console import Parser
 from mvest.cases.from_images.measures import write_landmarks, write_surfaces
-from mvest.errors import MvestError
+from mvest.errors import ConfigurationError
 from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
 from mvest.files import write_atomically
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
@@ -33,7 +32,7 @@ from mvest.simulation.motion import DrawnValve, MotionSettings, close_in_motion
 SUFFIX = ".seq.nrrd"
 
 CONFIGURED = ("valve", "mechanics")
-"""Groups of the configuration that say what valve is closed, and how."""
+"""Groups of the configuration with the valve and its mechanics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +74,8 @@ def simulate_command(given: Sequence[str]) -> int:
     parser.add_argument("target", type=Path, metavar="OUT", help=f"ends in {SUFFIX}")
     parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
     parsed = parser.parse_intermixed_args(list(given))
-    try:
-        began = time.monotonic()
-        volume, truth = write_simulated_volume(parsed.target, parsed.options)
-    except (MvestError, HydraException, OSError) as error:
-        print(f"error: {str(error).partition(chr(10))[0]}", file=sys.stderr)
-        return 2
+    began = time.monotonic()
+    volume, truth = write_simulated_volume(parsed.target, parsed.options)
     print(
         f"wrote {volume}: a simulated volume, of nobody, in {time.monotonic() - began:.1f} s\n"
         f"what is true in it: {truth}\nnext: mvest volume {volume} --check"
@@ -97,17 +92,18 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     Raises
     ------
     MvestError
-        An unknown name, a value that is inadmissible, or a valve that does not close.
-    HydraException
-        A word of the configuration that is not understood.
+        An unknown name, an inadmissible value, or a valve that does not close.
     """
     checked_path(target, SUFFIX)
     configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
     own = [word for word in words if word not in configured]
     options = from_words("simulate", SimulatedVolumeOptions, own, CONFIGURED)
     register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        values = plain(compose("config", ["experiment=imaging", *configured]))
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            values = plain(compose("config", ["experiment=imaging", *configured]))
+    except HydraException as error:
+        raise ConfigurationError(str(error).partition("\n")[0]) from error
     template, mechanics = template_of(values), mechanics_of(values)
     moduli = dict(zip(("E_f.anterior", "E_f.posterior"), options.moduli, strict=True))
     motion = MotionSettings(frames=options.frames, held_pressure=(), held_relaxation=())
@@ -128,7 +124,7 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     truth = target.with_name(target.name.removesuffix(SUFFIX) + "_truth")
     truth.mkdir(exist_ok=True)
     true = true_sequence(valve, probe)
-    said: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "simulated": True,
         "command": " ".join(["mvest simulate volume", target.name, *words]),
         "moduli_MPa": moduli,
@@ -141,5 +137,5 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     write_surfaces(truth, true)
     for frame in (0, options.frames - 1):
         write_landmarks(truth / f"valve_{frame:04d}.mrk.json", true, frame)
-    write_atomically(truth / "truth.json", json.dumps(said, indent=1) + "\n")
+    write_atomically(truth / "truth.json", json.dumps(facts, indent=1) + "\n")
     return write_sequence_nrrd(target, volume), truth

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -10,17 +11,29 @@ import pytest
 linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
 
 
-def alive(folder: Path) -> list[str]:
-    """Command lines of the processes, not this one, that work in a folder or below."""
+def living(folder: Path) -> list[int]:
+    """The processes, not this one, that work in a folder or below."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
-        try:
+        with suppress(OSError):
             lives = (place / "stat").read_text().rsplit(") ", 1)[1][0] != "Z"
             here = (place / "cwd").readlink().is_relative_to(folder.resolve())
             if lives and here and int(place.name) != os.getpid():
-                found.append((place / "cmdline").read_text().replace("\0", " "))
-        except OSError:
-            continue
+                found.append(int(place.name))
+    return found
+
+
+def command_of(process: int) -> str:
+    """Its command line."""
+    return Path(f"/proc/{process}/cmdline").read_text().replace("\0", " ")
+
+
+def alive(folder: Path) -> list[str]:
+    """Command lines of the processes, not this one, that work in a folder or below."""
+    found = []
+    for process in living(folder):
+        with suppress(OSError):
+            found.append(command_of(process))
     return found
 
 

@@ -151,7 +151,7 @@ RUNNER = "experiments.runner"
 ORDINARY_WORDS = {"case", "volume", "gate", "closure", "external", "filters", "patient"}
 """Names of studies that are also parts of a configuration, or words."""
 RUNNER_ROOMS = (
-    "jobs", "plan", "compose", "compared", "tracking", "dashboard", "cluster", "engine", "job",
+    "jobs", "plan", "compose", "compared", "tracking", "cluster", "engine", "job",
 )  # fmt: skip
 """In the runner a module imports none that comes after it; one that is not listed comes last."""
 
@@ -311,7 +311,7 @@ def test_conf_is_data() -> None:
         # A study knows no other, nor what runs or publishes it.
         ("experiments.studies.a", "from experiments.studies.ab import STUDY"),
         ("experiments.studies.a", "def f():\n    import experiments.runner.job"),
-        ("experiments.studies.a", "from experiments.results.keep import publish"),
+        ("experiments.studies.a", "from experiments.results.published import publish"),
         ("experiments.studies.a", "from experiments import studies"),
         # What a job is does not depend on how jobs are run or logged.
         ("experiments.runner.jobs", "from experiments.runner.tracking import store"),

@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin
 
 from docutils import nodes
 from docutils.statemachine import StringList
@@ -16,9 +18,9 @@ from sphinx.util.docutils import SphinxDirective
 from study_pages import comment_of
 
 from experiments.common.config import Config
-from experiments.common.schema import marks_in
-from experiments.common.study import load_settings, study_names
-from experiments.results.keep import records_of
+from experiments.common.schema import hints_of
+from experiments.common.study import load_study, study_names
+from experiments.results.published import records_of
 from mvest.mechanics.parameters import KINDS
 from mvest.quantities import Within
 from mvest.reporting.skill import GENERIC, skill_table, stated
@@ -68,7 +70,7 @@ def setting_groups() -> str:
 def setting_ranges() -> str:
     """What settings may be, by the kinds of quantities."""
     found: dict[tuple[str, ...], set[str]] = {}
-    for kind in [Config, *map(load_settings, study_names())]:
+    for kind in [Config, *(load_study(name).settings for name in study_names())]:
         for key, mark in marks_in(kind):
             if not isinstance(mark, Within):
                 continue
@@ -78,6 +80,23 @@ def setting_ranges() -> str:
         ["from", "to", "unit", "why", "settings"],
         [[*row, ", ".join(f"`{name}`" for name in sorted(names))] for row, names in found.items()],
     )
+
+
+def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names of the settings of a schema with each mark; names within mappings are ``*``."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        kind, *marks = arguments
+        yield from ((key, mark) for mark in marks)
+        yield from marks_in(kind, key)
+    elif isinstance(kind, type) and is_dataclass(kind):
+        for name, hint in hints_of(kind).items():
+            yield from marks_in(hint, f"{key}.{name}".lstrip("."))
+    elif origin in (dict, Mapping):
+        yield from marks_in(arguments[1], f"{key}.*")
+    else:
+        for part in arguments:
+            yield from marks_in(part, key)
 
 
 def sweep_list() -> str:

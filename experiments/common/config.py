@@ -12,10 +12,8 @@ from functools import cache
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeAlias
 
+from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.object_type import ObjectType
-from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.common.building.closure import ValveSettings, folder_hash
@@ -23,14 +21,14 @@ from experiments.common.schema import (
     BY_PARAMETER,
     NOT_HASHED,
     hints_of,
-    marks_in,
+    kinds_in,
+    parts_of,
     require_admissible_values,
     schema,
     validated,
     with_contents,
-    without,
 )
-from experiments.common.study import load_settings, study_names
+from experiments.common.study import load_study, study_names
 from mvest.errors import ConfigurationError
 from mvest.files import sha256_of
 from mvest.imaging.models import MODEL_FILE
@@ -67,8 +65,8 @@ GROUP = "study"
 MAX_NAME = 120
 """Letters of a text that names files."""
 
-NAMES = ("name", "table", "study", "sweep.name")
-"""Settings that name files and folders."""
+NAMES = ("name", "table", "study")
+"""Settings that name files and folders, besides ``sweep.name``."""
 
 Switch: TypeAlias = Annotated[bool, NOT_HASHED]
 ByParameter: TypeAlias = Annotated[dict[str, float], BY_PARAMETER]
@@ -246,18 +244,22 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
     """SHA-256 of everything in a configuration, resolved or not, that can change the result.
 
-    Of files and folders that it names what lies there counts, and not their names.
+    A file or folder that it names counts by its content, not by its name.
     """
     values = plain(config) if isinstance(config, DictConfig) else config
     _require_names(values)  # of the folder, which Hydra makes next
-    study = values.get("study")
-    kept = without(values, ("hydra", *_not_hashed(study)))
-    return config_hash(with_contents(_marks(study), kept))
+    return config_hash(with_contents(_kinds(values.get("study")), values, hashed=True))
 
 
 def is_hashed(key: str, study: str | None) -> bool:
     """Whether a setting, or what it is part of, can change the result of a study."""
-    return not any(key == name or key.startswith(f"{name}.") for name in _not_hashed(study))
+    kinds = _kinds(study)
+    for name in key.split("."):
+        kind, marks = parts_of(kinds.get(name, Any))
+        if NOT_HASHED in marks:
+            return False
+        kinds = kinds_in(kind, ())
+    return True
 
 
 def require_in_range(values: Mapping[str, Any]) -> None:
@@ -285,9 +287,11 @@ def require_in_range(values: Mapping[str, Any]) -> None:
 
 
 def _require_names(values: Mapping[str, Any]) -> None:
-    for key in NAMES:
-        part, _, inner = key.partition(".")
-        name = str((values.get(part) or {}).get(inner) or "" if inner else values.get(part) or "")
+    """Refuse a name that is none for a file."""
+    names = {key: values.get(key) for key in NAMES}
+    names["sweep.name"] = (values.get("sweep") or {}).get("name")
+    for key, given in names.items():
+        name = str(given or "")
         if len(name) > MAX_NAME:
             raise ConfigurationError(f"{key} has more than {MAX_NAME} letters")
         if name and (PurePath(name).name != name or name[0] == "." or not name.isprintable()):
@@ -297,29 +301,19 @@ def _require_names(values: Mapping[str, Any]) -> None:
 def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration as it is written and given away: no name of a file or folder of its user.
 
-    What a setting reads has its SHA-256 in the place of its name; where results lie is left out.
+    A setting that names a file has its SHA-256 instead; the folders of results are left out.
     """
-    kept = {str(key): value for key, value in values.items() if key != "paths"}
-    return with_contents(_marks(kept.get("study")), kept)
-
-
-@cache
-def _not_hashed(study: str | None) -> tuple[str, ...]:
-    """Dotted names of the settings that change no number of a study's results."""
-    return tuple(name for name, mark in _marks(study) if mark is NOT_HASHED)
-
-
-@cache
-def _marks(study: str | None) -> tuple[tuple[str, Any], ...]:
-    """Dotted names of a study's settings with each mark."""
-    return tuple(marked for top, kind in _kinds(study).items() for marked in marks_in(kind, top))
+    known = {str(key): value for key, value in values.items() if key != "paths"}
+    return with_contents(_kinds(known.get("study")), known, hashed=False)
 
 
 @cache
 def _kinds(study: str | None) -> dict[str, Any]:
     """Setting of a study at the top -> its type."""
-    own = hints_of(load_settings(study)) if study in study_names() else {}
-    return {**hints_of(Config), **own}
+    if study not in study_names():
+        return hints_of(Config)
+    settings: type = load_study(study).settings
+    return {**hints_of(Config), **hints_of(settings)}
 
 
 def _package_model() -> str | None:
@@ -329,51 +323,18 @@ def _package_model() -> str | None:
     return sha256_of(MODEL_FILE)
 
 
-class StudySource(ConfigSource):
-    """The configuration group ``study``: the schema of each study, made when it is asked for.
+class Studies(dict[str, Any]):
+    """Hydra's configuration group ``study``: the schema of a study is made when Hydra reads it.
 
-    So a job imports its own study's settings only, and a new study needs no registration.
+    So a job imports its own study only, and a new study needs no registration.
     """
 
-    @staticmethod
-    def scheme() -> str:
-        """What the search path names it by."""
-        return "studies"
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        """The schema of a study: what every study has, and what its own settings add."""
-        name = _study_of(config_path)
-        config = OmegaConf.structured(schema(Config, load_settings(name)))
+    def __getitem__(self, file: str) -> ConfigNode:
+        name = file.removesuffix(".yaml")
+        settings: type = load_study(name).settings
+        config = OmegaConf.structured(schema(Config, settings))
         config.study = name
-        return ConfigResult(
-            provider=self.provider,
-            path=self.full_path(),
-            config=config,
-            header={"package": "_global_"},
-        )
-
-    def is_group(self, config_path: str) -> bool:
-        """Whether this is the one group, or what holds it."""
-        return config_path.strip("/") in ("", GROUP)
-
-    def is_config(self, config_path: str) -> bool:
-        """Whether there is such a study."""
-        return _study_of(config_path) in study_names()
-
-    def available(self) -> bool:
-        """Always."""
-        return True
-
-    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """The group, or the studies."""
-        if config_path.strip("/") != GROUP:
-            return [] if results_filter == ObjectType.CONFIG else [GROUP]
-        return [] if results_filter == ObjectType.GROUP else sorted(study_names())
-
-
-def _study_of(config_path: str) -> str:
-    group, _, name = config_path.strip("/").partition("/")
-    return name.removesuffix(".yaml") if group == GROUP else ""
+        return ConfigNode(file, config, GROUP, "_global_", "mvest")
 
 
 def _valve_folder(*, _root_: DictConfig) -> str | None:
@@ -397,7 +358,8 @@ def register() -> None:
     package's detectors, ``${chosen:GROUP}`` what was chosen of a group,
     ``${valve_folder:}`` the hash of the case whose anatomy is configured.
     """
-    Plugins.instance().register(StudySource)
+    studies = Studies.fromkeys(f"{name}.yaml" for name in study_names())
+    ConfigStore.instance().repo[GROUP] = studies
     OmegaConf.register_new_resolver("package_model", _package_model, replace=True)
     OmegaConf.register_new_resolver("valve_folder", _valve_folder, replace=True)
     OmegaConf.register_new_resolver("chosen", _chosen, replace=True)

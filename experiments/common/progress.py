@@ -1,6 +1,6 @@
-"""What a single run reports while it works: forward solves, steps of a filter, what is left.
+"""Progress of a single run: forward solves, steps of a filter, time left.
 
-On a terminal a bar moves besides. Lines go to standard error, which in a sweep is the job's log.
+On a terminal a bar moves as well. Lines go to standard error, which in a sweep is the job's log.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the first guess of what is left."""
 
 QUICK = 1.0
-"""Seconds since the last line within which a forward solve that ended is not told."""
+"""A forward solve that ends sooner than this (s) after the last line gets no line."""
 
 
 @cache

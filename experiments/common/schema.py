@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -32,7 +32,7 @@ MAX_ENTRIES, MAX_LETTERS = 10_000, 10_000
 """Of a list or mapping, and of a text."""
 
 LARGEST = 1e15
-"""Of a number whose type has no range: a factor of a sweep, a setting of another program."""
+"""Of a number whose type has no range: a sweep's factor, a setting of another program."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -62,11 +62,11 @@ def _in_their_ranges(values: dict[str, float]) -> dict[str, float]:
 
 
 BY_PARAMETER = AfterValidator(_in_their_ranges)
-"""Marks values that are named by parameters, and in the range of what those are."""
+"""Marks values by parameter; each must be in the range of its parameter."""
 
 
-def contents(value: Any, _beside: Mapping[str, Any] | None = None) -> Any:
-    """Plain data with what lies at each path in place of its name; what cannot be read keeps it."""
+def contents(value: Any, _beside: Values | None = None) -> Any:
+    """Plain data with the content of each named file in place of its name, if it can be read."""
     if isinstance(value, Mapping):
         return {key: contents(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -82,42 +82,58 @@ InputFile = Annotated[str | None, Reads(contents)]
 """Type of a setting that names one file or folder, all of which is read."""
 
 
-def with_contents(marks: Iterable[tuple[str, Any]], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values with what their settings read in place of its name, and equal numbers alike.
+def with_contents(kinds: Mapping[str, Any], values: Values, *, hashed: bool) -> dict[str, Any]:
+    """Values with the content of the files that they name, and equal numbers equal.
 
     Parameters
     ----------
-    marks : iterable of (str, object)
-        Those of the settings, see `marks_in`.
+    kinds : mapping
+        Setting -> its type with its marks.
     values : mapping
         Plain data. Whole numbers become ints, so that 1 and 1.0 are one setting in a hash.
+    hashed : bool
+        Whether settings that change no result are left out.
     """
-    found = dict(values)
-    for name, mark in marks:
-        if isinstance(mark, Reads):
-            found = _changed(found, name.split("."), mark.contents)
-    return {name: _alike(value) for name, value in found.items()}
-
-
-def _changed(values: Any, path: Sequence[str], change: Callable[[Any, Any], Any]) -> Any:
-    """Nested values with those at a path changed; in it ``*`` stands for every name."""
-    if not isinstance(values, Mapping):
-        return values
-    name, *inner = path
-    found = dict(values)
-    for key in values if name == "*" else {name} & values.keys():
-        if inner:
-            found[key] = _changed(values[key], inner, change)
-        elif values[key] not in (None, MISSING):
-            found[key] = change(values[key], values)
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        kind, marks = parts_of(kinds.get(name, Any))
+        if hashed and NOT_HASHED in marks:
+            continue
+        reads = [mark for mark in marks if isinstance(mark, Reads)]
+        if reads and value not in (None, MISSING):
+            value = reads[0].contents(value, values)
+        inner = kinds_in(kind, value) if isinstance(value, Mapping) else {}
+        # Within a mapping by any names every setting counts.
+        within = hashed and _is_schema(kind)
+        found[name] = with_contents(inner, value, hashed=within) if inner else _whole(value)
     return found
 
 
-def _alike(value: Any) -> Any:
+def parts_of(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The type of a setting without None, and its marks."""
+    marks: tuple[Any, ...] = ()
+    if typing.get_origin(kind) is Annotated:
+        kind, *marks_ = typing.get_args(kind)
+        marks = tuple(marks_)
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        kind = next(one for one in typing.get_args(kind) if one is not types.NoneType)
+    return kind, marks
+
+
+def kinds_in(kind: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Setting -> type within a dataclass, or within a mapping that has these names."""
+    if _is_schema(kind):
+        return hints_of(kind)
+    is_mapping = typing.get_origin(kind) in (dict, Mapping)
+    return dict.fromkeys(names, typing.get_args(kind)[1]) if is_mapping else {}
+
+
+def _whole(value: Any) -> Any:
+    """Plain data with whole numbers as ints."""
     if isinstance(value, Mapping):
-        return {key: _alike(item) for key, item in value.items()}
+        return {key: _whole(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_alike(item) for item in value]
+        return [_whole(item) for item in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -131,33 +147,6 @@ def hints_of(cls: type) -> dict[str, Any]:
     names = {field.name for field in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls, include_extras=True)
     return {name: hint for name, hint in hints.items() if name in names}
-
-
-def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Nested values without those of the dotted names."""
-    kept = {key: value for key, value in values.items() if key not in names}
-    for name in names:
-        part, _, inner = name.partition(".")
-        if inner and isinstance(kept.get(part), Mapping):
-            kept[part] = without(kept[part], (inner,))
-    return kept
-
-
-def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names of the settings of a schema with each mark; names within mappings are ``*``."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Annotated:
-        kind, *marks = arguments
-        yield from ((key, mark) for mark in marks)
-        yield from marks_in(kind, key)
-    elif _is_schema(kind):
-        for name, hint in hints_of(kind).items():
-            yield from marks_in(hint, f"{key}.{name}".lstrip("."))
-    elif origin in (dict, Mapping):
-        yield from marks_in(arguments[1], f"{key}.*")
-    else:
-        for part in arguments:
-            yield from marks_in(part, key)
 
 
 _adapter = cache(TypeAdapter)
@@ -190,16 +179,16 @@ def validated(kind: Any, value: Any, key: str = "") -> Any:
         given = first["input"]
         match first["type"]:
             case _ if own is not None:
-                said = str(own)
+                fault = str(own)
             case "missing" if isinstance(last, str):
-                said = " has no value"
+                fault = " has no value"
             case _ if given == MISSING:
-                said = " has no value"
+                fault = " has no value"
             case "literal_error":
-                said = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
+                fault = f" = {given!r}, expected {first['ctx']['expected'].replace(chr(39), '')}"
             case _:
-                said = f" = {given!r}: {first['msg']}"
-        raise ConfigurationError(f"{name}{said}") from error
+                fault = f" = {given!r}: {first['msg']}"
+        raise ConfigurationError(f"{name}{fault}") from error
 
 
 def build(cls: type[T], values: Mapping[str, Any]) -> T:
@@ -231,8 +220,8 @@ def from_words(command: str, cls: type[T], words: Sequence[str], others: Sequenc
         merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(words)))
     except OmegaConfBaseException as error:
         known = ", ".join([*others, *map(str, defaults)])
-        said = str(error).partition("\n")[0]
-        raise ConfigurationError(f"{command}: {said}; known are {known}") from error
+        fault = str(error).partition("\n")[0]
+        raise ConfigurationError(f"{command}: {fault}; known are {known}") from error
     return build(cls, typing.cast("dict[str, Any]", OmegaConf.to_container(merged)))
 
 
@@ -275,7 +264,7 @@ def _require_plain(value: Any, key: str) -> None:
 def schema(*classes: type) -> type:
     """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
 
-    Tuples become lists, nested dataclasses schemas of their own; defaults are kept.
+    Tuples become lists, nested dataclasses schemas of their own; defaults stay.
     """
     fields: dict[str, Any] = {}
     for cls in classes:

@@ -95,10 +95,6 @@ class Results:
         return joined(parts) if len(self.records) > 1 else next(iter(parts.values()))
 
 
-def _nothing(*_: Any) -> None:
-    """Nothing more is done."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study(Generic[S]):
     """How a kind of study is run and shown.
@@ -150,7 +146,7 @@ class Study(Generic[S]):
     keep_arrays: Callable[[Record, Path], Mapping[str, Any]] = lambda record, path: {}
     keeps_failures: bool = False
     checks: Callable[[], tuple[Check, ...]] = tuple
-    require: Callable[[Mapping[str, Any]], None] = _nothing
+    require: Callable[[Mapping[str, Any]], None] = lambda values: None
 
 
 def study_names() -> tuple[str, ...]:
@@ -158,11 +154,6 @@ def study_names() -> tuple[str, ...]:
     modules = [p.stem for p in ROOMS.glob("*.py") if p.stem != "__init__"]
     packages = [p.parent.name for p in ROOMS.glob("*/study.py")]
     return tuple(sorted([*modules, *packages]))
-
-
-def load_settings(name: str) -> type:
-    """The settings of a study."""
-    return load_study(name).settings
 
 
 def load_study(name: str) -> Study[Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.common.records.record import Record, read_record
-from experiments.results.keep import RECORDS, records_of
+from experiments.results.published import RECORDS, records_of
 from experiments.sweeps.collected import SWEEPS, Sweep, read_sweep
 from mvest.errors import InputError
 from mvest.files import write_atomically
@@ -91,8 +91,8 @@ def estimate_table(folder: Path) -> DataFrame:
         place = path.relative_to(folder).as_posix()
         try:
             if path in tables:
-                kept = records_of(folder, path.stem)
-                for name, record in kept.records.items() if kept else ():
+                found = records_of(folder, path.stem)
+                for name, record in found.records.items() if found else ():
                     rows += _rows(record, f"{place}#{name}")
             elif path in sweeps:
                 rows += _of_sweep(read_sweep(path), place)

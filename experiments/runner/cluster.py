@@ -80,7 +80,7 @@ def run_on_dask(
     stop: Callable[[], None],
     requests: Sequence[Request],
     settings: EngineSettings,
-    asked_ns: int | None,
+    requested_ns: int | None,
 ) -> Generator[tuple[int, Record]]:
     """Run jobs as `engine.run_jobs` does, by ``execute`` on the workers of a cluster.
 
@@ -91,7 +91,7 @@ def run_on_dask(
 
     for name in list(logging.root.manager.loggerDict):
         if name.startswith(("distributed", "asyncio", "tornado")):
-            # What matters of what they have to say is said here, in a line.
+            # What matters is reported here, in one line.
             logging.getLogger(name).setLevel(logging.CRITICAL)
     own = requests[0].folder.resolve().parent / "dask"
     with dask.config.set(DASK), _client(settings, own, stop) as client:
@@ -103,7 +103,7 @@ def run_on_dask(
             requests,
             execute=execute,
             directory=str(Path.cwd()),
-            asked_ns=asked_ns,
+            requested_ns=requested_ns,
             at_a_time=settings.jobs if settings.cluster == LOCAL else 1,
             key=[(group, k) for k in range(len(requests))],
             pure=False,
@@ -120,11 +120,11 @@ def run_on_dask(
 
 
 def _there(
-    request: Request, *, execute: Execute, directory: str, asked_ns: int | None, at_a_time: int
+    request: Request, *, execute: Execute, directory: str, requested_ns: int | None, at_a_time: int
 ) -> Record:
     """Run a job in a worker of dask, from the folder in which its relative paths mean something."""
     os.chdir(directory)
-    return execute(request, asked_ns, at_a_time)
+    return execute(request, requested_ns, at_a_time)
 
 
 def _lost(request: Request, error: BaseException) -> Record:
@@ -157,7 +157,7 @@ def _client(settings: EngineSettings, folder: Path, stop: Callable[[], None]) ->
                 where.sync(where._correct_state)
                 for worker in where.workers.values():
                     if worker.status.name == "created":
-                        # It could not be submitted; asked again, its queue says why.
+                        # It could not be submitted; a second try raises the reason.
                         where.sync(worker.start)
                 if settings.adapt:
                     where.adapt(minimum=0, maximum=settings.jobs)

@@ -1,4 +1,4 @@
-"""What runs are compared by: the numbers of a record, and the settings that tell jobs apart."""
+"""What runs are compared by: the numbers of a record, and the settings that differ."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from experiments.common.config import is_hashed
 from experiments.common.records.record import Record
+from experiments.sweeps.collected import short_names
 
 Values = Mapping[str, Any]
 
@@ -21,22 +22,14 @@ LARGEST_ERROR = 1.0
 """Relative error of a modulus beyond which an estimate is no answer."""
 
 
-def short_names(names: Sequence[str]) -> list[str]:
-    """Names of parameters without a common beginning: ``E_f.anterior`` becomes ``anterior``."""
-    together = len({name.split(".")[0] for name in names}) == 1 and all("." in n for n in names)
-    return [name.split(".", 1)[1] if together else name for name in names]
-
-
-def metrics(record: Record) -> dict[int, dict[str, float]]:
-    """Step -> name -> number; step 0 has all but the iterates, with the mean error (%) first.
+def metrics(record: Record) -> dict[str, float]:
+    """Name -> number, the mean error (%) first.
 
     Of a job that repeats over seeds these are means over the estimates that converged, and
     ``spread`` is their standard deviation.
     """
-    runs, short = (
-        record.estimates,
-        dict(zip(record.parameters, short_names(record.parameters), strict=True)),
-    )
+    runs = record.estimates
+    short = dict(zip(record.parameters, short_names(record.parameters), strict=True))
     pairs: list[tuple[str, float | None]] = []
     for run in (run for run in runs if run.converged):
         for one in (one for one in run.unknowns if one.name in short):
@@ -51,24 +44,19 @@ def metrics(record: Record) -> dict[int, dict[str, float]]:
     series: dict[str, list[float]] = {}
     for key, value in pairs:
         series.setdefault(key, []).extend([] if value is None else [value])
-    found = {0: {key: fmean(values) for key, values in series.items() if values}}
+    found = {key: fmean(values) for key, values in series.items() if values}
     for name in short.values():
         if len(values := series.get(f"estimate.{name}", [])) > 1:
-            found[0][f"spread.{name}"] = stdev(values)
+            found[f"spread.{name}"] = stdev(values)
     numbers = {"forward_solves": record.forward_solves, **record.numbers}
     if runs:
         numbers["failed"] = sum(not run.converged for run in runs)
         numbers["seconds"] = sum(run.seconds or 0.0 for run in runs)
-    found[0] |= {k: float(v) for k, v in numbers.items() if isinstance(v, int | float)}
-    for step, iterate in enumerate(runs[0].iterates if runs else ()):
-        for one, value in zip(runs[0].parameters, iterate, strict=False):
-            if value is not None:
-                found.setdefault(step, {})[f"iterate.{short.get(one.name, one.name)}"] = value
-    return found
+    return found | {k: float(v) for k, v in numbers.items() if isinstance(v, int | float)}
 
 
 def implausible(record: Record) -> str:
-    """Why a run is not to be compared with others; empty if it is.
+    """Why a run is left out of comparisons; empty if it is not.
 
     It failed, its verdict is that there is no estimate, or a modulus is wrong by more than its
     truth, where that is known.
@@ -84,69 +72,48 @@ def implausible(record: Record) -> str:
     return ""
 
 
-def typed(overrides: Iterable[str]) -> list[str]:
-    """Names of settings that were typed (``NAME=VALUE``), each once."""
-    names = (word.lstrip("+~").partition("=")[0].replace("/", ".") for word in overrides)
-    return list(dict.fromkeys(name for name in names if name != "name"))
-
-
-def columns(config: Values, words: Iterable[str]) -> dict[str, Any]:
-    """The settings of a run that were typed, and the handful: a column for each value.
+def settings_of(config: Values, overrides: Iterable[str]) -> dict[str, Any]:
+    """The settings of a run that were typed, as they were typed, and the handful.
 
     Parameters
     ----------
     config : mapping
-        As it lies beside the result: without a name of a file, which must not reach a store.
-    words : iterable of str
-        Dotted names; of one that has settings below it all are meant.
+        As it lies beside the result: the content of a file instead of its name, which must not
+        reach a store.
+    overrides : iterable of str
+        ``NAME=VALUE``.
     """
-    chosen = tuple(f"{word}." for word in (*words, *HANDFUL))
-    return {
-        name: value
-        for name, value in leaves(config, config["parameters"]).items()
-        if f"{name}.".startswith(chosen) and is_hashed(name, config["study"])
-    }
-
-
-def leaves(value: Any, parameters: Sequence[str], name: str = "") -> dict[str, Any]:
-    """Single values by dotted names; of a list by its parameters, of a matrix the diagonal."""
-    if isinstance(value, list):
-        names = short_names(parameters) if len(value) == len(parameters) else range(len(value))
-        square = all(isinstance(item, list) and len(item) == len(value) for item in value)
-        value = [row[k] for k, row in enumerate(value)] if square else value
-        value = dict(zip(names, value, strict=True))
-    if not isinstance(value, Mapping):
-        return {} if value in (None, "") else {name: value}
+    words = (word.lstrip("+~").partition("=") for word in overrides)
+    typed = {name.replace("/", "."): text for name, _, text in words if name != "name"}
     found: dict[str, Any] = {}
-    for key, item in value.items():
-        found |= leaves(item, parameters, f"{name}.{key}" if name else str(key))
+    for name in (*typed, *HANDFUL):
+        value: Any = config
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if isinstance(value, Mapping | list) and "sha256" not in str(value):
+            value = typed[name]
+        if value not in (None, "") and is_hashed(name, config["study"]):
+            found[name] = value
     return found
 
 
 def varied(rows: Sequence[Values], factors: Sequence[Values]) -> list[dict[str, Any]]:
     """Of the columns of jobs those that differ, and the handful; factors that no column repeats."""
-    kept: dict[str, list[Any]] = {}
+    shown: dict[str, list[Any]] = {}
     for source in (rows, factors):
         for name in dict.fromkeys(name for row in source for name in row):
             values = [row.get(name) for row in source]
-            shown = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
-            if shown and (source is rows or values not in kept.values()):
-                kept[name] = values
-    return [{name: values[k] for name, values in kept.items()} for k in range(len(rows))]
+            differs = name in HANDFUL or len(rows) == 1 or len(set(map(repr, values))) > 1
+            if differs and (source is rows or values not in shown.values()):
+                shown[name] = values
+    return [{name: values[k] for name, values in shown.items()} for k in range(len(rows))]
 
 
-def together(rows: Sequence[Values], words: Iterable[str]) -> dict[str, str]:
-    """The values that typed settings have in a sweep, as they are typed: ``[5,3],[4,2]``."""
-    found: dict[str, dict[str, None]] = {}
-    for row in rows:
-        for word in (*words, *HANDFUL):
-            own = [
-                text_of(value) for name, value in row.items() if f"{name}.".startswith(f"{word}.")
-            ]
-            if own:
-                whole = own[0] if word in row else f"[{','.join(own)}]"
-                found.setdefault(word, {})[whole] = None
-    return {word: ",".join(texts) for word, texts in found.items()}
+def together(rows: Sequence[Values]) -> dict[str, str]:
+    """The values that settings have in a sweep: ``[5,3],[4,2]``."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    each = {name: [text_of(row[name]) for row in rows if name in row] for name in names}
+    return {name: ",".join(dict.fromkeys(texts)) for name, texts in each.items()}
 
 
 def text_of(value: Any) -> str:

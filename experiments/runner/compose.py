@@ -1,8 +1,8 @@
 """The jobs of a sweep, composed from the overrides of each.
 
 A grid is a mapping from settings to choices in Hydra's sweep syntax, and stands for the product of
-its choices. Several grids stand for their union. What is said on the command line holds for every
-grid and takes the place of a grid's own choices.
+its choices. Several grids stand for their union. What the command line sets holds for every grid
+and replaces a grid's own choices.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from tqdm import tqdm
 
 from experiments.common.config import hash_of, plain
-from experiments.results.publish import as_configured, publish_as
+from experiments.results.published import as_configured, publish_as
 from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
 from experiments.runner.plan import Plan, earlier
 from mvest.errors import ConfigurationError
@@ -113,7 +113,7 @@ def make_plan(
             HydraConfig.instance().set_config(merged[kind])
         composed = merged[kind]
         values = plain(composed)
-        # Null takes the limit away; the default holds where nothing is said.
+        # Null removes the limit; without an override the default holds.
         if values["time_limit_s"] is None and "time_limit_s" not in parsed:
             values["time_limit_s"] = TIME_LIMIT_S
         values["factors"] = {

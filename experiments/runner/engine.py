@@ -14,15 +14,14 @@ import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from subprocess import PIPE, TimeoutExpired
 from typing import Any
 
-from experiments.common.records.record import Record, stamp
-from experiments.common.study import Result
+from experiments.common.records.record import Record
 from experiments.runner.cluster import EngineSettings, run_on_dask
-from experiments.runner.jobs import Request, attempt, default_memory_gb
+from experiments.runner.jobs import Request, attempt, default_memory_gb, failed_record
 from experiments.sweeps.collected import head_of
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.processes import Program, ending, environment, python
@@ -122,29 +121,8 @@ class WorkerProcess:
             program.end()
 
 
-own_worker = cache(WorkerProcess)
-"""The one that this process keeps for a run by itself."""
-
-
-def run_apart(
-    request: Request,
-    worker: WorkerProcess | None = None,
-    asked_ns: int | None = None,
-    at_a_time: int = 1,
-    *,
-    aloud: bool = False,
-) -> Record:
-    """Run a job in a worker as `attempt` does; by default in the one kept by this process.
-
-    ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
-    Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
-    """
-    run = partial((worker or own_worker()).run, request, at_a_time, aloud=aloud)
-    return attempt(request, run, asked_ns)
-
-
 def run_jobs(
-    requests: Sequence[Request], settings: EngineSettings, at_a_time: int, asked_ns: int | None
+    requests: Sequence[Request], settings: EngineSettings, at_a_time: int, requested_ns: int | None
 ) -> Generator[tuple[int, Record]]:
     """Run jobs; yields the position of each and the head of its record, as they end.
 
@@ -157,7 +135,7 @@ def run_jobs(
     settings : EngineSettings
     at_a_time : int
         Jobs that run on one machine beside each other and share its memory.
-    asked_ns : int or None
+    requested_ns : int or None
         As in `run_apart`.
 
     Raises
@@ -168,11 +146,12 @@ def run_jobs(
         If dask's scheduler is lost.
     """
     if settings.elsewhere:
-        yield from run_on_dask(execute, stop_jobs, requests, settings, asked_ns)
+        yield from run_on_dask(execute, stop_jobs, requests, settings, requested_ns)
         return
     pool = ThreadPoolExecutor(min(at_a_time, len(requests)))
     futures = {
-        pool.submit(execute, request, asked_ns, at_a_time): k for k, request in enumerate(requests)
+        pool.submit(execute, request, requested_ns, at_a_time): k
+        for k, request in enumerate(requests)
     }
     try:
         for future in as_completed(futures):
@@ -190,10 +169,13 @@ _idle: dict[str, list[WorkerProcess]] = {}
 _busy: set[WorkerProcess] = set()
 
 
-def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -> Record:
-    """Run a job, unless it is done, in a process that this one keeps for its jobs.
+def run_apart(
+    request: Request, requested_ns: int | None = None, at_a_time: int = 1, *, aloud: bool = False
+) -> Record:
+    """Run a job as `attempt` does, in a process that this one starts once for its jobs.
 
-    Whatever becomes of the job is in the head of a record that is returned.
+    ``at_a_time`` jobs share the memory of this machine. ``aloud`` is that of `WorkerProcess.run`.
+    Raises a `MvestError` if nothing can be recorded, or a job that runs aloud is refused.
     """
     idle = _idle.setdefault(str(Path.cwd()), [])
     try:
@@ -202,14 +184,20 @@ def execute(request: Request, asked_ns: int | None = None, at_a_time: int = 1) -
         worker = WorkerProcess()
     _busy.add(worker)
     try:
-        record = run_apart(request, worker, asked_ns, at_a_time)
-    except (MvestError, OSError) as error:
-        # Not even a record of the failure could be written.
-        result = Result(status="failed", reason=str(error))
-        record = stamp(request.values, request.config_hash, result, time.time())
+        run = partial(worker.run, request, at_a_time, aloud=aloud)
+        return attempt(request, run, requested_ns)
     finally:
         _busy.remove(worker)
-    idle.append(worker)
+        idle.append(worker)
+
+
+def execute(request: Request, requested_ns: int | None = None, at_a_time: int = 1) -> Record:
+    """Run a job as `run_apart` does; returns the head of its record, whatever becomes of it."""
+    try:
+        record = run_apart(request, requested_ns, at_a_time)
+    except (MvestError, OSError) as error:
+        # Not even a record of the failure could be written.
+        record = failed_record(request, str(error))
     return head_of(record)
 
 

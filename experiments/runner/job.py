@@ -27,7 +27,7 @@ from experiments.common.records.writer import words_of, write_results
 from experiments.common.schema import build
 from experiments.common.study import Check, Job, Results, Study, load_study, study_names
 from experiments.console import raised
-from experiments.results.keep import arrays_of
+from experiments.results.published import arrays_of
 from experiments.runner.engine import run_apart
 from experiments.runner.jobs import (
     LOG,

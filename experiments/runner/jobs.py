@@ -27,7 +27,7 @@ from omegaconf import DictConfig
 from experiments.common.config import hash_of, plain, require_in_range, without_places
 from experiments.common.records.record import Record, adopt_arrays, read_record, stamp, write_record
 from experiments.common.study import Result
-from experiments.results.publish import publish_as
+from experiments.results.published import publish_as
 from mvest.errors import InputError, message_of
 from mvest.files import remove_parts, require_writable, sha256_of, write_atomically
 from mvest.provenance import write_json
@@ -145,21 +145,23 @@ def last_record(folder: Path, config_hash: str, *, cut_off: bool = False) -> Rec
     return record if matches and cut_off == (record.converged > is_done(folder)) else None
 
 
-def usable_record(request: Request, asked_ns: int | None = None) -> Record | None:
+def usable_record(request: Request, requested_ns: int | None = None) -> Record | None:
     """The record that makes a run superfluous; None if the job has to be run.
 
-    With ``force`` it must have been written after ``asked_ns``, when the job was requested.
+    With ``force`` it must have been written after ``requested_ns``, when the job was requested.
     """
     record = last_record(request.folder, request.config_hash)
     if record is None or not record.converged:
         return None
     if request.values["force"]:
         written_ns = (request.folder / RESULT).stat().st_mtime_ns
-        return record if asked_ns is not None and written_ns > asked_ns else None
+        return record if requested_ns is not None and written_ns > requested_ns else None
     return record
 
 
-def attempt(request: Request, run: Callable[[], str | None], asked_ns: int | None = None) -> Record:
+def attempt(
+    request: Request, run: Callable[[], str | None], requested_ns: int | None = None
+) -> Record:
     """Run a job unless it is done; returns its record, whatever happened.
 
     Parameters
@@ -167,7 +169,7 @@ def attempt(request: Request, run: Callable[[], str | None], asked_ns: int | Non
     request : Request
     run : callable
         () -> why it wrote no record of the job; None if it did.
-    asked_ns : int, optional
+    requested_ns : int, optional
         As in `usable_record`.
 
     Raises
@@ -178,7 +180,7 @@ def attempt(request: Request, run: Callable[[], str | None], asked_ns: int | Non
     folder, config_hash = request.folder, request.config_hash
     require_writable(folder)
     with lock(folder):
-        record = usable_record(request, asked_ns)
+        record = usable_record(request, requested_ns)
         if record is None:
             started = time.time()
             make_way(request)
@@ -258,10 +260,16 @@ def write_failure(request: Request, reason: str, started: float) -> Record:
     """
     computed = last_record(request.folder, request.config_hash, cut_off=True)
     if computed is not None:
-        told = UNWRITTEN.format(request.folder)
-        print(f"warning: {reason if told in reason else f'{reason}; {told}'}", file=sys.stderr)
+        remedy = UNWRITTEN.format(request.folder)
+        print(f"warning: {reason if remedy in reason else f'{reason}; {remedy}'}", file=sys.stderr)
         return computed
     return replace_record(request, Result(status="failed", reason=reason), started)
+
+
+def failed_record(request: Request, reason: str) -> Record:
+    """The record, written nowhere, of a job without an estimate."""
+    result = Result(status="failed", reason=reason)
+    return stamp(request.values, request.config_hash, result, time.time())
 
 
 def write_hydra(request: Request) -> None:

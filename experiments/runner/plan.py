@@ -16,9 +16,8 @@ from statistics import fmean
 from typing import Any
 
 from experiments.common.progress import duration
-from experiments.common.records.record import Record, here_and_now, stamp
-from experiments.common.study import Result
-from experiments.runner.jobs import Request, last_record
+from experiments.common.records.record import Record, here_and_now
+from experiments.runner.jobs import Request, failed_record, last_record
 from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import config_hash, git_state, write_json
@@ -119,12 +118,12 @@ class Plan:
             | {
                 "hash": job.short_hash,
                 "folder": os.path.relpath(job.folder, self.folder),
-                "name": name,
+                "name": job.label if job.values["factors"] else job.values["row"],
                 "factors": job.values["factors"],
                 "values": {k: v for k, v in job.values.items() if v is not self.common.get(k, job)},
                 "without": [key for key in self.common if key not in job.values],
             }
-            for job, name in zip(self.jobs, self.names(), strict=True)
+            for job in self.jobs
         ]
         sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
         try:
@@ -199,13 +198,6 @@ class Plan:
             why = one_line(error, 160)
             raise InputError(f"{place} is no plan of this version: {why}") from error
 
-    def names(self) -> list[str]:
-        """What sets each job apart, in a few words: the factors in which jobs differ."""
-        factors = [[f"{k}={v}" for k, v in job.values["factors"].items()] for job in self.jobs]
-        shared = set(factors[0]).intersection(*factors) if len(factors) > 1 else set()
-        found = [", ".join(text for text in texts if text not in shared) for texts in factors]
-        return [name or str(job.values["row"]) for name, job in zip(found, self.jobs, strict=True)]
-
     def summary(self) -> str:
         """How much is done, how much is left and how long it will take, in one line."""
         left, done = len(self.to_run), self.done
@@ -265,14 +257,9 @@ class Plan:
 
 
 def _swept(job: Request, record: Record | None) -> SweptJob:
-    values = job.values
-    if record is None:
-        result = Result(status="failed", reason=NOT_RUN)
-        record = stamp(values, job.config_hash, result, time.time())
+    values, record = job.values, record or failed_record(job, NOT_RUN)
+    # One that was computed for another sweep has the factors of that.
+    record = record.model_copy(update={"factors": values["factors"]})
     return SweptJob(
-        hash=job.short_hash,
-        seed=values["seed"],
-        repeats=values["repeats"],
-        # One that was computed for another sweep has the factors of that.
-        record=record.model_copy(update={"factors": values["factors"]}),
+        hash=job.short_hash, seed=values["seed"], repeats=values["repeats"], record=record
     )

@@ -1,4 +1,4 @@
-"""What Hydra is extended by: a sweeper for grids and their unions, and a launcher of many jobs.
+"""Plugins for Hydra: a sweeper for grids and their unions, and a launcher of many jobs.
 
 Both are Hydra's own kinds of plugins: the launcher serves any sweeper (``hydra/sweeper=basic``,
 optuna's), and the sweeper any launcher (``hydra/launcher=basic`` runs jobs in this process).
@@ -24,7 +24,7 @@ PLACE = "hydra_plugins.mvest"
 
 
 class FailedSweepError(Exception):
-    """A job of a sweep has no estimate; the sweep has said so."""
+    """A job of a sweep has no estimate; this was reported."""
 
 
 class GridSweeper(Sweeper):
@@ -43,7 +43,7 @@ class GridSweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Keep what Hydra has to say about the sweep, and its launcher."""
+        """Store the configuration of the sweep, and its launcher."""
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=hydra_context, task_function=task_function, config=config
         )
@@ -88,7 +88,7 @@ class JobLauncher(Launcher):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Keep what Hydra has to say about the sweep."""
+        """Store the configuration of the sweep."""
         self._given = config, hydra_context.config_loader
 
     def launch(
@@ -101,7 +101,7 @@ class JobLauncher(Launcher):
         MvestError, HydraException, OmegaConfBaseException
             If the request is wrong; nothing is run then.
         """
-        # Imports every study, for seconds: not where only help is asked for.
+        # Takes seconds to import, which `--help` must not.
         from experiments.runner.sweep import launch
 
         assert self._given is not None

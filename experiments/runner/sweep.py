@@ -17,7 +17,7 @@ from experiments.common.progress import PartBar, announce_compilation, say
 from experiments.common.records.record import Record
 from experiments.common.schema import build, require_admissible_values
 from experiments.results.estimates import sweep_table
-from experiments.results.publish import publish_runs, publish_sweep
+from experiments.results.published import publish_runs, publish_sweep
 from experiments.runner.cluster import EngineSettings, require_engine
 from experiments.runner.compared import metrics
 from experiments.runner.compose import make_plan
@@ -117,7 +117,7 @@ def launch(
     ended = _run(plan, batch, settings)
     found = {job.hash: job.record for job in finish(plan, ended).jobs}
     returned = [_returned(job, found[job.short_hash], config.objective) for job in batch.jobs]
-    # Ten thousand records are not kept while they are logged.
+    # Frees ten thousand records before they are logged.
     folder, common = plan.folder, plan.common
     del ended, found, plan, batch
     log_sweep(folder, common)
@@ -228,11 +228,11 @@ def collected(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
 
 
 def _returned(job: Request, record: Record, objective: str) -> JobReturn:
-    """What Hydra is told of a job."""
+    """The result of a job for Hydra."""
     returned = JobReturn(overrides=job.overrides, working_dir=str(job.folder))
     returned.status = JobStatus.COMPLETED if record.converged else JobStatus.FAILED
     returned.return_value = (
-        metrics(record)[0].get(objective, math.nan)
+        metrics(record).get(objective, math.nan)
         if record.converged
         else FailedRunError(f"{record.reason} (recorded in {job.folder})")
     )

@@ -1,4 +1,4 @@
-"""Logging to MLflow what is on disk: a run, a sweep, or all outputs (``mvest sync``).
+"""MLflow: what is logged of runs and sweeps (``mvest sync``), and its pages (``mvest dashboard``).
 
 A run of the store with the same result is left, one with another is replaced, a missing one added.
 The store's database is made once.
@@ -6,17 +6,23 @@ The store's database is made once.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
+import socket
 import sqlite3
+import subprocess
 import sys
+import time
+import urllib.request
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
+from urllib.parse import quote
 
 from filelock import FileLock
 from omegaconf import OmegaConf
@@ -25,20 +31,19 @@ from tqdm import tqdm
 from experiments.common.records.record import read_record
 from experiments.runner.compared import (
     Values,
-    columns,
     implausible,
-    leaves,
     metrics,
+    settings_of,
     text_of,
     together,
-    typed,
     varied,
 )
 from experiments.runner.jobs import CONFIG, RESULT, is_done
 from experiments.runner.plan import PLAN
 from experiments.sweeps.collected import read_sweep
-from mvest.errors import ConfigurationError, MvestError
+from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.files import sha256_of
+from mvest.processes import Program, environment, python
 from mvest.reading.documents import read_mapping
 
 SWEEP, TYPED = "sweep.json", ".hydra/overrides.yaml"
@@ -50,8 +55,8 @@ FILES = ("*.json", "*.png", "*.svg", "*.csv", "*.md", "*.html", "*.parquet")
 MANY = 1000
 """Jobs of a sweep above which only the sweep as a whole is a run."""
 
-Entry: TypeAlias = tuple[Path, str, Values, Mapping[int, Mapping[str, float]], float]
-"""Result file, name, tags (the first is no other run's), step -> metrics, seconds computed."""
+Entry: TypeAlias = tuple[Path, str, Values, dict[str, float], float]
+"""Result file, name, tags (the first is no other run's), metrics, seconds computed."""
 
 PARENT, WHOLE = "mlflow.parentRunId", "result_hash"
 """Tags: of a job, its sweep's run; of a run that was logged to its end, the hash of its result."""
@@ -71,6 +76,21 @@ ARTIFACTS, SQLITE = "mlartifacts", "sqlite:///"
 PASSWORD = re.compile(r"://[^/@:]*:[^/@]+@")
 BROKEN = re.compile(r"malformed|not a database|no such (table|column)|out-of-date database schema")
 """What SQLite and MLflow say of a file that is no database, damaged, or was never finished."""
+
+
+MOST = 100
+"""Runs on MLflow's page of comparison, which reads them one by one."""
+
+SERVED = MANNERS | {
+    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+    "MLFLOW_ENABLE_ASSISTANT_SANDBOX": "true",
+    "MLFLOW_ENABLE_REMOTE_ASSISTANT": "false",
+    "PYTHONSAFEPATH": "1",
+}
+"""Environment of the server: no telemetry, no jobs, no assistant, no module of a case's folder."""
+
+HOST = "mvest.localhost"
+"""This machine, by a name at which MLflow's pages do not open their assistant."""
 
 
 class TrackingError(MvestError):
@@ -118,9 +138,9 @@ def opened(uri: str | None, outputs: Path, experiment: str) -> Iterator[str]:
                     database.execute("select * from alembic_version, experiments").fetchone()
             mlflow.set_tracking_uri(place)
             if mlflow.get_experiment_by_name(experiment) is None:
-                kept = None if place.startswith("http") else (outputs / ARTIFACTS).as_uri()
+                copies = None if place.startswith("http") else (outputs / ARTIFACTS).as_uri()
                 kind = {"mlflow.experimentKind": "custom_model_development"}
-                mlflow.create_experiment(experiment, kept, kind)
+                mlflow.create_experiment(experiment, copies, kind)
             mlflow.set_experiment(experiment)
         yield place
     except MvestError:
@@ -178,7 +198,6 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
     alone = [] if is_sweep else [{"folder": "", "overrides": _typed(folder), "factors": {}}]
     plan: dict[str, Any] = read_mapping(folder / PLAN) if is_sweep else {"jobs": alone}
     each = len(plan["jobs"]) <= MANY
-    words = typed(word for job in plan["jobs"] for word in job["overrides"])
     entries, rows, factors = [], [], []
     for job in plan["jobs"]:
         place = folder / job["folder"]
@@ -186,15 +205,15 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
             if (place / RESULT).is_file():
                 own = read_mapping(place / CONFIG)
                 entries.append(_job(place, job.get("name")) if each else None)
-                rows.append(columns(own, words))
-                factors.append(leaves(job["factors"], own["parameters"]))
+                rows.append(settings_of(own, job["overrides"]))
+                factors.append(job["factors"])
         except MvestError as error:
             counts["left"] += _left_out(place, error)
     with opened(tracking["uri"], outputs, name):
         known = runs_of(name, "" if is_sweep else f"tags.folder = '{folder.resolve().name}'")
         parent, shown = None, zip(entries, varied(rows, factors), strict=True)
         if is_sweep:
-            parent, done = _put(_sweep(folder, plan), together(rows, words), known, None)
+            parent, done = _put(_sweep(folder, plan), together(rows), known, None)
             counts[done] += 1
         for entry, row in tqdm(list(shown), "to MLflow", disable=None, leave=False):
             if entry is not None:
@@ -230,12 +249,12 @@ def _sweep(folder: Path, plan: Values) -> Entry:
     name, tags = f"sweep of {len(plan['jobs'])} jobs", {"sweep_id": plan["sweep_id"]}
     if (folder / SWEEP).is_file():
         result, sweep = folder / SWEEP, read_sweep(folder / SWEEP)
-        means = [one for record in sweep.records if (one := metrics(record)[0].get("error.mean"))]
+        means = [one for record in sweep.records if (one := metrics(record).get("error.mean"))]
         totals = {"error.mean": fmean(means)} | totals if means else totals
         totals["failed"] = sum(not record.converged for record in sweep.records)
         totals["seconds"] = sum(record.seconds_total for record in sweep.records)
         tags["mlflow.source.git.commit"] = sweep.provenance.git.sha
-    return result, name, tags, {0: totals}, totals.get("seconds", 0.0)
+    return result, name, tags, totals, totals.get("seconds", 0.0)
 
 
 def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tuple[str, str]:
@@ -258,8 +277,7 @@ def _put(entry: Entry, row: Values, known: list[Any], parent: str | None) -> tup
         about = {key: value for key, value in about.items() if value is not None}
         with mlflow.start_run(run_name=name, parent_run_id=parent, tags=about) as run:
             mlflow.log_params(texts)
-            for step, values in numbers.items():
-                mlflow.log_metrics(values, step=step)
+            mlflow.log_metrics(numbers, step=0)
             for path in sorted(path for name in FILES for path in result.parent.glob(name)):
                 if path.name != PLAN and not path.name.startswith("."):
                     mlflow.log_artifact(str(path))
@@ -279,3 +297,80 @@ def runs_of(experiment: str, chosen: str) -> list[Any]:
     from mlflow import search_runs
 
     return list(search_runs(None, chosen, experiment_names=[experiment], output_format="list"))
+
+
+def last_sweep(outputs: Path) -> tuple[str, str, str]:
+    """Of the sweep that was planned last: its store, the path of its page, and a line on it.
+
+    The page compares the runs with a plausible answer. It lists them where they are too many, and
+    shows the sweep as a whole where there are none.
+
+    Raises
+    ------
+    InputError
+        If there is no sweep, or it has not been logged.
+    """
+    plans = sorted(outputs.glob(f"*/{PLAN}"), key=lambda path: path.stat().st_mtime)
+    if not plans:
+        raise InputError(f"{outputs} holds no sweep; run one, or name another folder")
+    plan, sweep = read_mapping(plans[-1]), plans[-1].parent.name
+    name = str(plan["values"]["name"])
+    with opened(plan["values"]["tracking"]["uri"], outputs, name) as place:
+        whole = runs_of(name, f"tags.sweep_id = '{plan['sweep_id']}'")
+        if not whole:
+            raise InputError(f"{sweep} is not in {place}; `mvest sync {outputs}` logs it")
+        parent, experiment = whole[0].info.run_id, whole[0].info.experiment_id
+        jobs = f"tags.`{PARENT}` = '{parent}'"
+        chosen = f"{jobs} and tags.plausible = 'yes'"
+        runs, count = [run.info.run_id for run in runs_of(name, chosen)], len(runs_of(name, jobs))
+    page = f"/#/experiments/{experiment}/runs"
+    if not runs:
+        page += f"/{parent}"
+    elif len(runs) > MOST:
+        page += f"?searchFilter={quote(chosen)}"
+    else:
+        ids, experiments = (quote(json.dumps(some)) for some in (runs, [experiment]))
+        page = f"/#/compare-runs?runs={ids}&experiments={experiments}&workflowType=machine_learning"
+    left = f" ({count - len(runs)} failed or implausible)" if count > len(runs) else ""
+    return place, page, f"{sweep}, {len(runs)} runs{left}"
+
+
+@contextmanager
+def serving(
+    place: str, port: int, *, quiet: bool = False
+) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """MLflow's server, for this machine only: its address, and its process, which ends with this.
+
+    Raises
+    ------
+    InputError
+        If the port is taken, or the server does not start.
+    """
+    try:
+        with socket.create_server(("127.0.0.1", port)) as probe:
+            port = int(probe.getsockname()[1])
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used ({error}); name one by --port") from error
+    command = python("mlflow", "server", "--backend-store-uri", place)
+    command += ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    command += ["--allowed-hosts", ",".join(hosts := allowed_hosts(port))]
+    command += ["--cors-allowed-origins", ",".join("http://" + host for host in hosts)]
+    # Whatever the login shell has set: nobody else is let in.
+    own = {k: v for k, v in environment().items() if not k.startswith("MLFLOW_SERVER_")} | SERVED
+    streams = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL if quiet else None)
+    # uvicorn looks for modules in the folder that it is started in.
+    with Program(command, stdin=subprocess.DEVNULL, env=own, cwd="/", **streams) as server:
+        until = time.monotonic() + 120.0  # s
+        while server.process.poll() is None and time.monotonic() < until:
+            with suppress(OSError):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=2.0).close()
+                break
+            time.sleep(0.2)
+        else:
+            raise InputError(f"MLflow's server at port {port} did not start")
+        yield "http://" + f"{HOST}:{port}", server.process
+
+
+def allowed_hosts(port: int) -> list[str]:
+    """The hosts that a request may name; MLflow's own list lets names like 10.evil.com in."""
+    return [f"{host}:{port}" for host in (HOST, "127.0.0.1", "localhost", "[::1]")]

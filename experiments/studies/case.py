@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.common.cases.check import check
 from experiments.common.cases.own_case import (
+    CaseInput,
+    PersonalSettings,
     case_words,
+    check,
     read_configured,
     run_case,
     write_report,
 )
-from experiments.common.cases.settings import CaseInput, PersonalSettings
 from experiments.common.study import Job, Result, Study
 from mvest.cases.case import ValveCase
 from mvest.cases.plausibility import require_plausible

@@ -17,8 +17,7 @@ import numpy as np
 
 from experiments.common.building.closure import closure_model, mechanics_of, template_of
 from experiments.common.building.filters import require_one_each
-from experiments.common.cases.own_case import settings_of
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings, settings_of
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import NOT_GATED, Mesh
 from experiments.common.schema import Values

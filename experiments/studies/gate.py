@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common.building.closing import close_valve, draw_closing
 from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import (
     anatomy_digest,
     ask_gate,
+    close_valve,
     closures_of,
+    draw_closing,
     gate_of,
     gate_rows,
 )

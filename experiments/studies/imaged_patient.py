@@ -16,7 +16,12 @@ import numpy as np
 from scipy.stats import linregress, sem
 
 from experiments.common.building.closure import mechanics_of, template_of
-from experiments.common.cases.own_case import case_words, write_report
+from experiments.common.cases.own_case import (
+    ImagedInput,
+    PersonalSettings,
+    case_words,
+    write_report,
+)
 from experiments.common.cases.revealed import (
     MODULUS_COLUMNS,
     Groups,
@@ -28,7 +33,6 @@ from experiments.common.cases.revealed import (
     short,
     unknowns_of,
 )
-from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ErrorSamples

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from experiments.common.building.closing import close_valve, draw_closing
 from experiments.common.building.closure import folder_hash, mechanics_of
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import (
     anatomy_digest,
     ask_gate,
+    close_valve,
     closures_of,
+    draw_closing,
     gate_rows,
 )
 from experiments.common.building.twin import build_twin, estimate_twin

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.common.building.patient_store import make_patient
-from experiments.common.cases.own_case import case_words
+from experiments.common.cases.own_case import PersonalSettings, case_words
 from experiments.common.cases.revealed import (
     MODULUS_COLUMNS,
     Groups,
@@ -25,7 +25,6 @@ from experiments.common.cases.revealed import (
     short,
     verdicts_and_skill,
 )
-from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Number, Record
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import Frame

@@ -7,8 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.common.cases.own_case import case_words, find_valve, run_volume, write_report
-from experiments.common.cases.settings import ImagedInput, PersonalSettings, VolumeInput
+from experiments.common.cases.own_case import (
+    ImagedInput,
+    PersonalSettings,
+    VolumeInput,
+    case_words,
+    find_valve,
+    run_volume,
+    write_report,
+)
 from experiments.common.schema import build
 from experiments.common.study import Job, Result, Study
 

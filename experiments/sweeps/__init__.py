@@ -1,1 +1,1 @@
-"""What is said of a sweep: rows, statistics, tables, figures, conclusions."""
+"""A collected sweep, and its tables and figures."""

@@ -6,28 +6,26 @@ A job is its record, without tables, and what the runner knows of it besides.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
-from experiments.common.records.record import Frozen, Provenance, Record, checked
-from mvest.errors import InputError
+from experiments.common.records.record import Provenance, Record
 from mvest.files import write_atomically
-from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.record import EstimateRecord, Frozen, Unknown
+from mvest.problem.registration import unit_of
 from mvest.provenance import require_sealed, sealed
-from mvest.reading.documents import read_mapping
+from mvest.reading.documents import read_mapping, validated
 
 SWEEPS = "sweeps"
 """Folder of the published sweeps within the results."""
 
 NOT_KEPT: dict[str, Any] = {
-    "detail": "", "correlation": (), "frames": (), "condition_number": None, "flat": (),
-    "confounded": (), "objective": (), "details": {}, "distance_to_truth_mm": None,
-    "iterates": (), "iterate_std": (),
+    "detail": "", "frames": (), "condition_number": None, "distance_to_truth_mm": None,
 }  # fmt: skip
-"""Parts of an estimate that no table or figure of a sweep shows; the job's own record has them."""
+"""Parts of an estimate left out of a sweep, besides details; the job's own record has them."""
 
 
 class SweptJob(Frozen):
@@ -51,13 +49,14 @@ class SweptJob(Frozen):
     @property
     def runs(self) -> tuple[EstimateRecord, ...]:
         """A run for each planned seed; one that left no estimate failed for the job's reason."""
-        known = {one.seed for one in self.record.estimates}
+        record, known = self.record, {one.seed for one in self.record.estimates}
+        unknowns = tuple(Unknown(name=name, unit=unit_of(name)) for name in record.parameters)
         lost = [
-            EstimateRecord(seed=seed, status="failed", reason=self.record.reason)
+            EstimateRecord(seed=seed, status="failed", reason=record.reason, unknowns=unknowns)
             for seed in range(self.seed, self.seed + self.repeats)
             if seed not in known
         ]
-        return (*self.record.estimates, *lost)
+        return (*record.estimates, *lost)
 
 
 class Sweep(Frozen):
@@ -102,61 +101,29 @@ class Sweep(Frozen):
         """Those of all jobs."""
         return [job.record for job in self.jobs]
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data for JSON, sealed; `Sweep.of_plain` reads them."""
-        jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in self.jobs]
-        return sealed({**self.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
-
-    @classmethod
-    def of_plain(cls, data: Any, where: str) -> Sweep:
-        """A sweep from plain data; ``where`` names them in an error.
-
-        Raises
-        ------
-        InputError
-            If the data are no collected sweep of this version, or not as they were written.
-        """
-        if not isinstance(data, Mapping):
-            raise InputError(f"{where} is no collected sweep but a {type(data).__name__}")
-        known = {k: v for k, v in data.items() if k != "sha256"}
-        sweep = checked(cls, known, where, "collected sweep")
-        require_sealed(data, where)
-        return sweep
-
 
 def head_of(record: Record) -> Record:
     """What a sweep keeps of a job's record: no tables, and of estimates what sweeps show."""
     estimates = tuple(
-        one.model_copy(
+        one.without_details().model_copy(
             update={**NOT_KEPT, "unknowns": tuple(u for u in one.unknowns if u.kind != "derived")}
         )
         for one in record.estimates
     )
-    head = record.model_copy(update={"tables": {}, "estimates": estimates})
-    _forget_given(head)
-    return head
-
-
-def _forget_given(part: Any) -> None:
-    """Forget which fields of a record were given: a third of the memory of ten thousand heads."""
-    if isinstance(part, Frozen | EstimateRecord | Unknown):
-        object.__setattr__(part, "__pydantic_fields_set__", set())
-        for value in vars(part).values():
-            _forget_given(value)
-    elif isinstance(part, tuple):
-        for value in part:
-            _forget_given(value)
+    return record.model_copy(update={"tables": {}, "estimates": estimates})
 
 
 def write_sweep_file(path: Path, sweep: Sweep) -> None:
-    """Write a collected sweep, whole or not at all.
+    """Write a collected sweep with a digest of its content, whole or not at all.
 
     Raises
     ------
     InputError
         If it cannot be written.
     """
-    text = json.dumps(sweep.plain(), ensure_ascii=False, separators=(",", ":"))
+    jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in sweep.jobs]
+    content = sealed({**sweep.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
     write_atomically(path, text + "\n", sync=True)
 
 
@@ -166,11 +133,20 @@ def read_sweep(path: Path) -> Sweep:
     Raises
     ------
     InputError
-        If it cannot be read, is no collected sweep, or is not as it was written.
+        If it cannot be read, is no sweep of this version, or is not as it was written.
     """
-    return Sweep.of_plain(read_mapping(path), str(path))
+    data = read_mapping(path)
+    sweep = validated(Sweep, {k: v for k, v in data.items() if k != "sha256"}, str(path))
+    require_sealed(data, str(path))
+    return sweep
 
 
 def read_sweeps(results: Path) -> list[Sweep]:
     """Every published sweep in the order of file names."""
     return [read_sweep(path) for path in sorted((results / SWEEPS).glob("*.json"))]
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names of parameters without a common beginning: ``E_f.anterior`` becomes ``anterior``."""
+    together = len({name.split(".")[0] for name in names}) == 1 and all("." in n for n in names)
+    return [name.split(".", 1)[1] if together else name for name in names]

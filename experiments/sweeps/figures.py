@@ -12,8 +12,8 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from experiments.sweeps.collected import Sweep
-from experiments.sweeps.runs import Z95, factors_of, good_of, is_number, runs_of, values_of
+from experiments.sweeps.collected import Sweep, short_names
+from experiments.sweeps.report import Z95, factors_of, good_of, is_number, runs_of, values_of
 from mvest.reporting.figures import (
     BAD,
     COLOURS,
@@ -76,7 +76,7 @@ def _along(sweep: Sweep, runs: DataFrame, values: Values) -> Figure | None:
         grid[0, 0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         most *= 2.0
     grid[0, 0].set_ylim(-most, most)
-    for k, name in enumerate(_names(sweep)):
+    for k, name in enumerate(short_names(sweep.parameters)):
         grid[0, 0].plot([], [], "o-", color=COLOURS[k % len(COLOURS)], label=name)
     grid[0, 0].legend(fontsize=SMALL, frameon=False)
     note = (
@@ -204,13 +204,6 @@ def _heading(sweep: Sweep, column: str) -> str:
 
 def _label(value: Any) -> str:
     return plain_number(float(value)) if is_number([value]) else str(value)
-
-
-def _names(sweep: Sweep) -> list[str]:
-    """Names for figures: the regions alone where all are the same modulus."""
-    kinds = {name.partition(".")[0] for name in sweep.parameters}
-    regions = [name.partition(".")[2] or name for name in sweep.parameters]
-    return regions if len(kinds) == 1 else list(sweep.parameters)
 
 
 def _titled(figure: Figure, sweep: Sweep, note: str) -> Figure:

@@ -1,19 +1,98 @@
-"""Files of a published sweep: tidy runs, statistics by setting, figures.
+"""Files of a sweep: its runs as a tidy table, statistics of them by setting, figures, a page.
 
-They follow from the collected sweep alone (``results/sweeps/NAME.json``), so they can be made again
-without running anything.
+They follow from the collected sweep alone (``results/sweeps/NAME.json``) and not from when or where
+a run was made, so that equal results give equal files.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from experiments.common.records.writer import LONGEST, write_page
 from experiments.sweeps.collected import Sweep
-from experiments.sweeps.runs import by_setting, runs_of, shortened
 from mvest.errors import InputError
+from mvest.estimation.estimate import NOT_THE_POSTERIOR
+from mvest.problem.registration import unit_of
+from mvest.reporting.tables import Column, Table, table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
+
+CONVERGED = "converged"
+
+SEED = "seed"
+"""A factor of this name is a repetition and no setting."""
+
+MOST_SETTINGS = 150
+"""If there are more settings than this, each with a single run, numbers count as repetitions."""
+
+Z95 = 1.959963984540054
+"""97.5 % quantile of the normal distribution."""
+
+ENDINGS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
+"""Endings of factor names that say a unit."""
+
+COVARIANCE = "filter coordinates²"
+"""Filter coordinates are MPa, or logarithms where the filter works in them."""
+
+UNIT, BOUND, ERROR = "unit of the parameter", "Cramér–Rao bound", "signed error"
+"""A unit that differs from row to row where parameters do, and two columns."""
+
+COVARIANCES = {"P0": COVARIANCE, "Q": COVARIANCE, "R": "mm²"}
+"""Factors whose unit no ending says."""
+
+COLUMNS = {
+    **dict.fromkeys(("job", "seed", "status", "parameter"), ""), "true value": UNIT, "start": UNIT,
+    "estimate": UNIT, "std": UNIT, "low": UNIT, "high": UNIT, BOUND: UNIT, ERROR: "%",
+    "distance mean": "mm", "distance SD": "mm", "distance max": "mm", "iterations": "",
+    "forward solves": "", "reason": "",
+}  # fmt: skip
+"""Columns of the tidy table after the factors, and their units."""
+
+RENAMED = {
+    "truth": "true value", "prior_mean": "start", "bound": BOUND, "relative_error": ERROR,
+    "distance_mean": "distance mean", "distance_std": "distance SD",
+    "distance_max": "distance max", "forward_solves": "forward solves",
+}  # fmt: skip
+"""Columns that have another name in the rows of a record (`EstimateRecord.rows`)."""
+
+STATISTICS: dict[str, tuple[Column, Callable[[DataFrame], Any]]] = {
+    "estimate": (
+        Column(UNIT, std="SD over runs", label="mean estimate ± SD over runs"),
+        lambda good: good["estimate"].mean(),
+    ),
+    "SD over runs": (Column(UNIT), lambda good: good["estimate"].std()),
+    "std": (Column(UNIT, label="SD stated by the filter"), lambda good: good["std"].mean()),
+    "error": (Column("%", label="mean error", hidden=True), lambda good: good[ERROR].mean()),
+    "median error": (Column("%"), lambda good: good[ERROR].median()),
+    "RMSE": (Column("%"), lambda good: _rms(good[ERROR])),
+    "largest error": (Column("%"), lambda good: good[ERROR].abs().max()),
+    "RMSE / bound": (
+        Column(),
+        lambda good: _rms(good["estimate"] - good["true value"]) / (good[BOUND].mean() or np.nan),
+    ),
+    "coverage": (
+        Column("%", ".0f", low="coverage, low", high="coverage, high",
+               label="95 % intervals that hold"),
+        lambda good: _coverage(good)[0],
+    ),
+    "coverage, low": (Column("%"), lambda good: _coverage(good)[1]),
+    "coverage, high": (Column("%"), lambda good: _coverage(good)[2]),
+    "distance mean": (Column("mm", hidden=True), lambda good: good["distance mean"].mean()),
+    "distance SD": (Column("mm", hidden=True), lambda good: good["distance SD"].mean()),
+    "forward solves": (Column(), lambda good: good["forward solves"].mean()),
+    "forward solves, median": (Column(hidden=True), lambda good: good["forward solves"].median()),
+    "forward solves, max": (Column(hidden=True), lambda good: good["forward solves"].max()),
+}  # fmt: skip
+"""Column -> what it is and how it follows from the runs of a setting that did not fail."""
+
 
 CAPTIONS = {
     "": "Errors and intervals along each factor.",
@@ -24,6 +103,174 @@ CAPTIONS = {
 
 SHOWN = ("setting", "parameter", "runs", "failed", "estimate", "median error", "largest error")
 """Columns of the table by settings that a terminal has room for."""
+
+
+def factors_of(sweep: Sweep) -> dict[str, tuple[str, str]]:
+    """Factor -> its column and unit: ``noise_mm`` -> ``noise`` and mm."""
+    found = {}
+    for name in sweep.factors:
+        stem, _, ending = name.rpartition("_")
+        unit = ENDINGS.get(ending.lower(), "") if stem else ""
+        label = (stem if unit else name).replace("_", " ")
+        unit = "MPa" if name.startswith("start_") else unit
+        if label in COLUMNS and name != SEED:
+            label = f"{label} (factor)"
+        found[name] = (label, COVARIANCES.get(name, unit))
+    return found
+
+
+def runs_of(sweep: Sweep) -> Table:
+    """A row for each parameter of each run (job and seed), failed ones included, factors first.
+
+    Errors are signed, in percent of the truth. The ends of an interval are those that the record
+    states, or 1.96 standard deviations from the estimate. Of a lost run only its factors are known.
+    """
+    factors = factors_of(sweep)
+    units = {**dict(factors.values()), **COLUMNS}
+    rows = []
+    for job in sweep.jobs:
+        varied = {column: job.record.factors.get(name) for name, (column, _) in factors.items()}
+        rows += [
+            {"job": job.hash, **_cells(row), **varied} for run in job.runs for row in run.rows()
+        ]
+    return _table(sweep, rows, {name: Column(unit) for name, unit in units.items()})
+
+
+def _table(sweep: Sweep, rows: list[dict[str, Any]], about: dict[str, Column]) -> Table:
+    """A table of these columns; where all parameters have one unit it stands at the columns."""
+    units = {unit_of(name) for name in sweep.parameters}
+    if len(units) == 1:
+        unit = units.pop()
+        about = {k: replace(c, unit=unit) if c.unit == UNIT else c for k, c in about.items()}
+    return table([{name: row.get(name) for name in about} for row in rows], **about)
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Columns of a parameter from its row of a record."""
+    cells = {RENAMED.get(name, name): value for name, value in row.items()}
+    estimate, std, error = (cells.get(name) for name in ("estimate", "std", ERROR))
+    if cells.get("low") is None and estimate is not None and std is not None:
+        cells |= {"low": estimate - Z95 * std, "high": estimate + Z95 * std}
+    cells[ERROR] = None if error is None else 100.0 * error
+    cells["reason"] = "" if row["status"] == CONVERGED else row["reason"]
+    return cells
+
+
+def shortened(whole: Table) -> Table:
+    """Ten significant digits of every number; each text in one line, as simple readers need it."""
+
+    def short(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.10g}")
+        return " ".join(value.split()) if isinstance(value, str) else value
+
+    values = {name: list(map(short, column)) for name, column in whole.values.items()}
+    return Table(values, whole.columns)
+
+
+def good_of(runs: DataFrame) -> DataFrame:
+    """The rows of runs that converged to an estimate, with numbers as floats."""
+    numbers = [name for name in runs if COLUMNS.get(str(name)) in (UNIT, "%", "mm")]
+    good = runs[(runs["status"] == CONVERGED) & runs["estimate"].notna()]
+    return good.astype(dict.fromkeys([*numbers, "forward solves"], float))
+
+
+def values_of(sweep: Sweep, runs: DataFrame) -> dict[str, list[Any]]:
+    """Column of each factor that takes several values -> these, numbers in increasing order."""
+    found = {}
+    for name, (column, _) in factors_of(sweep).items():
+        values = list(dict.fromkeys(runs[column].dropna()))
+        if name != SEED and len(values) > 1:
+            found[column] = sorted(values) if is_number(values) else values
+    return found
+
+
+def is_number(values: Sequence[Any]) -> bool:
+    """Whether all values are numbers."""
+    return all(isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values)
+
+
+def by_setting(sweep: Sweep) -> Table:
+    """Statistics of each parameter in each setting, below the paper's numbers if it has any.
+
+    Runs that failed are counted and enter no other number. Where there are very many settings with
+    a single run each, runs that differ in numbers only are counted as repetitions of a setting.
+    """
+    runs = runs_of(sweep).frame
+    units = {column: unit for name, (column, unit) in factors_of(sweep).items() if name != SEED}
+    # Jobs that differ in their seeds are repetitions of one setting.
+    names = list(units) or ([] if sweep.factors else ["job"])
+    single = runs.groupby([*names, "parameter"], sort=False, dropna=False).size().max() == 1
+    if single and len(runs) > MOST_SETTINGS * len(sweep.parameters):
+        names = [name for name in names if not is_number(list(runs[name].dropna()))]
+    varied = [name for name in names if runs[name].nunique(dropna=False) > 1]
+    rows: list[dict[str, Any]] = []
+    if sweep.paper is not None:
+        none = [None] * len(sweep.parameters)
+        found = (sweep.paper.get(key) or none for key in ("estimate", "error_percent"))
+        rows = [
+            {"setting": f"paper, {sweep.paper['table']}", "parameter": name,
+             "estimate": estimate, "largest error": error}
+            for name, estimate, error in zip(sweep.parameters, *found, strict=True)
+        ]  # fmt: skip
+    for _, group in runs.groupby([*names, "parameter"], sort=False, dropna=False):
+        first = group.iloc[0]
+        words = {"setting": _words(first, varied, units), "parameter": first["parameter"]}
+        rows.append({**words, **{name: first[name] for name in names}, **_statistics(group)})
+
+    about = {
+        "setting": Column(),
+        "parameter": Column(),
+        **{name: Column(units.get(name, ""), hidden=True) for name in names},
+        "runs": Column(),
+        "failed": Column(),
+        **{name: column for name, (column, _) in STATISTICS.items()},
+        "failures": Column(hidden=not any(row.get("failures") for row in rows)),
+    }
+    return _table(sweep, rows, about)
+
+
+def _words(run: Series[Any], names: Sequence[str], units: Mapping[str, str]) -> str:
+    """A run's values of some factors: a text as it is, a number with its name and unit."""
+    words = []
+    for name in names:
+        value, unit = run[name], units.get(name, "")
+        if isinstance(value, str):
+            words.append(value)
+        elif value == value and value is not None:
+            text = f"{value:g}" if isinstance(value, float) else str(value)
+            words.append(f"{name} {text} {'' if unit == COVARIANCE else unit}".rstrip())
+    return ", ".join(words) or "all runs"
+
+
+def _statistics(runs: DataFrame) -> dict[str, Any]:
+    """Numbers of a parameter in a group of runs; NaN or None where there is nothing to take."""
+    good = good_of(runs)
+    lost = runs.drop(good.index)["reason"]
+    # Without the numbers of the filter's check.
+    reasons = Counter("".join(reason.partition(NOT_THE_POSTERIOR)[:2]) for reason in lost)
+    return {
+        "runs": len(good),
+        "failed": len(lost),
+        **{name: number(good) for name, (_, number) in STATISTICS.items()},
+        "failures": "; ".join(f"{n} x {text}" if n > 1 else text for text, n in reasons.items()),
+    }
+
+
+def _rms(values: Series[Any]) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None]:
+    """Share (%) of intervals that contain the truth, and Wilson's 95 % interval of it."""
+    from scipy.stats import binomtest
+
+    low, truth, high = good[["low", "true value", "high"]].dropna().to_numpy(dtype=np.float64).T
+    if not truth.size:
+        return None, None, None
+    inside = int(((low <= truth) & (truth <= high)).sum())
+    ends = binomtest(inside, truth.size).proportion_ci(confidence_level=0.95, method="wilson")
+    return 100.0 * inside / truth.size, 100.0 * float(ends.low), 100.0 * float(ends.high)
 
 
 def text_of(sweep: Sweep) -> str:

@@ -206,44 +206,28 @@ def installed(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_an_installed_wheel_lists_its_experiments(installed):
-    run, _ = installed
-    done = run("list")
-    assert done.returncode == 0, done.stderr
-    assert "table1" in done.stdout
-
-
-@pytest.mark.slow
-def test_an_installed_wheel_runs_the_chain_and_says_that_no_commit_made_it(installed):
-    run, folder = installed
-    done = run("run", "experiment=debug")
-    assert done.returncode == 0, done.stderr
-    (record,) = folder.glob("outputs/debug/*/result.json")
-    assert re.search(r'"sha": null', record.read_text(encoding="utf-8"))
-
-
-@pytest.mark.slow
-def test_an_installed_wheel_sweeps(installed):
-    run, folder = installed
-    done = run("run", "-m", "experiment=debug", "seed=2,3")
-    assert done.returncode == 0, done.stderr
-    assert len(list(folder.glob("outputs/debug/*/result.json"))) >= 2
-
-
-@pytest.mark.slow
-def test_an_installed_wheel_checks_an_own_valve(installed):
+def test_an_installed_wheel_does_everything(installed):
     run, folder = installed
     write_case(folder / "my valve", made_up_case(0.3, 8.0, np.random.default_rng(1)))
-    done = run("own-valve", "my valve", "--check", "personal.mesh.source=structured")
-    assert done.returncode == 0, done.stderr
-    assert list(folder.glob("outputs/own_valve/*/*.png"))
-
-
-@pytest.mark.slow
-def test_an_installed_wheel_says_in_one_line_what_is_wrong(installed):
-    run, _ = installed
-    for arguments in (("run", "experiment=tabel1"), ("own-valve", "nowhere", "--check")):
-        done = run(*arguments)
-        assert done.returncode == 2
-        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
-        assert done.stderr.startswith("error: ")
+    outputs = folder / "outputs"
+    for words, pattern, count in (
+        (["run", "experiment=debug"], "debug/*/result.json", 1),
+        (["run", "-m", "experiment=debug", "seed=2,3"], "debug/*/result.json", 3),
+        (
+            ["own-valve", "my valve", "--check", "personal.mesh.source=structured"],
+            "own_valve/*/case.png",
+            1,
+        ),
+    ):
+        done = run(*words)
+        assert done.returncode == 0, done.stderr
+        found = list(outputs.glob(pattern))
+        assert len(found) == count
+        # No commit made it.
+        assert ".json" not in pattern or '"sha": null' in found[0].read_text(encoding="utf-8")
+    assert "table1" in run("list").stdout
+    for words in (["run", "experiment=tabel1"], ["own-valve", "nowhere", "--check"]):
+        wrong = run(*words)
+        assert wrong.returncode == 2
+        (line,) = wrong.stderr.strip().splitlines()
+        assert line.startswith("error: ")

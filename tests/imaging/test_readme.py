@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import pytest
 
-from experiments.common.cases.settings import ImagedInput
+from experiments.common.cases.own_case import ImagedInput
 from experiments.studies.imaging.detectors import ImagingSettings
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.valve_sequence import LANDMARKS

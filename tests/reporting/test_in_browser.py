@@ -10,11 +10,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from experiments.tables import write_report
 from mvest.reporting.case.report import report
-from tests.experiments.results.test_report import publish_sweep
 from tests.experiments.runner.screenshot import look_at
-from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep
 from tests.reporting.case.made_up_case import (
     LINE,
     PROVENANCE,
@@ -114,30 +111,9 @@ def case_page(tmp_path_factory) -> Path:
     return written[1]
 
 
-@pytest.fixture(scope="module")
-def results_page(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("results")
-    jobs = [
-        job({"filter": f"{LONG}{k}", LONG: k}, [run(1, TRUTH * 1.02, [0.1, 0.1])], row=LONG)
-        for k in range(2)
-    ]
-    lost = job({"filter": LONG, LONG: 2}, [], LONG, row=LONG)
-    publish_sweep(folder, sweep("filter", [*jobs, lost], title=LONG, settings={LONG: LONG}))
-    (folder / "gate.md").write_text(
-        f"# {LONG}\n\n{LONG}\n\n| {HOSTILE} |\n|---|\n| b |\n", encoding="utf-8"
-    )
-    (folder / "long.md").write_text(f"# {'W' * 10_000}\n", encoding="utf-8")
-    return write_report(folder)
-
-
-@pytest.fixture(params=["case_page", "results_page"])
-def page(request) -> Path:
-    return request.getfixturevalue(request.param)
-
-
 @needs_browser
-def test_nothing_that_a_record_says_runs(page) -> None:
-    seen = looked_at(page)
+def test_nothing_that_a_record_says_runs(case_page) -> None:
+    seen = looked_at(case_page)
     assert "data-ran" not in seen.root
     assert seen.handlers == []
     assert not {"iframe", "object", "embed", "base"} & set(seen.tags)
@@ -145,8 +121,8 @@ def test_nothing_that_a_record_says_runs(page) -> None:
 
 
 @needs_browser
-def test_a_page_stays_as_wide_as_its_window(page) -> None:
-    held, window = widths(page)
+def test_a_page_stays_as_wide_as_its_window(case_page) -> None:
+    held, window = widths(case_page)
     assert held <= window
 
 
@@ -166,16 +142,18 @@ def test_the_policy_runs_the_scene_and_no_script_that_slipped_in(case_page) -> N
     assert looked_at(slipped).root["data-ran"] == "1"
 
 
-def test_characters_that_act_are_named_and_what_is_cut_is_said(page) -> None:
-    text = page.read_text(encoding="utf-8")
+def test_characters_that_act_are_named_and_what_is_cut_is_said(case_page) -> None:
+    text = case_page.read_text(encoding="utf-8")
     text = re.sub("<script.*?</script>", "", text, flags=re.DOTALL)
     assert not ACTING.search(text)
     assert "[U+202E]gnp.exe[U+202C]" in text
     assert "characters)" in text
 
 
-def test_pictures_stay_whole(page) -> None:
-    found = re.findall('src="data:image/webp;base64,([^"]*)"', page.read_text(encoding="utf-8"))
+def test_pictures_stay_whole(case_page) -> None:
+    found = re.findall(
+        'src="data:image/webp;base64,([^"]*)"', case_page.read_text(encoding="utf-8")
+    )
     assert found
     for data in found:
         Image.open(io.BytesIO(base64.b64decode(data, validate=True))).load()

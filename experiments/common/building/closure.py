@@ -161,7 +161,7 @@ def guide_of(model: ClosureModel, anatomy: Anatomy, mesh: Values) -> ClosureMode
 
 
 def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> SolidMesh:
-    """The mesh of an anatomy; an unstructured one is made once and kept in ``store``."""
+    """The mesh of an anatomy; an unstructured one is made once and cached in ``store``."""
     if mesh["source"] == "structured":
         cells = mesh["columns"], mesh["rows"], mesh["layers"]
         if isinstance(anatomy, Template):
@@ -183,7 +183,7 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
 def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureModel:
     """The configured model of the closure, with one variation.
 
-    It closes the open valve each time; whoever continues from closed states says so.
+    It closes the open valve each time, unless its user sets a continuation.
     """
     anatomy, settings = anatomy_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]
@@ -216,5 +216,5 @@ def _varied(grid: Values, factor: float) -> dict[str, int]:
 
 
 def mesh_store(config: Values) -> Path:
-    """Where unstructured meshes are kept."""
+    """Folder of cached unstructured meshes."""
     return Path(config["paths"]["outputs"]) / "meshes"

@@ -1,24 +1,48 @@
-"""The gate of an anatomy (`mvest.closure.robustness`): what to ask, rows of it, kept verdicts."""
+"""The gate of an anatomy (`mvest.closure.robustness`), and one closure with every step recorded."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from experiments.common.building.closure import closure_model
+from experiments.common.building.closure import anatomy_of, closure_model
 from experiments.common.places import GATE_RECORDS
-from experiments.common.progress import say
+from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import Values, build
 from mvest.closure.anchors import content_digest
+from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate
+from mvest.errors import InputError
+from mvest.mechanics.valve_system import boundary_loading
+from mvest.reading.npz import read_npz
 from mvest.reporting.tables import Table, table
+from mvest.scenarios.measures import contact_pressure, measure_steps, nodal_stress
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.geometry.thickening import thicken
+from mvest.valve.mesh.solid_mesh import embed
+
+COLUMNS = {
+    "time": "s:.2f",
+    "pressure": "mmHg:.0f",
+    "orifice": "mm²:.1f",
+    "coaptation": "mm:.1f",
+    "intersections": "",
+    "chord strain": ":.3f",
+    "chord force": "N:.2f",
+    "smallest det F": ":.2f",
+    "Newton iterations": "",
+}
+"""Units of what `mvest.scenarios.measures.measure_steps` measures."""
 
 
 def ask_gate(values: Values) -> GateReport:
@@ -80,7 +104,7 @@ def gate_of(values: Mapping[str, Any], records: Path = GATE_RECORDS) -> str:
     values : mapping
         The resolved configuration.
     records : Path
-        The gate's kept records, one a line.
+        Published records of the gate, one a line.
     """
     return _verdicts(records).get(anatomy_digest(values), NOT_GATED)
 
@@ -100,3 +124,140 @@ def _verdicts(records: Path) -> dict[str, str]:
         except (ValueError, KeyError, TypeError, IndexError):
             continue
     return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closing:
+    """A closure from the open valve.
+
+    Attributes
+    ----------
+    model : ClosureModel
+    result : ClosureResult
+        With a frame for each step.
+    normals : (n, 3)
+        Directions of the thickness at the observed vertices.
+    """
+
+    model: ClosureModel
+    result: ClosureResult
+    normals: FloatArray
+
+    @property
+    def contact_distance_mm(self) -> float:
+        """Between midsurfaces, up to which leaflets count as coapting."""
+        contact, surface = self.model.settings.contact, self.model.valve.surface
+        share = contact.reference_distance + contact.activation_distance
+        return 0.5 * share * float(surface.thickness.mean())
+
+    def ends(self) -> Closing:
+        """The same with the open and the last state only."""
+        whole = self.result.simulation
+        two = replace(whole, times=whole.times[[0, -1]], frames=whole.frames[[0, -1]])
+        return replace(self, result=replace(self.result, simulation=two))
+
+    def steps(self) -> Table:
+        """What is measured of each step (`mvest.scenarios.measures.measure_steps`)."""
+        steps = measure_steps(self.model, self.result, self.contact_distance_mm, self.normals)
+        return table(steps, **COLUMNS)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Each step: thick leaflets with stress and contact pressure (MPa), chordae and tips."""
+        model, system, simulation = self.model, self.result.system, self.result.simulation
+        valve = model.valve
+        surface = thicken(valve.surface, self.normals)
+        faces = embed(model.mesh, surface.vertices)
+        loading = boundary_loading(system, valve, model.contact_valve, model.settings)
+        assert system.cables is not None
+        pressed = [contact_pressure(system, x) for x in simulation.frames]
+        # The samples are finer than the surface, whose two faces lie over the same ones.
+        at_face = np.tile(cKDTree(pressed[0][0]).query(valve.surface.vertices)[1], 2)
+        moving = {
+            "stress": [faces(nodal_stress(system, x)) for x in simulation.frames],
+            "contact_pressure": [values[at_face] for _, values in pressed],
+            "frames": [faces(x) for x in simulation.frames],
+            "tips": [loading(float(t)).tips for t in simulation.times],
+            "chord_end": [system.cables.patches(x) for x in simulation.frames],
+        }
+        return {name: np.stack(states).astype(np.float32) for name, states in moving.items()} | {
+            "times": simulation.times,
+            "triangles": surface.triangles.astype(np.int32),
+            "region": surface.region.astype(np.int8),
+            # Along the atrial faces.
+            "annulus": valve.annulus + len(valve.surface.vertices),
+            "chord_tip": system.cables.tip,
+            # Of faces, which are half a thickness nearer than midsurfaces on both sides.
+            "reach_mm": np.array(
+                model.contact_reach_mm - valve.surface.thickness[valve.free_edge].mean()
+            ),
+        }
+
+
+def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
+    """Close the configured valve with the configured moduli of the truth.
+
+    Parameters
+    ----------
+    values : mapping
+        The resolved configuration.
+    name : str
+        Of the progress bar.
+    """
+    model = closure_model(values)
+    truth = np.array(values["truth"]["values"], dtype=float)
+    with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
+        model.on_step = bar.step
+        result = model.close(truth, sensitivities=False, every_frame=True)
+    seen = values["observation"]
+    return Closing(model, result, anatomy_of(values).normals(seen["columns"], seen["rows"]))
+
+
+def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequence[str]) -> None:
+    """Draw some steps of a closure from the atrium and from the posterior side.
+
+    Parameters
+    ----------
+    part : Figure or SubFigure
+    path : Path
+        An ``.npz`` file with `Closing.arrays`.
+    steps : mapping of int to str
+        Number of a step -> its title. What leaks of the last one is painted.
+    names : sequence of str
+        Of the leaflets.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    from mvest.problem.fields import case_fields
+    from mvest.reporting.case import drawing
+    from mvest.reporting.figures import ATRIUM, View
+
+    try:
+        arrays = read_npz(path)
+        count = len(arrays["chord_tip"])
+        # The ends of the chordae are points of no triangle.
+        shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
+        own = {
+            "rest": shapes[0],
+            "frames": [f"{t:g} s" for t in arrays["times"][1:]],
+            "seen": np.ones(len(shapes) - 1, dtype=bool),
+            "chord_insertion": shapes.shape[1] - count + np.arange(count),
+        }
+        valve = case_fields(arrays | own, turned=False)
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
+    posterior = View("seen from the posterior side", 8.0, -90.0)
+    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35])
+    colours, last = drawing.leaflet_colours(valve.region), len(shapes) - 1
+    for column, (k, title) in zip(panels.T, steps.items(), strict=True):
+        for view, axes in zip((ATRIUM, posterior), column, strict=True):
+            shown = view is posterior
+            drawing.draw_valve(axes, valve, shapes[k], colours, view, k, chords=shown)
+        column[0].set_title(title, fontsize=10)
+    drawing.paint_leak(panels[0, -1], valve, shapes[last], last)
+    drawing.name_leaflets(panels[0, 0], valve, names)
+    drawn = [shapes[k] for k in steps]
+    drawing.same_scale(list(panels[0]), drawn, ATRIUM)
+    drawing.same_scale(list(panels[1]), [*drawn, *(valve.tips[k] for k in steps)], posterior)

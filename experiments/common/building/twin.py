@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ from mvest.valve.anatomy.valve import LeafletSurface, Valve
 def build_truth(
     config: Values, plain: ClosureModel, settings: MechanicsSettings, anatomy: Anatomy
 ) -> tuple[ClosureModel, StoredModel | Extrapolated]:
-    """The model that the observation is made from, and the same behind its store."""
+    """The model that the observation is made from, and the same behind its cache."""
     truth, element = config["truth"], config["mechanics"]["element"]
     changed, other = truth_mesh(config["mesh"], truth), truth["element"] or element
     coarser = list(truth["extrapolated_from"])
@@ -67,18 +67,8 @@ def build_truth(
         )
         if coarser:  # meshes as fine as these take minutes from the open valve
             model.guide = guide_of(model, anatomy, mesh)
-        described = {
-            "valve": config["valve"],
-            "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
-            "mesh": mesh if mesh["source"] == "tetwild" else _cells(mesh),
-            "element": other,
-            "dt_factor": truth["dt_factor"],
-            "tissue": {region: asdict(tissue) for region, tissue in settings.tissue.items()},
-            "fixed": model.fixed,
-            "observed": [config["observation"]["columns"], config["observation"]["rows"]],
-            "parameters": list(config["parameters"]),
-            **({"guided": True} if coarser else {}),
-        }
+        decisive = model.valve, model.contact_valve, model.mesh, settings, model.names, model.fixed
+        described = {"model": content_digest(*decisive), "guided": bool(coarser)}
         store = Store(config["paths"]["outputs"])
         return model, store.model("truth", model, described, MADE_BY)
 
@@ -131,11 +121,6 @@ def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
     return changed
 
 
-def _cells(mesh: Values) -> dict[str, Any]:
-    """What decides a structured mesh besides its element."""
-    return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
-
-
 MADE_BY = (closure_model, truth_mechanics, truth_mesh)
 """What makes the closures of a configured valve."""
 
@@ -167,8 +152,7 @@ class Twin:
     truth_model : ClosureModel
         The observation's; an object of its own.
     source : StoredModel or Extrapolated
-        ``truth_model`` behind its store on disk, carried on to cells of no size where that is asked
-        for.
+        ``truth_model`` behind its cache on disk, extrapolated to zero mesh size if configured.
     truth_values : (p,)
     valve : Valve
         The observed surface.
@@ -238,8 +222,8 @@ def build_twin(config: Values) -> Twin:
     # Each length is factorised once.
     correlated = cache(partial(SpatialCorrelation, valve.surface.vertices))
     errors = observation_errors(observation, valve.surface, correlated)
-    told_length = config["filter"]["R_correlation_mm"]
-    correlation = correlated(told_length) if told_length else None
+    assumed_length = config["filter"]["R_correlation_mm"]
+    correlation = correlated(assumed_length) if assumed_length else None
     plain = closure_model(config)
     model = replace(
         plain,
@@ -300,7 +284,7 @@ def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[Stud
 
 
 def expect_twin(config: Values, _folder: Path | None = None) -> str:
-    """What ``check=true`` says of a synthetic study: the answer of the Fisher information."""
+    """The expected information of a synthetic study, for ``check=true``."""
     twin = build_twin(config)
     start = twin.problem.start
     model = SharedStart(twin.model, start)

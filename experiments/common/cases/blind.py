@@ -21,8 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.cases.own_case import read_configured, run_case, run_volume
-from experiments.common.cases.settings import ImagedInput, PersonalSettings
+from experiments.common.cases.own_case import (
+    ImagedInput,
+    PersonalSettings,
+    read_configured,
+    run_case,
+    run_volume,
+)
 from experiments.common.records.record import NOT_GATED
 from experiments.common.schema import build
 from experiments.common.study import Result
@@ -79,7 +84,7 @@ def estimate_blindly(
     sealed : Path
         Folder that the process cannot open.
     gate : str
-        What the gate said of the anatomy.
+        Verdict of the gate on the anatomy.
 
     Raises
     ------
@@ -142,12 +147,11 @@ def main() -> int:
         seal(place)
     values = request["values"]
     try:
+        personal = build(PersonalSettings, values["personal"])
         if values.get("volume") is None:
             case = read_configured(values["case"])
-            personal = build(PersonalSettings, values["personal"])
             result = run_case(values, personal, case, gate=request["gate"])
         else:
-            personal = build(PersonalSettings, values["personal"])
             imaged = build(ImagedInput, values["imaged"])
             result = run_volume(values, values["volume"], imaged, personal, folder)
         write_estimate(folder, result)

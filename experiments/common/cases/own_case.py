@@ -1,14 +1,14 @@
-"""A configured case, or the valve in a configured volume, from its files to the result of a run."""
+"""A configured case, or the valve in a configured volume: settings, check, and result of a run."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
-from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.progress import PartBar, SolveBar
 from experiments.common.records.record import (
     FIELDS,
@@ -18,9 +18,9 @@ from experiments.common.records.record import (
     Record,
     has_passed,
 )
-from experiments.common.schema import Values
+from experiments.common.schema import InputFile, Reads, Values, build, contents
 from experiments.common.study import Result
-from mvest.cases.case import ValveCase
+from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.detected import (
     CASE,
@@ -28,24 +28,86 @@ from mvest.cases.from_images.detected import (
     detect_in_volume,
     read_for_case,
 )
+from mvest.cases.from_images.settings import ImagedSettings
 from mvest.cases.plausibility import doubts
+from mvest.cases.schema import files_of_case
 from mvest.errors import ConfigurationError
+from mvest.exchange.volumes import files_of_volume
 from mvest.imaging.detection.detect import NoValveError
+from mvest.mechanics.settings import ExponentialTissue
+from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.model import with_pressures
+from mvest.personalisation.check import expect_case
+from mvest.personalisation.geometry import ConsideredGeometry
+from mvest.personalisation.model import build_coarse, gate_case, gate_lines, with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
+from mvest.personalisation.result import Expected
 from mvest.personalisation.settings import (
+    CaseMesh,
+    PaperSettings,
     PersonaliseSettings,
+    PressureErrors,
     Prior,
     Treatment,
     with_stiffening,
 )
 from mvest.problem.record import Row
 from mvest.problem.registration import REGISTRATION
+from mvest.quantities import Count, Logarithm, Tolerance, Value
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 
 TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
+
+
+def _content_of(files_of: Callable[[Path], Any]) -> Reads:
+    """Marks a setting that names what ``files_of`` finds the files of."""
+    return Reads(lambda value, _: contents(files_of(Path(value))) or value)
+
+
+CaseInput = Annotated[str | None, _content_of(files_of_case)]
+"""Type of a setting that names the folder of a case."""
+
+VolumeInput = Annotated[str | None, _content_of(files_of_volume)]
+"""Type of a setting that names the file of a volume over time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnknownSettings:
+    """One quantity that is not known of a case: its prior, and what becomes of it."""
+
+    mean: Value
+    std: Value
+    treatment: Literal["estimated", "fixed"] = "estimated"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PersonalSettings:
+    """How a case is personalised (see mvest.personalisation.PersonaliseSettings)."""
+
+    unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
+    mesh: CaseMesh = field(default_factory=CaseMesh)
+    tolerance: Tolerance = 2e-3
+    max_iterations: Count = 15
+    largest_change: Logarithm = 0.2  # of a parameter's logarithm from one equilibrium to the next
+    paper: PaperSettings | None = None
+    moduli_only: bool = False  # estimate also with all nuisances fixed
+    confirm: bool = False  # close the fitted valve anew from the open one
+    correspondence: bool = True  # use corresponding vertices as such, where there are any
+    errors: ErrorBeliefs | None = None  # learn the errors that the case states
+    considered_geometry: ConsideredGeometry | None = None  # how well it is known; null: exactly
+    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)  # it may follow
+    pressures: PressureErrors | None = None  # of several closed frames, beside a common factor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImagedInput(ImagedSettings):
+    """From a volume to a case; what the settings name is read for the hash."""
+
+    model: InputFile = None
+    package_model: str | None = "${package_model:}"  # SHA-256 of the one for ultrasound
+    landmarks: Annotated[tuple[Any, ...], Reads(contents)] = ()
+    pressure_curve: InputFile = None
 
 
 def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettings:
@@ -83,11 +145,11 @@ def run_case(
     images: Mapping[str, tuple[Row, ...]] | None = None,
     gate: str = NOT_GATED,
 ) -> Result:
-    """Personalise a case; ``gate`` is what the gate said of its anatomy."""
+    """Personalise a case; ``gate`` is the verdict of the gate on its anatomy."""
     for sentence in () if images else case.derived:
         print(f"derived: {sentence}", file=sys.stderr)
-    for doubt in doubts(case):
-        print(f"doubtful: {doubt}", file=sys.stderr)
+    for value in doubts(case):
+        print(f"implausible: {value}", file=sys.stderr)
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
@@ -185,3 +247,68 @@ def write_report(folder: Path, record: Record) -> list[Path]:
         line=record.line,
         provenance=record.provenance.model_dump(),
     )
+
+
+def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) -> str:
+    """Check and draw a case, and say what an estimate of it could tell.
+
+    ``check.html`` in the folder says the same.
+
+    Parameters
+    ----------
+    values : mapping
+        The configuration.
+    case : ValveCase
+    folder : Path
+        Of the run.
+    gate : bool
+        Whether to test that its closed state is the only one, which takes minutes.
+    """
+    from mvest.reporting.case.figures import frames_figure
+    from mvest.reporting.case.report import check_page
+    from mvest.reporting.case.tables import expected_tables
+    from mvest.reporting.figures import save_figure_with
+
+    settings = settings_of(values, build(PersonalSettings, values["personal"]))
+    coarse = build_coarse(case, settings, mesh_store(values))
+    figure = frames_figure(case, coarse.contact_reach_mm)
+    drawn = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")
+    lines = _described(case)
+    if gate:
+        lines += gate_lines(gate_case(case, settings, mesh_store(values)))
+    strange = doubts(case)
+    lines += [f"{'MISTAKE?' if one.mistake else 'implausible'}: {one}" for one in strange]
+    lines.append(
+        f"Implausible values: {len(strange)}; look at them before anything is estimated "
+        "(strict=true refuses them)"
+        if strange
+        else "In order"
+    )
+    expected = Expected(reason="an open frame alone, from which nothing can be estimated")
+    if case.closed is not None:
+        with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
+            coarse.on_step = bar.step
+            expected = expect_case(case, settings, coarse)
+    page = check_page(folder, case.name, lines, expected, drawn[-1])
+    tables = expected_tables(expected) if expected.unknowns else {}
+    texts = [f"{name}\n{one.text()}" for name, one in tables.items()]
+    lacking = [f"what an estimate could tell is not known: {expected.reason}"]
+    return "\n".join([case.name, *lines, *(texts or lacking), f"drawn and written: {page}"])
+
+
+def _described(case: ValveCase) -> list[str]:
+    """A case as it was read, in lines."""
+    surface, tips = case.surface, case.frame(Role.REFERENCE).papillary_tips
+    lines = [
+        f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, leaflets "
+        f"{', '.join(surface.region_names)}; {len(case.chordae)} chordae from {len(tips)} "
+        "papillary tips"
+    ]
+    for frame in case.frames:
+        same = "same vertices as the reference" if frame.corresponds else "without correspondence"
+        lines.append(
+            f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
+            f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices"
+            + ("" if frame.role is Role.REFERENCE else f", {same}")
+        )
+    return [*lines, *(f"derived: {sentence}" for sentence in case.derived)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from experiments.common.cases import blind
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings
 from experiments.common.records.record import Record
 from experiments.common.study import Result, Results
 from mvest.errors import InputError

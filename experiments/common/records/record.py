@@ -1,6 +1,6 @@
-"""The record of a run: what ``result.json`` and the kept records in ``results/`` hold.
+"""The record of a run: the content of ``result.json`` and of the records in ``results/``.
 
-A study returns a `Result`; what a record says besides is stamped once, by the runner.
+A study returns a `Result`; the runner adds the rest of the record once.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, Field
 
 from mvest.errors import InputError
 from mvest.files import PREFIX, sha256_of, write_atomically
-from mvest.problem.record import EstimateRecord
+from mvest.problem.record import EstimateRecord, Frozen
 from mvest.provenance import provenance, require_sealed, sealed, write_json
-from mvest.reading.documents import read_mapping
-from mvest.reading.text import one_line
+from mvest.reading.documents import read_mapping, validated
 from mvest.reporting.tables import Table
 
 if TYPE_CHECKING:
@@ -36,17 +35,10 @@ HASH_DIGITS = 12
 """Digits of a hash that a line of text shows."""
 
 NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
-"""What the gate has said of an anatomy begins with one of these."""
+"""The verdict of the gate on an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
-M = TypeVar("M", bound=BaseModel)
 Number: TypeAlias = float | int | str | bool | None
-
-
-class Frozen(BaseModel):
-    """A part of a record: immutable, and without fields that it does not name."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class GitState(Frozen):
@@ -146,7 +138,7 @@ class Result(Frozen):
     Attributes
     ----------
     tables : mapping of str to Table
-        Tidy tables by name, kept as plain data (`table_of`); the one called ``""`` is the study's
+        Tidy tables by name, stored as plain data (`table_of`); the one called ``""`` is the study's
         main table.
     numbers : mapping
         Single values by name, with the unit at the end of the name; MLflow gets those that are
@@ -166,8 +158,8 @@ class Result(Frozen):
     model : Model or None
         Likewise.
     gate : str or None
-        What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
-        study uses none of the configured anatomies.
+        Verdict of the gate on the anatomy (see `experiments.common.building.gate`); None where the
+        study uses no configured anatomy.
     """
 
     tables: Annotated[Mapping[str, Any], BeforeValidator(_plain)] = {}
@@ -206,7 +198,7 @@ class Result(Frozen):
 
 
 class Record(Result):
-    """A finished run: what ``result.json`` and the kept records in ``results/`` hold.
+    """A finished run: the content of ``result.json`` and of the records in ``results/``.
 
     Attributes
     ----------
@@ -232,11 +224,11 @@ class Record(Result):
 
     @property
     def caution(self) -> str:
-        """What stands before a result whose anatomy has not passed the gate; else empty."""
+        """A warning where the anatomy has not passed the gate; else empty."""
         if self.gate == NOT_GATED:
             return (
-                "The gate was not asked of this anatomy: whether its closed state is the only one "
-                "is not known (experiment=gate; of one's own valve, check=true gate=true)."
+                "Uniqueness of the closed state was not tested for this anatomy (experiment=gate; "
+                "for your own valve check=true gate=true)."
             )
         if self.gate is not None and not has_passed(self.gate):
             return (
@@ -259,7 +251,7 @@ class Record(Result):
 
 
 def has_passed(gate: str) -> bool | None:
-    """Whether the gate was passed; None if it was not asked."""
+    """Whether the gate was passed; None if it was not run."""
     return None if gate == NOT_GATED else gate.startswith(PASSED_GATE)
 
 
@@ -365,22 +357,6 @@ def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:
     return sealed({ARRAYS: digest, **record.model_dump(mode="json")})
 
 
-def checked(kind: type[M], data: Mapping[str, Any], where: str, what: str) -> M:
-    """Plain data as a model of pydantic; in an error ``where`` names them, ``what`` the model.
-
-    Raises
-    ------
-    InputError
-        One line with the first field that is wrong.
-    """
-    try:
-        return kind.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = one_line(".".join(map(str, first["loc"])) or "it", 80)
-        raise InputError(f"{where} is no {what}: {field}: {first['msg']}") from error
-
-
 def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None) -> Record:
     """A record from plain data, which must be as they were written.
 
@@ -400,7 +376,7 @@ def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None)
     known = {key: value for key, value in data.items() if key not in ("sha256", ARRAYS)}
     if known.get("version") != VERSION:
         raise InputError(f"{where} is no record of this version ({VERSION})")
-    record = checked(Record, known, where, "record of a run")
+    record = validated(Record, known, where)
     require_sealed(data, where)
     if arrays is not None and data.get(ARRAYS) != (sha256_of(arrays) if arrays.is_file() else None):
         raise InputError(f"{where}: the arrays beside it are not those that it was written with")

@@ -20,8 +20,7 @@ from scipy.stats import chi2
 from experiments.common.building.gate import gate_of
 from experiments.common.building.patient_store import PatientPlace, make_patient
 from experiments.common.cases.blind import estimate_blindly
-from experiments.common.cases.check import check
-from experiments.common.cases.own_case import case_words, write_report
+from experiments.common.cases.own_case import PersonalSettings, case_words, check, write_report
 from experiments.common.cases.revealed import (
     Groups,
     grouped,
@@ -31,7 +30,6 @@ from experiments.common.cases.revealed import (
     unknowns_of,
     verdicts_and_skill,
 )
-from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import NOT_GATED, Number, Record
 from experiments.common.schema import Values, build
 from experiments.common.study import Job, Result, Results, Study
@@ -351,17 +349,9 @@ def _quantities(patients: Patients) -> dict[str, list[Unknown]]:
         for own in estimate.details.get("known", ()) if estimate.is_stated else ():
             name, numbers = str(own["name"]), record.numbers
             if f"true {name}" in numbers:
-                ends = {end: own[end] for end in ("estimate", "low", "high")}
-                truth, guess = numbers[f"true {name}"], numbers[f"else {name}"]
-                row = Unknown(
-                    name=name,
-                    kind="quantity",
-                    unit=own["unit"],
-                    prior_mean=guess,
-                    truth=truth,
-                    **ends,
-                )
-                groups.setdefault(name, []).append(row)
+                row = {key: own[key] for key in ("name", "unit", "estimate", "low", "high")}
+                row |= {"truth": numbers[f"true {name}"], "prior_mean": numbers[f"else {name}"]}
+                groups.setdefault(name, []).append(Unknown(kind="quantity", **row))
     return groups
 
 

@@ -6,7 +6,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 
-from experiments.doors import export_command
+from experiments import cli
 from mvest.cases.folder import write_case
 from mvest.errors import InputError
 from mvest.exchange.exporting.febio import FebioOptions, export_febio
@@ -240,9 +240,9 @@ def test_records_of_something_else_are_refused(tmp_path):
 
 def test_from_the_console(folder, tmp_path, capsys):
     words = ["febio", str(folder), str(tmp_path / "a.feb"), "columns=12", "rows=2", "E_f=[7,2]"]
-    assert export_command(words) == 0
+    assert cli.main(["export", *words]) == 0
     assert "a.feb" in capsys.readouterr().out
     root = Xml.parse(tmp_path / "a.feb").getroot()
     assert [float(e.text) for e in root.findall("Material/material/Ez")] == [7.0, 2.0]
-    assert export_command(["febio", str(folder), str(tmp_path / "a.txt")]) == 2
+    assert cli.main(["export", "febio", str(folder), str(tmp_path / "a.txt")]) == 2
     assert ".feb" in capsys.readouterr().err

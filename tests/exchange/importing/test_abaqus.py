@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.doors import import_command
+from experiments import cli
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
@@ -31,7 +31,7 @@ def source(tmp_path: Path) -> Path:
 def test_a_closure_becomes_a_case(source: Path, tmp_path: Path, capsys) -> None:
     words = [f"{key}={value}".replace("'", "").replace("(", "[").replace(")", "]").replace(" ", "")
              for key, value in SETS.items()]  # fmt: skip
-    assert import_command(["abaqus", str(source), str(tmp_path / "case"), *words]) == 0
+    assert cli.main(["import", "abaqus", str(source), str(tmp_path / "case"), *words]) == 0
     assert "1 mm assumed; std_mm=... states it" in capsys.readouterr().out
     case = read_case(tmp_path / "case")
     valve = read_recording(source, **NAMES).valve

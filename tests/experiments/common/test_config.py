@@ -4,7 +4,7 @@ from experiments.common.building.filters import build_filter
 from experiments.common.building.twin import build_twin, truth_mesh
 from experiments.common.config import hash_of
 from experiments.common.schema import build
-from experiments.results.publish import as_published
+from experiments.results.published import as_published
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
 from tests.experiments.configured import composed, plain

@@ -14,7 +14,7 @@ import pytest
 import mvest.files
 from experiments.common.config import hash_of
 from experiments.common.schema import Reads, build
-from experiments.common.study import load_settings, study_names
+from experiments.common.study import load_study, study_names
 from experiments.run import main
 from experiments.studies.imported import DonorSettings, recorded_valve
 from mvest.cases.folder import write_case
@@ -41,7 +41,7 @@ def marked(cls: type, above: str = "") -> Iterator[str]:
                 yield from marked(kind, f"{above}{field.name}.")
 
 
-SETTINGS = [(study, name) for study in study_names() for name in marked(load_settings(study))]
+SETTINGS = [(study, name) for study in study_names() for name in marked(load_study(study).settings)]
 
 
 def test_the_settings_that_name_files_are_found():

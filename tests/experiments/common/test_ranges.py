@@ -15,7 +15,7 @@ from experiments.common.schema import (
     require_admissible_values,
     validated,
 )
-from experiments.common.study import load_settings, study_names
+from experiments.common.study import load_study, study_names
 from experiments.runner.cluster import EngineSettings
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
@@ -56,7 +56,7 @@ def without_range(kind: object, key: str = "") -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "kind",
-    [Config, *map(load_settings, study_names())],
+    [Config, *(load_study(name).settings for name in study_names())],
     ids=lambda kind: f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}",
 )
 def test_every_number_has_a_range(kind: type) -> None:

@@ -11,7 +11,7 @@ from pandas import read_csv, read_parquet
 from experiments.cli import main
 from experiments.common.records.record import write_record
 from experiments.results.estimates import COLUMNS, estimate_table, write_estimates
-from experiments.results.keep import write_records
+from experiments.results.published import write_records
 from experiments.sweeps.collected import write_sweep_file
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown

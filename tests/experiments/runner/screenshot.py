@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.runner.dashboard import last_sweep, serving
+from experiments.runner.tracking import last_sweep, serving
 from mvest.errors import InputError, MvestError
 from mvest.processes import run
 

@@ -16,7 +16,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from experiments.runner import dashboard
+from experiments.runner import tracking
 from mvest.errors import InputError
 from tests.experiments.runner import screenshot
 from tests.places import ROOT
@@ -41,9 +41,9 @@ def outputs(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def shown(outputs) -> str:
     """The comparison's page as it is drawn."""
-    place, page, _ = dashboard.last_sweep(outputs)
+    place, page, _ = tracking.last_sweep(outputs)
     try:
-        with dashboard.serving(place, 0, quiet=True) as (address, _):
+        with tracking.serving(place, 0, quiet=True) as (address, _):
             return screenshot.look_at(address + page, "--dump-dom")
     except InputError as error:
         if "not installed" in str(error):
@@ -54,7 +54,7 @@ def shown(outputs) -> str:
 def test_the_page_compares_every_run_and_calls_it_by_what_differs(shown, outputs) -> None:
     jobs = json.loads((outputs / "sweep_debug" / "plan.json").read_text())["jobs"]
     assert f"Comparing {len(jobs)} Runs" in shown
-    runs = re.findall(r"[0-9a-f]{32}", unquote(dashboard.last_sweep(outputs)[1]))
+    runs = re.findall(r"[0-9a-f]{32}", unquote(tracking.last_sweep(outputs)[1]))
     assert set(re.findall(r"/runs/([0-9a-f]{32})", shown)) == set(runs)
     assert len(runs) == len(jobs) == 4
     for job in jobs:
@@ -83,13 +83,13 @@ def test_the_picture_is_made(outputs, shown, tmp_path) -> None:
 @pytest.fixture(scope="module")
 def address(outputs) -> Iterator[str]:
     """Of a server on the sweep, whatever the login shell says of whom to answer."""
-    place, _, _ = dashboard.last_sweep(outputs)
+    place, _, _ = tracking.last_sweep(outputs)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MLFLOW_SERVER_ALLOWED_HOSTS", "*")
         patch.setenv("MLFLOW_SERVER_CORS_ALLOWED_ORIGINS", "*")
         patch.setenv("MLFLOW_SERVER_DISABLE_SECURITY_MIDDLEWARE", "true")
-        with dashboard.serving(place, 0, quiet=True) as (at, _):
-            yield at.replace(dashboard.HOST, "127.0.0.1")
+        with tracking.serving(place, 0, quiet=True) as (at, _):
+            yield at.replace(tracking.HOST, "127.0.0.1")
 
 
 def asked(address: str, *, host: str, origin: str = "", path: str = "experiments/search") -> int:
@@ -121,11 +121,11 @@ def test_only_its_own_page_is_answered(address, host, origin, status) -> None:
 
 
 def test_no_module_of_the_working_folder_is_run(outputs, tmp_path, monkeypatch) -> None:
-    place, _, _ = dashboard.last_sweep(outputs)
+    place, _, _ = tracking.last_sweep(outputs)
     for name in ("mlflow", "uvicorn", "fastapi", "sqlalchemy", "click", "filelock", "json", "ssl"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
     monkeypatch.chdir(tmp_path)
-    with dashboard.serving(place, 0, quiet=True):
+    with tracking.serving(place, 0, quiet=True):
         assert not (tmp_path / "ran").exists()
 
 
@@ -166,6 +166,6 @@ def test_a_stopped_dashboard_leaves_no_server_behind(outputs, tmp_path, end, sta
 def test_a_server_that_ends_is_not_waited_for(outputs) -> None:
     with (
         pytest.raises(InputError, match="did not start"),
-        dashboard.serving("nonsense://place", 0, quiet=True),
+        tracking.serving("nonsense://place", 0, quiet=True),
     ):
         pytest.fail("it cannot serve this")

@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from experiments.sweeps.collected import read_sweep
-from tests.experiments.runner.test_shards import FAKE, WORKER, is_in, runs, until
+from tests.experiments.runner.test_shards import FAKE, WORKER, runs
 from tests.places import ROOT
+from tests.processes import command_of, linux, living, until
 
 pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
+pytestmark = linux
 
 FOLDER = Path("outputs/debug")
 CLUSTER = ("hydra.launcher.cluster=LocalCluster", "hydra.launcher.jobs=2")
@@ -49,12 +50,7 @@ def sweep(tmp_path, monkeypatch):
         )
 
     yield start
-    until(lambda: not left(tmp_path))
-
-
-def left(folder: Path) -> list[Path]:
-    """Processes that work in a folder."""
-    return [place for place in Path("/proc").glob("[0-9]*") if is_in(place, folder)]
+    until(lambda: not living(tmp_path))
 
 
 def parents(pid: int) -> list[int]:
@@ -111,7 +107,7 @@ def test_nothing_runs_on_when_the_command_is_ended(sweep, tmp_path, number):
     os.kill(running.pid, number)
     out, _ = running.communicate(timeout=60)
     assert running.returncode == (130 if number == signal.SIGINT else -9), out
-    until(lambda: not left(tmp_path))
+    until(lambda: not living(tmp_path))
     begun = runs()
     time.sleep(1.0)
     assert runs() == begun
@@ -121,7 +117,7 @@ def test_a_cluster_of_this_machine_listens_on_this_machine_only(sweep, tmp_path)
     Path("wait-3").touch()
     running = sweep()
     until(lambda: 3 in runs())
-    pids = {running.pid, *map(_pid, left(tmp_path))}
+    pids = {running.pid, *living(tmp_path)}
     listed = subprocess.run(["ss", "-ltnpH"], capture_output=True, text=True, check=True).stdout
     own = [
         line.split()[3]
@@ -135,14 +131,10 @@ def test_a_cluster_of_this_machine_listens_on_this_machine_only(sweep, tmp_path)
     assert all(address.startswith(("127.0.0.1:", "[::1]:")) for address in own), own
 
 
-def _pid(place: Path) -> int:
-    return int(place.name)
-
-
 def _dask_workers(folder: Path, client: int) -> set[int]:
     """Processes of dask's workers: children of the client that jobs hang below."""
     return {
         pid
-        for pid in map(_pid, left(folder))
-        if client in parents(pid)[:1] and b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        for pid in living(folder)
+        if client in parents(pid)[:1] and "spawn_main" in command_of(pid)
     }

@@ -18,9 +18,10 @@ from experiments.common.records.record import VERSION, Record, stamp, write_reco
 from experiments.common.study import Result
 from experiments.runner import engine
 from experiments.runner import job as child
-from experiments.runner.engine import WorkerProcess, run_apart
+from experiments.runner.engine import WorkerProcess
 from experiments.runner.jobs import (
     Request,
+    attempt,
     is_done,
     last_record,
     lock,
@@ -52,6 +53,10 @@ def worker():
     found = WorkerProcess((sys.executable, "-c", OBEDIENT))
     yield found
     found.close()
+
+
+def run_in(worker: WorkerProcess, asked: Request) -> Record:
+    return attempt(asked, lambda: worker.run(asked))
 
 
 TRUTH = {
@@ -119,7 +124,7 @@ def said(folder: Path) -> dict:
 )
 def test_whatever_ends_a_job_costs_its_own_row(worker, tmp_path, order, reason):
     asked = request(tmp_path / "job", **order)
-    record = run_apart(asked, worker)
+    record = run_in(worker, asked)
     assert record.status == "failed"
     assert reason in record.reason
     assert record.factors == {"k": 1}
@@ -162,7 +167,7 @@ def test_a_process_without_a_job_leaves_by_itself_and_a_busy_one_does_not(tmp_pa
 def test_a_stopped_worker_and_its_supervisor_do_not_escape_their_time_limit(worker, tmp_path):
     asked = request(tmp_path, sleep=60, limit=3.0)
     reasons = []
-    waits = threading.Thread(target=lambda: reasons.append(run_apart(asked, worker).reason))
+    waits = threading.Thread(target=lambda: reasons.append(run_in(worker, asked).reason))
     waits.start()
     until(lambda: worker._program is not None)
     for pid in (worker._program.process.pid, worker._program.pid):
@@ -184,7 +189,7 @@ def test_a_process_that_cannot_be_started_is_one_clear_line(worker, tmp_path, mo
 
     monkeypatch.setattr(engine, "Program", fails)
     with pytest.raises(InputError) as refused:
-        run_apart(request(tmp_path), worker)
+        run_in(worker, request(tmp_path))
     assert str(refused.value) == f"no process for {tmp_path}: Too many open files"
 
 
@@ -192,16 +197,16 @@ def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
     asked = request(tmp_path, signal=9)
     done = converged(asked)
     mark_done(tmp_path)
-    assert run_apart(asked, worker) == done
+    assert run_in(worker, asked) == done
     asked.values["force"] = True
-    assert run_apart(asked, worker).status == "failed"
+    assert run_in(worker, asked).status == "failed"
     assert not is_done(tmp_path)
 
 
 def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
     converged(request(tmp_path), "1" * 64)
     mark_done(tmp_path)
-    assert run_apart(request(tmp_path, exit=3), worker).status == "failed"
+    assert run_in(worker, request(tmp_path, exit=3)).status == "failed"
 
 
 def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_path, capsys):
@@ -210,7 +215,7 @@ def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_pat
     mark_done(tmp_path)
     write_json(tmp_path / "result.json", changed(tmp_path, numbers={"a_mm": 2.0}))
     assert last_record(tmp_path, "0" * 64) is None
-    run_apart(asked, worker)
+    run_in(worker, asked)
     assert said(tmp_path), "the worker was asked"
     assert capsys.readouterr().err.splitlines() == [
         f"note: {tmp_path / 'result.json'}: its content is not what was written (SHA-256 does not "
@@ -240,11 +245,11 @@ def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
 def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_path, order, capsys):
     asked = request(tmp_path, **order)
     record = converged(asked)
-    assert run_apart(asked, worker) == record
+    assert run_in(worker, asked) == record
     assert "the same command writes what is missing" in capsys.readouterr().err
     assert last_record(tmp_path, "0" * 64) is None, "of which not everything is written"
     asked.values["force"] = True
-    assert run_apart(asked, worker).status == "failed"
+    assert run_in(worker, asked).status == "failed"
 
 
 @pytest.mark.parametrize(
@@ -259,7 +264,7 @@ def test_a_damaged_result_is_none(worker, tmp_path, content):
     (tmp_path / "result.json").write_text(content)
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) is None
-    assert run_apart(request(tmp_path, exit=3), worker).status == "failed"
+    assert run_in(worker, request(tmp_path, exit=3)).status == "failed"
 
 
 def test_a_second_process_says_that_it_waits_for_the_folder(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from mlflow.server.security_utils import is_allowed_host_header
 
 from experiments.cli import main
-from experiments.runner import dashboard
+from experiments.runner import tracking
 from mvest.errors import InputError
 
 OWN = ("127.0.0.1:5000", "localhost:5000", "[::1]:5000", "mvest.localhost:5000")
@@ -34,12 +34,12 @@ OTHERS = (
 
 @pytest.mark.parametrize("host", OWN)
 def test_its_own_address_is_answered(host: str) -> None:
-    assert is_allowed_host_header(dashboard.allowed_hosts(5000), host)
+    assert is_allowed_host_header(tracking.allowed_hosts(5000), host)
 
 
 @pytest.mark.parametrize("host", OTHERS)
 def test_no_other_name_is(host: str) -> None:
-    assert not is_allowed_host_header(dashboard.allowed_hosts(5000), host)
+    assert not is_allowed_host_header(tracking.allowed_hosts(5000), host)
 
 
 def test_a_port_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,6 +52,6 @@ def test_a_port_that_is_taken_is_refused() -> None:
         port = taken.getsockname()[1]
         with (
             pytest.raises(InputError, match=f"port {port} cannot be used"),
-            dashboard.serving("sqlite://", port),
+            tracking.serving("sqlite://", port),
         ):
             pytest.fail("it cannot serve there")

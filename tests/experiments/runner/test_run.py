@@ -374,7 +374,7 @@ def test_results_that_could_not_be_renewed_are_renewed_by_the_same_command(
         raise InputError("records are damaged")
 
     with monkeypatch.context() as patch:
-        patch.setattr("experiments.results.publish.publish", damaged)
+        patch.setattr("experiments.results.published.publish", damaged)
         status, _, err = run(*usual)
     assert (status, err.splitlines()[-1]) == (2, "error: records are damaged")
     status, out, _ = run(*usual)

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,7 @@ from experiments.runner.plan import Plan
 from experiments.sweeps.collected import read_sweep
 from mvest.errors import InputError
 from tests.places import ROOT
+from tests.processes import alive, linux, until
 
 FAKE = str(Path(__file__).parents[0] / "fake_worker.py")
 PLAN = (
@@ -65,14 +65,7 @@ def mvest(*arguments: str, **settings) -> subprocess.Popen[str]:
     )
 
 
-def until(condition) -> None:
-    stop = time.monotonic() + 120.0
-    while not condition():
-        assert time.monotonic() < stop, "waited in vain"
-        time.sleep(0.02)
-
-
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
+@linux
 def test_an_interrupted_sweep_stops_at_once_and_records_nothing_of_what_ran(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("wait-4").touch()
@@ -84,8 +77,7 @@ def test_an_interrupted_sweep_stops_at_once_and_records_nothing_of_what_ran(tmp_
     assert sweep.returncode == 130, out
     assert "4 of 12 jobs done, 0 without an estimate, 8 not finished" in out
     assert runs() == list(range(6)), "nothing begins after that"
-    here = [place for place in Path("/proc").glob("[0-9]*") if is_in(place, tmp_path)]
-    assert not here, "a process was left behind"
+    assert not alive(tmp_path), "a process was left behind"
 
     Path("wait-4").unlink()
     Path("wait-5").unlink()
@@ -96,21 +88,16 @@ def test_an_interrupted_sweep_stops_at_once_and_records_nothing_of_what_ran(tmp_
     assert runs() == sorted([*range(12), 4, 5])
 
 
-def is_in(process: Path, folder: Path) -> bool:
-    """Whether a process that lives, not this one, works in a folder."""
-    try:
-        lives = (process / "stat").read_text().rsplit(") ", 1)[1][0] != "Z"
-        return lives and int(process.name) != os.getpid() and (process / "cwd").readlink() == folder
-    except OSError:
-        return False
-
-
 @pytest.mark.parametrize("text", ["0/4", "5/4", "2", "2/0", "a/b", "-1/4"])
-def test_what_is_no_shard_is_refused(planned, capsys, text):
+def test_what_is_no_shard_or_no_sweep_is_refused(tmp_path, monkeypatch, capsys, text):
+    monkeypatch.chdir(tmp_path)
     assert cli.main(["worker", str(FOLDER), f"--shard={text}"]) == 2
     assert capsys.readouterr().err == (
         f"error: shard {text}, expected I/N with I from 1 to N, for example 2/8\n"
     )
+    for command in ("worker", "collect"):
+        assert cli.main([command, "nowhere"]) == 2
+        assert capsys.readouterr().err == "error: no sweep is planned in nowhere\n"
 
 
 def test_a_plan_is_read_as_it_was_written(planned, monkeypatch, tmp_path):
@@ -157,7 +144,7 @@ def test_the_same_shard_started_twice_does_no_job_twice(planned):
     assert runs() == list(range(12))
 
 
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="a worker ends as Linux lets it")
+@linux
 def test_a_killed_shard_loses_the_job_in_flight_and_a_second_one_finishes(planned, capsys):
     Path("wait-6").touch()
     shard = mvest("worker", str(FOLDER), "--shard", "1/2")
@@ -203,18 +190,3 @@ def test_jobs_that_are_forced_run_again_once(planned, monkeypatch):
         assert cli.main(["worker", str(FOLDER), "--shard", "1/2"]) == 0
     assert cli.main(["worker", str(FOLDER), "--shard", "2/2"]) == 0
     assert runs() == sorted([*range(12)] * 2)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("worker", "nowhere"), "no sweep is planned in nowhere"),
-        (("collect", "nowhere"), "no sweep is planned in nowhere"),
-    ],
-)
-def test_a_wrong_share_is_one_clear_line(planned, capsys, arguments, words):
-    assert cli.main(list(arguments)) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("error: ")
-    assert words in err
-    assert len(err.splitlines()) == 1

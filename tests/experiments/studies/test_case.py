@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.common.cases.own_case import settings_of
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings, settings_of
 from experiments.common.config import hash_of
 from experiments.common.records.record import NOT_GATED, read_record, stamp, write_record
 from experiments.common.schema import build
@@ -152,7 +151,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
 
 def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
     built = use(monkeypatch)
-    monkeypatch.setattr("experiments.common.cases.check.build_coarse", check.build_coarse)
+    monkeypatch.setattr("experiments.common.cases.own_case.build_coarse", check.build_coarse)
     monkeypatch.setattr(
         "mvest.personalisation.estimation.estimate",
         lambda *a, **k: pytest.fail("something was estimated"),

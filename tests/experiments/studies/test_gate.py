@@ -11,7 +11,7 @@ from experiments.common.places import GATE_RECORDS
 from experiments.common.records.record import NOT_GATED, Record, has_passed, read_record, stamp
 from experiments.common.records.writer import cautions, write_results
 from experiments.common.study import Result, Results
-from experiments.results.keep import records_of, write_records
+from experiments.results.published import records_of, write_records
 from experiments.studies.gate import STUDY
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, MAX_LIMIT, MEAN_LIMIT, GateCase

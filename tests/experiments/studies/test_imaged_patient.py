@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from experiments.common.cases import blind
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings
 from experiments.common.records.record import Record
 from experiments.common.schema import build
 from experiments.common.study import Job, Results
-from experiments.results.keep import publish, records_of
+from experiments.results.published import publish, records_of
 from experiments.studies import imaged_patient
 from experiments.studies.imaged_patient import (
     HIDDEN,

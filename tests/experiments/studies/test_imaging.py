@@ -9,7 +9,7 @@ import pytest
 
 from experiments.common.records.record import Record, read_record
 from experiments.common.schema import build
-from experiments.results.keep import publish, regenerate
+from experiments.results.published import publish, regenerate
 from experiments.run import main
 from experiments.studies.imaging import study as imaging
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore

@@ -8,8 +8,7 @@ import pytest
 
 from experiments.common.building import patient_store
 from experiments.common.cases.blind import SECRET, read_estimate, write_estimate
-from experiments.common.cases.own_case import read_configured, run_case
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.own_case import PersonalSettings, read_configured, run_case
 from experiments.common.records.record import NOT_GATED, stamp
 from experiments.common.schema import build
 from experiments.common.study import Job

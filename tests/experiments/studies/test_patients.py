@@ -11,7 +11,7 @@ import pytest
 
 from experiments.common.records.record import Record
 from experiments.common.study import Results
-from experiments.results.keep import publish, records_of
+from experiments.results.published import publish, records_of
 from experiments.studies.patient import study
 from experiments.studies.patient.figures import figure_3, ranks_figure
 from experiments.studies.patient.study import KEPT_ARRAYS, STUDY, figure, keep, summary

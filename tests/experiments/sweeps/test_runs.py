@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pandas import read_csv
 
-from experiments.sweeps.runs import by_setting, factors_of, runs_of, shortened
+from experiments.sweeps.report import by_setting, factors_of, runs_of, shortened
 from mvest.estimation.estimate import NOT_THE_POSTERIOR
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,

@@ -1,29 +1,106 @@
-"""``results/records``: kept records, and the tables and figures that follow from them.
+"""The published results: which runs they take over, their records, and what follows from these.
 
 ``results/records/TABLE.jsonl`` holds the records of a table, one a line; what figures need of a
-run's arrays lies in ``results/records/TABLE/NAME.npz``.
+run's arrays lies in ``results/records/TABLE/NAME.npz``. A run is taken over only if it was run as
+it is configured.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from filelock import FileLock
+from omegaconf import DictConfig
 
+from experiments.common.config import is_hashed
 from experiments.common.records.record import FIELDS, Record, record_from, sealed_record
 from experiments.common.records.writer import write_results
 from experiments.common.study import Results, Study, load_study
+from experiments.sweeps.collected import SWEEPS, Sweep, read_sweeps, write_sweep_file
+from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.reading.documents import parse_json
 
 RECORDS = "records"
-"""Folder of the kept records within the results."""
+"""Folder of the records within the results."""
+
+
+def publish_as(
+    values: Mapping[str, Any], overrides: Sequence[str], swept: Mapping[str, Any] | None
+) -> str | None:
+    """Name of a run's record in the results; None where they are not to be touched.
+
+    ``swept`` is what the experiment itself varies (empty: nothing) if this is one run of several.
+    """
+    # A sweep is published as a whole.
+    published = values["publish"] and not values["sweep"]
+    if not published or not as_published(overrides, swept, values["study"]):
+        return None
+    if swept is None:
+        return str(values["name"])
+    return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
+
+
+def as_published(
+    overrides: Sequence[str], swept: Mapping[str, Any] | None, study: str | None
+) -> bool:
+    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
+    allowed = {"experiment", "hydra", *(swept or {})}
+    keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
+    return all({key, key.partition(".")[0]} & allowed or not is_hashed(key, study) for key in keys)
+
+
+def as_configured(config: DictConfig) -> bool:
+    """Whether a sweep is run as it is published: nothing but its size is chosen."""
+    task = config.hydra.overrides.task
+    changed = [line for line in task if line.startswith("sweep.")]
+    sized = all(line.startswith("sweep.size=") for line in changed)
+    return sized and as_published(task, None, config.study)
+
+
+def publish_runs(runs: Iterable[tuple[str | None, Record | None, Path, Path]]) -> None:
+    """Let the results take over runs that have records of their own there.
+
+    Parameters
+    ----------
+    runs : iterable of tuple
+        Name (None: the results are not to be touched), record, folder, and folder of the results.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    groups: dict[tuple[Path, str, str], dict[str, tuple[Record, Path]]] = {}
+    for name, record, folder, results in runs:
+        if name and record and (record.converged or load_study(record.study).keeps_failures):
+            group = results, record.study, record.table
+            groups.setdefault(group, {})[name] = record, folder
+    for (results, study, _), named in groups.items():
+        publish(load_study(study), results, named)
+        print(f"Results in {results}")
+
+
+def publish_sweep(results: Path, sweep: Sweep) -> None:
+    """Let the results take over a sweep.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    folder = results / SWEEPS
+    folder.mkdir(parents=True, exist_ok=True)
+    write_sweep_file(folder / f"{sweep.name}.json", sweep)
+    write_sweep(results, sweep)
+    print(f"Results in {results}")
 
 
 def arrays_of(folder: Path, name: str) -> dict[str, Path]:
@@ -61,11 +138,11 @@ def publish(
             records = {} if known is None else dict(known.records)
             for name, (record, folder) in runs.items():
                 own = arrays_of(folder, name)
-                kept = study.keep_arrays(record, own[name]) if own else {}
-                if kept:
+                stored = study.keep_arrays(record, own[name]) if own else {}
+                if stored:
                     (place / table).mkdir(exist_ok=True)
                     path = _arrays(results, table, name)
-                    write_atomically(path, partial(np.savez_compressed, **kept))
+                    write_atomically(path, partial(np.savez_compressed, **stored))
                 records[name] = study.keep(record)
                 arrays |= own
             write_records(results, table, records)
@@ -79,7 +156,7 @@ def publish(
 
 
 def regenerate(results: Path) -> list[Path]:
-    """Write every table and figure again that follows from kept records.
+    """Write every table, figure and page again that follows from published records and sweeps.
 
     Raises
     ------
@@ -87,7 +164,8 @@ def regenerate(results: Path) -> list[Path]:
         If there is no record, or one is damaged or not as it was written.
     """
     paths = sorted((results / RECORDS).glob("*.jsonl"))
-    if not paths:
+    sweeps = read_sweeps(results)
+    if not paths and not sweeps:
         raise InputError(
             f"{results / RECORDS} holds no record; run an experiment first, for example "
             "mvest run experiment=table1"
@@ -97,11 +175,13 @@ def regenerate(results: Path) -> list[Path]:
         found = records_of(results, path.stem)
         assert found is not None
         written += write_results(results, load_study(found.first.study), found)
+    for sweep in sweeps:
+        written += write_sweep(results, sweep)
     return written
 
 
 def records_of(results: Path, table: str) -> Results | None:
-    """The kept records of a table, the one of its name first; None if there is none.
+    """The published records of a table, the one of its name first; None if there is none.
 
     Raises
     ------

@@ -1,3 +1,5 @@
+"""Published records: stored, checked, and everything that follows from them."""
+
 import json
 
 import numpy as np
@@ -6,10 +8,13 @@ import pytest
 
 from experiments.cli import main
 from experiments.common.records.record import Record
-from experiments.results.keep import publish, records_of, regenerate
+from experiments.results.published import publish, records_of, regenerate
 from experiments.studies.twin import STUDY
+from experiments.sweeps.collected import Sweep, write_sweep_file
+from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import made_up_twin
+from tests.experiments.sweeps.made_up_sweeps import TRUTH, job, run, sweep
 from tests.places import ROOT
 
 
@@ -66,17 +71,12 @@ def test_errors_are_without_sign_and_in_percent_of_the_truth(tmp_path) -> None:
     assert table["moduli error mean [%]"][0] == pytest.approx(0.0056, rel=1e-3)
 
 
-def test_an_empty_folder_says_what_to_run(tmp_path) -> None:
-    with pytest.raises(InputError, match=r"experiment=table1"):
-        regenerate(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("{", "not JSON"),
         (json.dumps({"name": "a", "record": {"version": 2}}), "no record of this version"),
-        (json.dumps({"name": "a", "record": {"version": 3}}), "no record of a run: study"),
+        (json.dumps({"name": "a", "record": {"version": 3}}), "record a: study: .*Field required"),
     ],
 )
 def test_a_damaged_record_is_named(tmp_path, text: str, words: str) -> None:
@@ -118,3 +118,28 @@ def test_every_committed_record_is_as_it_was_written() -> None:
         found = records_of(ROOT / "results", table)
         assert found is not None
         assert all(record.table == table for record in found.records.values())
+
+
+def small() -> Sweep:
+    jobs = [job({"filter": name}, [run(1, TRUTH * 1.02, [0.1, 0.1])]) for name in ("ekf", "iekf")]
+    return sweep("filter", [*jobs, job({"filter": "lost"}, [], "killed (signal 9)")])
+
+
+def test_tables_are_made_again_from_published_sweeps_alone(tmp_path, capsys) -> None:
+    place = tmp_path / "sweeps" / "filter.json"
+    place.parent.mkdir()
+    write_sweep_file(place, small())
+    write_sweep(tmp_path, small())
+    before = {path.name: path.read_bytes() for path in tmp_path.glob("sweep_*")}
+    for name in before:
+        (tmp_path / name).unlink()
+    assert main(["tables", str(tmp_path)]) == 0
+    assert before == {path.name: path.read_bytes() for path in tmp_path.glob("sweep_*")}
+    kept(tmp_path, "table1", made_up_twin())
+    assert main(["tables", str(tmp_path)]) == 0
+    page = tmp_path / "table1.md"
+    assert str(page) in capsys.readouterr().out
+    assert page.is_file()
+    place.write_text("{", encoding="utf-8")
+    assert main(["tables", str(tmp_path)]) == 2
+    assert "filter.json is not JSON" in capsys.readouterr().err

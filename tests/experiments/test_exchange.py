@@ -1,4 +1,4 @@
-"""Words for other programs' files: found by name, asked in words, one line if wrong."""
+"""Importers and exporters: found by name, options in words, one line if wrong."""
 
 import importlib
 import sys
@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 
-from experiments import cli, doors
+from experiments import cli, exchange
 from mvest.cases.folder import read_case
 from tests.made_up_closure import made_up_case
 
@@ -46,19 +46,19 @@ MODULE = '''
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """A package with one door, in place of those that ship."""
-    folder = tmp_path / "made_up_doors"
+    """A package with one importer and exporter, in place of those that ship."""
+    folder = tmp_path / "made_up_exchange"
     folder.mkdir()
     (folder / "__init__.py").write_text("")
     (folder / "other.py").write_text(textwrap.dedent(MODULE))
-    (folder / "neighbour.py").write_text('"""No door."""')
+    (folder / "neighbour.py").write_text('"""No importer."""')
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    module = importlib.import_module("made_up_doors")
-    monkeypatch.setattr(doors, "importing", module)
-    monkeypatch.setattr(doors, "exporting", module)
+    module = importlib.import_module("made_up_exchange")
+    monkeypatch.setattr(exchange, "importing", module)
+    monkeypatch.setattr(exchange, "exporting", module)
     yield
-    for name in [name for name in sys.modules if name.startswith("made_up_doors")]:
+    for name in [name for name in sys.modules if name.startswith("made_up_exchange")]:
         del sys.modules[name]
 
 
@@ -107,7 +107,7 @@ def test_an_existing_case_stays_and_nothing_is_read_for_it(package, tmp_path, ca
     assert [path.name for path in (tmp_path / "case").iterdir()] == ["mine"]
 
 
-def test_help_lists_doors_and_their_options(package, capsys):
+def test_help_lists_importers_and_their_options(package, capsys):
     for words, said in (
         (["import"], "other        A valve as another program has it."),
         (["import", "--help"], "other        A valve"),

@@ -1,8 +1,8 @@
 """``mvest import`` and ``mvest export``: other programs' files to a case, and from one.
 
-What there is to import and export is what lies in `mvest.exchange.importing` and
-`mvest.exchange.exporting`: the functions ``import_MODULE`` and ``export_MODULE``, whose last
-argument is a frozen dataclass of options. Nothing is listed here.
+Importers and exporters are found in `mvest.exchange.importing` and `mvest.exchange.exporting`: the
+functions ``import_MODULE`` and ``export_MODULE``, whose last argument is a frozen dataclass of
+options. Nothing is listed here.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from types import ModuleType
 from typing import Any
 
 from experiments.common.schema import from_words
-from experiments.console import Parser, interruptible
+from experiments.console import Parser
 from mvest.cases.folder import require_new, write_case
 from mvest.exchange import exporting, importing
 
 
-@interruptible
 def import_command(given: Sequence[str]) -> int:
-    """``mvest import NAME SOURCE CASE [option=value ...]``: write a case folder; exit status."""
+    """``mvest import NAME SOURCE CASE [OPTION=VALUE ...]``: write a case folder; exit status."""
     convert, source, target, options = _parsed("import", importing, "CASE", given)
     # Reading may take a minute.
     require_new(target)
@@ -36,9 +35,8 @@ def import_command(given: Sequence[str]) -> int:
     return 0
 
 
-@interruptible
 def export_command(given: Sequence[str]) -> int:
-    """``mvest export NAME SOURCE TARGET [option=value ...]``; exit status."""
+    """``mvest export NAME SOURCE TARGET [OPTION=VALUE ...]``; exit status."""
     convert, source, target, options = _parsed("export", exporting, "TARGET", given)
     print(f"wrote {convert(source, target, options)}")
     return 0
@@ -47,27 +45,26 @@ def export_command(given: Sequence[str]) -> int:
 def _parsed(
     verb: str, package: ModuleType, metavar: str, given: Sequence[str]
 ) -> tuple[Callable[..., Any], Path, Path, Any]:
-    """What converts the files that are named, their two names, and its options."""
+    """The function that converts, its source and target, and its options."""
     found = {}
     for one in pkgutil.iter_modules(package.__path__):
         module = importlib.import_module(f"{package.__name__}.{one.name}")
         if function := getattr(module, f"{verb}_{one.name}", None):
             found[one.name] = function, (module.__doc__ or "").partition("\n")[0]
     name = given[0] if given else "--help"
-    convert, _ = found.get(name, (None, ""))
-    kind: Any = typing.get_type_hints(convert)["options"] if convert else None
-    parser = Parser(
-        prog=f"mvest {verb} {name if convert else 'NAME'}",
-        description="\n\n".join(filter(None, map(inspect.getdoc, (convert, kind))))
-        if convert
-        else "\n".join(f"  {known:<12} {sentence}" for known, (_, sentence) in found.items()),
-        formatter_class=RawDescriptionHelpFormatter,
-    )
+    if name not in found:
+        parser = Parser(f"mvest {verb}", formatter_class=RawDescriptionHelpFormatter)
+        parser.usage = f"mvest {verb} NAME SOURCE {metavar} [OPTION=VALUE ...]"
+        parser.description = "\n".join(f"  {key:<12} {text}" for key, (_, text) in found.items())
+        if name.startswith("-"):
+            parser.parse_args(["--help"])
+        parser.error(f"{name}: nothing to {verb} by this name; known: {', '.join(found)}")
+    convert, _ = found[name]
+    kind: Any = typing.get_type_hints(convert)["options"]
+    parser = Parser(f"mvest {verb} {name}", formatter_class=RawDescriptionHelpFormatter)
+    parser.description = "\n\n".join(filter(None, map(inspect.getdoc, (convert, kind))))
     parser.add_argument("source", type=Path, metavar="SOURCE")
     parser.add_argument("target", type=Path, metavar=metavar)
     parser.add_argument("options", nargs="*", metavar="OPTION=VALUE")
-    if convert is None and not name.startswith("-"):
-        parser.error(f"{name}: nothing to {verb} by this name; known: {', '.join(found)}")
-    parsed = parser.parse_intermixed_args(list(given[1:]) if convert else ["--help"])
-    assert convert is not None
+    parsed = parser.parse_intermixed_args(list(given[1:]))
     return convert, parsed.source, parsed.target, from_words(name, kind, parsed.options)
