@@ -16,12 +16,6 @@ Conventions
   (thickness locking). The enhanced modes ``zeta * p(xi, eta)`` remove that (Buechter, Ramm and
   Roehl 1994, Int. J. Numer. Meth. Engng 37:2551, enhanced assumed strain of the thickness
   direction).
-* ``hex18_thin`` is ``hex18`` for thin bodies. In a biquadratic element that bends without being
-  stretched the membrane strain cannot vanish (membrane locking), and neither can the transverse
-  shear. Its covariant strains E11 and E13 are projected on what is linear in ``xi``, E22 and E23 on
-  what is linear in ``eta``, E12 on both, as if sampled at the two points of Gauss' rule in that
-  direction (assumed strains: Huang and Hinton 1986, Int. J. Numer. Meth. Engng 22:73; Bucalem and
-  Bathe 1993, ibid. 36:3729, with the same points).
 """
 
 from __future__ import annotations
@@ -64,9 +58,10 @@ class Element:
         is inside.
     face : str
         Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
-    sampling : callable or None
-        Points ``(q, 3)`` and weights ``(q,)`` of the quadrature -> ``(6, q, q)`` what the covariant
-        strains 11, 22, 33, 23, 13, 12 are multiplied by; None where they are as they are.
+    centre : ndarray
+        ``(1, 3)``.
+    top_face : ndarray
+        Local nodes of the face at ``zeta = 1`` of layered elements; empty for the others.
     """
 
     name: str
@@ -82,7 +77,6 @@ class Element:
     face: str
     centre: FloatArray
     top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    sampling: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     @property
     def layered(self) -> bool:
@@ -129,8 +123,20 @@ def _lagrange(order: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def _triangle6(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Six-node triangle: values ``(q, 6)`` and derivatives ``(q, 6, 2)``."""
+Factors = tuple[FloatArray, ...]
+"""Arrays ``(q, k)``, ``(q, l)``, ... whose products ``(q, k l ...)`` are the shape functions."""
+
+
+def _product(*factors: FloatArray) -> FloatArray:
+    """All products ``(q, k l ...)``, the numbers of the last factor fastest."""
+    out = factors[0]
+    for factor in factors[1:]:
+        out = (out[:, :, None] * factor[:, None]).reshape(len(out), -1)
+    return out
+
+
+def _triangle6(x: FloatArray, y: FloatArray) -> tuple[Factors, Factors, Factors]:
+    """Six-node triangle: its shape functions, and their derivatives by x and by y."""
     z = 1 - x - y
     value = np.stack(
         [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z],
@@ -139,7 +145,7 @@ def _triangle6(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     o = np.zeros_like(x)
     d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
     d_y = np.stack([1 - 4 * z, o, 4 * y - 1, -4 * x, 4 * x, 4 * (z - y)], axis=-1)
-    return value, np.stack([d_x, d_y], axis=-1)
+    return (value,), (d_x,), (d_y,)
 
 
 def _no_modes(xi: FloatArray) -> FloatArray:
@@ -166,109 +172,103 @@ _TRIANGLE_POINTS = np.array(
 _TRIANGLE_WEIGHTS = 0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-def _reduced(xi: FloatArray, weights: FloatArray) -> FloatArray:
-    """Projections ``(6, q, q)`` of ``hex18_thin``, within each layer of points."""
-    same = (xi[:, None, 2] == xi[None, :, 2]) * weights
-
-    def without(axis: int) -> FloatArray:
-        # Along its axis, what is less than quadratic, from the values on the same line.
-        line = same * (xi[:, None, 1 - axis] == xi[None, :, 1 - axis])
-        quadratic = 1.5 * xi[:, axis] ** 2 - 0.5
-        norm = line @ quadratic**2
-        return np.asarray(np.eye(len(xi)) - (quadratic / norm)[:, None] * line * quadratic)
-
-    first, second, all_of_it = without(0), without(1), np.eye(len(xi))
-    return np.stack([first, second, all_of_it, second, first, first @ second])
+def _quad9(x: FloatArray, y: FloatArray) -> tuple[Factors, Factors, Factors]:
+    """Nine-node quadrilateral: its shape functions, and their derivatives by x and by y."""
+    (a, da), (b, db) = _lagrange(2, x), _lagrange(2, y)
+    return (b, a), (b, da), (db, a)
 
 
-def _brick(name: str, thickness_order: int, *, thin: bool = False) -> Element:
-    def shape(xi: FloatArray) -> FloatArray:
-        a, _ = _lagrange(2, xi[:, 0])
-        b, _ = _lagrange(2, xi[:, 1])
-        c, _ = _lagrange(thickness_order, xi[:, 2])
-        return np.einsum("qk,qj,qi->qkji", c, b, a).reshape(xi.shape[0], -1)
+@dataclass(frozen=True, slots=True)
+class _Plane:
+    """What a layered element is in its plane; coordinates and points are ``(q, 2)``.
 
-    def gradient(xi: FloatArray) -> FloatArray:
-        a, da = _lagrange(2, xi[:, 0])
-        b, db = _lagrange(2, xi[:, 1])
-        c, dc = _lagrange(thickness_order, xi[:, 2])
-        parts = [(c, b, da), (c, db, a), (dc, b, a)]
-        return np.stack(
-            [np.einsum("qk,qj,qi->qkji", *p).reshape(xi.shape[0], -1) for p in parts], axis=-1
-        )
+    Attributes
+    ----------
+    evaluate : callable
+        Both coordinates ``(q,)`` -> shape functions and their two derivatives.
+    points, weights, nodes, centre : ndarray
+    modes : callable
+        Polynomials ``(q, m)`` of the enhanced strain.
+    outside, inside : callable
+        As those of :class:`Element`.
+    corners : ndarray
+        As those of :class:`Face`.
+    """
 
-    def modes(xi: FloatArray) -> FloatArray:
-        one = np.ones(xi.shape[0])
-        plane = np.stack([one, xi[:, 0], xi[:, 1], xi[:, 0] * xi[:, 1]], axis=-1)
-        return xi[:, 2:3] * plane
+    evaluate: Callable[[FloatArray, FloatArray], tuple[Factors, Factors, Factors]]
+    points: FloatArray
+    weights: FloatArray
+    nodes: FloatArray
+    centre: FloatArray
+    modes: Evaluate
+    outside: Evaluate
+    inside: Evaluate
+    corners: IntArray
 
-    g3, w3 = _gauss(3)
-    g2, w2 = _gauss(2)
-    points = np.array([[x, y, z] for z in g2 for y in g3 for x in g3])
-    weights = np.array([wx * wy * wz for wz in w2 for wy in w3 for wx in w3])
-    zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
-    nodes = np.array([[x, y, z] for z in zetas for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)])
-    return Element(
-        name=name,
-        n_nodes=len(nodes),
-        shape=shape,
-        gradient=gradient,
-        points=points,
-        weights=weights,
-        enhanced=modes if thickness_order == 1 else _no_modes,
-        node_coordinates=nodes,
+
+_G3, _W3 = _gauss(3)
+_PLANES = {
+    "quad9": _Plane(
+        _quad9,
+        points=np.array([[x, y] for y in _G3 for x in _G3]),
+        weights=np.tile(_W3, 3) * np.repeat(_W3, 3),
+        nodes=np.array([[x, y] for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)]),
+        centre=np.zeros(2),
+        modes=lambda xi: np.column_stack([np.ones(len(xi)), xi, xi[:, 0] * xi[:, 1]]),
         outside=lambda xi: np.max(np.abs(xi), axis=1) - 1.0,
         inside=lambda xi: np.clip(xi, -1.0, 1.0),
-        face="quad9",
-        centre=np.zeros((1, 3)),
-        top_face=np.arange(9) + 9 * (len(zetas) - 1),
-        sampling=_reduced if thin else None,
-    )
+        corners=np.array(
+            [[n + k for k in corner] for n in (0, 1, 3, 4) for corner in ((0, 1, 4), (0, 4, 3))]
+        ),
+    ),
+    "tri6": _Plane(
+        _triangle6,
+        points=_TRIANGLE_POINTS,
+        weights=_TRIANGLE_WEIGHTS,
+        nodes=np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]]),
+        centre=np.full(2, 1 / 3),
+        modes=lambda xi: np.column_stack([np.ones(len(xi)), xi - 1.0 / 3.0]),
+        outside=lambda xi: np.max(np.stack([-xi[:, 0], -xi[:, 1], xi.sum(axis=1) - 1]), axis=0),
+        inside=_simplex,
+        corners=np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+    ),
+}
 
 
-def _wedge(name: str, thickness_order: int) -> Element:
+def _layered(name: str, face: str, order: int) -> Element:
+    """The product of a plane element and a line of ``order`` through the thickness."""
+    plane = _PLANES[face]
+
     def shape(xi: FloatArray) -> FloatArray:
-        t, _ = _triangle6(xi[:, 0], xi[:, 1])
-        c, _ = _lagrange(thickness_order, xi[:, 2])
-        return np.einsum("qk,qa->qka", c, t).reshape(xi.shape[0], -1)
+        return _product(_lagrange(order, xi[:, 2])[0], *plane.evaluate(*xi[:, :2].T)[0])
 
     def gradient(xi: FloatArray) -> FloatArray:
-        t, dt = _triangle6(xi[:, 0], xi[:, 1])
-        c, dc = _lagrange(thickness_order, xi[:, 2])
-        parts = [(c, dt[:, :, 0]), (c, dt[:, :, 1]), (dc, t)]
-        return np.stack(
-            [np.einsum("qk,qa->qka", *p).reshape(xi.shape[0], -1) for p in parts], axis=-1
-        )
+        (c, dc), (value, d_x, d_y) = _lagrange(order, xi[:, 2]), plane.evaluate(*xi[:, :2].T)
+        return np.stack([_product(c, *d_x), _product(c, *d_y), _product(dc, *value)], axis=-1)
 
     def modes(xi: FloatArray) -> FloatArray:
-        third = 1.0 / 3.0
-        plane = np.stack([np.ones(xi.shape[0]), xi[:, 0] - third, xi[:, 1] - third], axis=-1)
-        return xi[:, 2:3] * plane
+        return np.asarray(xi[:, 2:] * plane.modes(xi[:, :2]))
 
-    g2, w2 = _gauss(2)
-    points = np.array([[*t, z] for z in g2 for t in _TRIANGLE_POINTS])
-    weights = np.array([wt * wz for wz in w2 for wt in _TRIANGLE_WEIGHTS])
-    zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
-    plane_nodes = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
-    nodes = np.array([[*p, z] for z in zetas for p in plane_nodes], dtype=np.float64)
+    (g2, w2), levels = _gauss(2), np.linspace(-1.0, 1.0, order + 1)
+
+    def stacked(points: FloatArray, zetas: FloatArray) -> FloatArray:
+        return np.array([[*point, zeta] for zeta in zetas for point in points])
+
+    nodes = stacked(plane.nodes, levels)
     return Element(
         name=name,
         n_nodes=len(nodes),
         shape=shape,
         gradient=gradient,
-        points=points,
-        weights=weights,
-        enhanced=modes if thickness_order == 1 else _no_modes,
+        points=stacked(plane.points, g2),
+        weights=np.array([along * across for across in w2 for along in plane.weights]),
+        enhanced=modes if order == 1 else _no_modes,
         node_coordinates=nodes,
-        outside=lambda xi: np.max(
-            np.stack([-xi[:, 0], -xi[:, 1], xi[:, 0] + xi[:, 1] - 1, np.abs(xi[:, 2]) - 1]), axis=0
-        ),
-        inside=lambda xi: np.column_stack(
-            [_simplex(xi[:, :2]), np.clip(xi[:, 2], -1.0, 1.0)],
-        ),
-        face="tri6",
-        centre=np.array([[1 / 3, 1 / 3, 0.0]]),
-        top_face=np.arange(6) + 6 * (len(zetas) - 1),
+        outside=lambda xi: np.maximum(plane.outside(xi[:, :2]), np.abs(xi[:, 2]) - 1.0),
+        inside=lambda xi: np.column_stack([plane.inside(xi[:, :2]), np.clip(xi[:, 2], -1.0, 1.0)]),
+        face=face,
+        centre=np.append(plane.centre, 0.0)[None],
+        top_face=np.arange(len(plane.nodes)) + len(plane.nodes) * order,
     )
 
 
@@ -323,66 +323,33 @@ def _tetrahedron(name: str, order: int) -> Element:
     )
 
 
-def _faces() -> dict[str, Face]:
-    g3, w3 = _gauss(3)
-    x = np.tile(g3, 3)
-    y = np.repeat(g3, 3)
-    a, da = _lagrange(2, x)
-    b, db = _lagrange(2, y)
-    quad9 = Face(
-        "quad9",
-        9,
-        np.einsum("qj,qi->qji", b, a).reshape(9, 9),
-        np.stack(
-            [
-                np.einsum("qj,qi->qji", b, da).reshape(9, 9),
-                np.einsum("qj,qi->qji", db, a).reshape(9, 9),
-            ],
-            axis=-1,
-        ),
-        np.tile(w3, 3) * np.repeat(w3, 3),
-        np.array(
-            [
-                t
-                for j in (0, 1)
-                for i in (0, 1)
-                for n in [i + 3 * j]
-                for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])
-            ]
-        ),
-    )
-    value, derivative = _triangle6(_TRIANGLE_POINTS[:, 0], _TRIANGLE_POINTS[:, 1])
-    tri6 = Face(
-        "tri6",
-        6,
-        value,
-        derivative,
-        _TRIANGLE_WEIGHTS,
-        np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
-    )
-    third = np.full((1, 3), 1 / 3)
-    tri3 = Face(
+def _face(name: str) -> Face:
+    plane = _PLANES[name]
+    value, d_x, d_y = plane.evaluate(*plane.points.T)
+    slope = np.stack([_product(*d_x), _product(*d_y)], axis=-1)
+    return Face(name, len(plane.nodes), _product(*value), slope, plane.weights, plane.corners)
+
+
+FACES: dict[str, Face] = {
+    **{name: _face(name) for name in _PLANES},
+    "tri3": Face(
         "tri3",
         3,
-        third,
+        np.full((1, 3), 1 / 3),
         np.array([[[-1.0, -1], [1, 0], [0, 1]]]),
         np.array([0.5]),
         np.array([[0, 1, 2]]),
-    )
-    return {f.name: f for f in (quad9, tri6, tri3)}
-
-
-FACES: dict[str, Face] = _faces()
+    ),
+}
 ELEMENTS: dict[str, Element] = {
     e.name: e
     for e in (
         _tetrahedron("tet4", 1),
         _tetrahedron("tet10", 2),
-        _brick("hex18", 1),
-        _brick("hex18_thin", 1, thin=True),
-        _brick("hex27", 2),
-        _wedge("wedge12", 1),
-        _wedge("wedge18", 2),
+        _layered("hex18", "quad9", 1),
+        _layered("hex27", "quad9", 2),
+        _layered("wedge12", "tri6", 1),
+        _layered("wedge18", "tri6", 2),
     )
 }
 

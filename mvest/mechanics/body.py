@@ -166,10 +166,9 @@ def simulate_body(
     elements : array_like
         ``(m, k)`` node indices in the order of :mod:`mvest.elements`.
     element_type : str
-        ``tet4``, ``tet10``, ``hex18``, ``hex18_thin``, ``hex27``, ``wedge12`` or ``wedge18``. One
-        layer of ``tet4`` is up to thirty times too stiff in bending; prefer the others. Where the
-        body is thinner than a tenth of a cell and bends by more than its thickness, only
-        ``hex18_thin`` is good on coarse cells (see the results on thin shells).
+        ``tet4``, ``tet10``, ``hex18``, ``hex27``, ``wedge12`` or ``wedge18``. One layer of ``tet4``
+        is up to thirty times too stiff in bending; prefer the others. Where the body bends by more
+        than its thickness within a cell, all are too stiff (see the results on thin shells).
     material : TransverselyIsotropic, sequence of them, or Law
         One, or one per region; or a law of one's own, which has what
         :class:`mvest.mechanics.Law` asks for, for all regions.

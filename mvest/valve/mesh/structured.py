@@ -73,7 +73,7 @@ def structured_mesh(
     shape : MaterialSurface
         The template, or any valve in material coordinates.
     element : str
-        ``hex18``, ``hex18_thin``, ``hex27`` (one brick per cell) or ``tet4``, ``tet10`` (six
+        ``hex18``, ``hex27`` (one brick per cell) or ``tet4``, ``tet10`` (six
         tetrahedra per cell).
     columns : int
         Cells around the valve; even, so that the leaflets meet at cell boundaries.
@@ -90,13 +90,11 @@ def structured_mesh(
             f"mesh of {columns} x {rows} x {layers} cells, expected an even number >= 6 of "
             "columns, rows >= 1 and layers >= 1"
         )
-    if element in ("hex18", "hex18_thin", "hex27"):
+    if element in ("hex18", "hex27"):
         return _bricks(shape, element, columns, rows, layers)
     if element in ("tet4", "tet10"):
         return _tetrahedra(shape, element, columns, rows, layers)
-    raise InputError(
-        f"no structured mesh of {element!r}; known: hex18, hex18_thin, hex27, tet4, tet10"
-    )
+    raise InputError(f"no structured mesh of {element!r}; known: hex18, hex27, tet4, tet10")
 
 
 def _grid(*sizes: int) -> tuple[IntArray, ...]:
