@@ -19,9 +19,10 @@ from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
 from mvest.valve.geometry.triangles import area_vectors, areas
+from mvest.valve.mesh.cells import boundary, local_faces, with_middles
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetwild import outer_faces, promote_to_tet10, tetrahedralize, tri6_faces
+from mvest.valve.mesh.tetwild import tetrahedralize
 
 
 class GivenValve:
@@ -133,15 +134,15 @@ def tetrahedral_leaflets(
         raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")
     closed = thicken(surface, normals)
     nodes, elements = tetrahedralize(closed.vertices, closed.triangles, edge_length, store)
-    faces, owner = outer_faces(elements)
+    owner, which = boundary(elements, "tet4")
+    faces = elements[owner[:, None], local_faces("tet4")[which]]
     pressure = _ventricular(nodes, faces, closed)
-    faces, owner = faces[pressure], owner[pressure]
-    _check_pressure_area(nodes, faces, closed)
+    _check_pressure_area(nodes, faces[pressure], closed)
     centroids = nodes[elements].mean(axis=1)
     nearest = closest_points(centroids, surface.vertices, surface.triangles)
     if element_type == "tet10":
-        nodes, elements = promote_to_tet10(nodes, elements)
-        faces = tri6_faces(faces, elements, owner)
+        nodes, elements = with_middles(nodes, elements)
+        faces = elements[owner[:, None], local_faces("tet10")[which]]
     return SolidMesh(
         nodes=nodes,
         elements=elements,
@@ -149,7 +150,7 @@ def tetrahedral_leaflets(
         region=surface.region[nearest.triangle],
         region_names=surface.region_names,
         fibre=_alike_within_elements(_fibres(nodes, surface)[elements]),
-        pressure_faces=faces,
+        pressure_faces=faces[pressure],
     )
 
 
