@@ -57,8 +57,6 @@ _REGION, _CHORDS = NamePart.REGION, NamePart.CHORDS
 
 KINDS: dict[str, Kind] = {
     "E_f": Kind("MPa", _REGION, 1e-6, 1e4, "Young's modulus along the fibre"),
-    "ratio": Kind("", _REGION, 1e-3, 1e3, "E_f over E_perp, at the same E_f"),
-    "G": Kind("MPa", _REGION, 1e-6, 1e4, "shear modulus, where it does not follow E_f"),
     "field": Kind(
         "", NamePart.MODE, -10, 10, "coefficient of a mode of log E_f within a leaflet", False
     ),
@@ -83,8 +81,8 @@ class Parameter:
     """One parameter to differentiate by: its name and its current value.
 
     Names are those of ``KINDS``: for example ``E_f.REGION`` (MPa; the region's other moduli follow
-    in proportion, except those that are parameters themselves), ``field.REGION.K``,
-    ``pressure_scale`` or ``chord_stiffness.FAMILY`` (factors, which multiply).
+    in proportion), ``field.REGION.K``, ``pressure_scale`` or ``chord_stiffness.FAMILY`` (factors,
+    which multiply).
     """
 
     name: str

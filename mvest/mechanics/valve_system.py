@@ -220,11 +220,11 @@ def _law_of(
     if tissues[0].law == "stiffening":
         own = {"stiffening": tissues[0].stiffening, **given(regions[0], "E_f", "stiffening")}
         return StiffeningLaw.of(tissues[0], **own)
-    moduli = [
-        tissue.moduli(**given(region, "E_f", "ratio", "G"))
+    materials = [
+        tissue.material(values[f"E_f.{region}"])
         for tissue, region in zip(tissues, regions, strict=True)
     ]
-    return BiotLaw.of_moduli(moduli, corotational=tissues[0].law == "corotational")
+    return BiotLaw.of(materials, corotational=tissues[0].law == "corotational")
 
 
 def variation_of(

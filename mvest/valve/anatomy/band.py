@@ -16,7 +16,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve, band_grid
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.thickening import smooth_normals_change, smooth_vertex_normals
-from mvest.valve.geometry.triangles import directed_edges
+from mvest.valve.geometry.triangles import edges_between
 
 INSIDE = 2.0
 """Degrees from the line between two leaflets at which the fibre of either is read."""
@@ -56,9 +56,7 @@ class Band:
         )
         # phi runs so that (along the leaflet) x (along phi) points to the ventricle: triangles,
         # whose normals do, are then run through clockwise in the plane of (phi, s).
-        corner = self._coordinates.strip_triangles()
-        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        self._sign = -1.0 if np.median(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0 else 1.0
+        self._sign = 1.0 if self._coordinates.clockwise else -1.0
         self._lines = self._leaflet_lines(surface)
         self._normals = leaflet_normals(surface)
 
@@ -67,14 +65,7 @@ class Band:
 
         theta runs as phi does, and is unwrapped about each line's beginning.
         """
-        ends = np.sort(directed_edges(surface.triangles), axis=1)
-        edges, number = np.unique(ends, axis=0, return_inverse=True)
-        region = np.tile(surface.region, 3)
-        low = np.full(len(edges), 2)
-        high = np.full(len(edges), -1)
-        np.minimum.at(low, number.ravel(), region)
-        np.maximum.at(high, number.ravel(), region)
-        between = np.unique(edges[low != high])
+        between = np.unique(edges_between(surface.triangles, surface.region))
         self._between = np.isin(np.arange(len(surface.vertices)), between)
         if not between.size:
             raise GeometryError("the two leaflets do not touch: no line between them")

@@ -17,6 +17,7 @@ from mvest.valve.geometry.proximity import (
     intersecting_triangles,
     overlapping_boxes,
 )
+from mvest.valve.geometry.triangles import edge_table
 
 ENOUGH_PAIRS = 1000
 """Of intersecting triangles that are counted for a message."""
@@ -128,18 +129,6 @@ def _check_triangles(points: FloatArray, faces: IntArray, name: str) -> None:
             f"{name}: duplicate triangle: triangles {listed(first[count > 1])} occur again with "
             f"the same three vertices; keep one of each"
         )
-
-
-def edge_table(faces: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Half-edges ``(3 m, 2)``, edges ``(e, 2)``, the edge of each half-edge, and their number.
-
-    Half-edge ``3 t + i`` runs from corner i of triangle t to the next.
-    """
-    half = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    edges, inverse, count = np.unique(
-        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return half, edges, inverse.ravel(), count
 
 
 def _check_edges(faces: IntArray, closed: bool, name: str) -> None:

@@ -51,6 +51,28 @@ def surface_edges(triangles: IntArray) -> IntArray:
     return np.unique(np.sort(directed_edges(triangles), axis=1), axis=0)
 
 
+def edge_table(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Half-edges ``(3 m, 2)``, edges ``(e, 2)``, the edge of each half-edge, and their number.
+
+    Half-edge ``3 t + i`` runs from corner i of triangle t to the next. Edges are sorted by their
+    lower and then by their higher vertex.
+    """
+    half = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+    edges, inverse, count = np.unique(
+        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return half, edges, inverse.ravel(), count
+
+
+def edges_between(triangles: IntArray, region: IntArray) -> IntArray:
+    """Edges ``(k, 2)`` on which triangles of different regions ``(m,)`` meet."""
+    _, edges, number, _ = edge_table(triangles)
+    low, high = np.full(len(edges), np.max(region)), np.full(len(edges), -1)
+    np.minimum.at(low, number, np.repeat(region, 3))
+    np.maximum.at(high, number, np.repeat(region, 3))
+    return edges[low != high]
+
+
 def unit_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Unit normals ``(m, 3)`` of triangles."""
     return unit_rows(area_vectors(vertices, triangles))
@@ -147,16 +169,14 @@ def refined(
 def _halved(vertices: FloatArray, coarse: Refinement) -> Refinement:
     x, triangles = coarse.weights @ vertices, coarse.triangles
     n = len(x)
-    edges, number = np.unique(
-        np.sort(directed_edges(triangles), axis=1), axis=0, return_inverse=True
-    )
+    _, edges, number, _ = edge_table(triangles)
     a, b = edges.T
     own = sparse.eye_array(n, format="csr")
     middle = 0.5 * (own[a] + own[b])
     for along, slope in zip((x[b] - x[a]).T, _slopes(x, triangles), strict=True):
         middle = middle + sparse.diags_array(along / 8.0) @ (slope[a] - slope[b])
     # Of each triangle the middles of its edges from corner 0, from 1 and from 2.
-    p, q, r = n + number.reshape(3, -1)
+    p, q, r = n + number.reshape(-1, 3).T
     i, j, k = triangles.T
     parts = np.array([[i, p, r], [p, j, q], [r, q, k], [p, q, r]])
     return Refinement(

@@ -23,9 +23,10 @@ from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from mvest.valve.geometry.triangles import directed_edges, unit_rows
+from mvest.valve.geometry.triangles import edge_table, unit_rows
 from mvest.valve.mesh.cells import lattice_elements, local_faces, numbered
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 
@@ -195,10 +196,8 @@ def layered_wedges(
 
 def _quadratic_sheet(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Six-node triangles, the edges ``(e, 2)`` whose middles are the new points, boundary flags."""
-    edges, number, count = np.unique(
-        np.sort(directed_edges(triangles), axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    middle = int(triangles.max()) + 1 + number.reshape(3, -1).T
+    _, edges, number, count = edge_table(triangles)
+    middle = int(triangles.max()) + 1 + number.reshape(-1, 3)
     return np.hstack([triangles, middle]), edges, count == 1
 
 
@@ -206,16 +205,12 @@ def _lay_on(fine: LeafletSurface, middles: FloatArray, on_boundary: IntArray) ->
     """Move interior points to the closest points of the surface, boundary ones to its loops."""
     at = closest_points(middles, fine.vertices, fine.triangles)
     result = at.interpolate(fine.vertices, fine.triangles)
-    loops = boundary_loops(fine.triangles)
-    start = np.concatenate(loops)
-    end = np.concatenate([np.roll(loop, -1) for loop in loops])
-    a, along = fine.vertices[start], fine.vertices[end] - fine.vertices[start]
-    for i in np.flatnonzero(on_boundary):
-        t = np.clip(
-            np.einsum("ij,ij->i", middles[i] - a, along) / np.einsum("ij,ij->i", along, along), 0, 1
-        )
-        candidate = a + t[:, None] * along
-        result[i] = candidate[np.argmin(np.linalg.norm(candidate - middles[i], axis=1))]
+    outer = middles[on_boundary]
+    offsets = np.stack(
+        [closest_on_loop(outer, fine.vertices[loop])[2] for loop in boundary_loops(fine.triangles)]
+    )
+    nearest = np.argmin(np.linalg.norm(offsets, axis=2), axis=0)
+    result[on_boundary] = outer - offsets[nearest, np.arange(len(outer))]
     return result
 
 
