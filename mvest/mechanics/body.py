@@ -26,6 +26,7 @@ from mvest.mechanics.system import Loads, System
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import checked_floats, checked_indices
 from mvest.valve.mesh.cells import box as box
+from mvest.valve.mesh.cells import local_faces
 from mvest.valve.mesh.cells import outer_faces as outer_faces
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -261,21 +262,17 @@ def _pressure_curve(
 
 def _check_pressure_faces(mesh: SolidMesh) -> None:
     """Each pressure face must be part of an element and point away from it."""
-    faces = mesh.pressure_faces
-    if len(faces) == 0:
-        return
+    local = local_faces(mesh.element_type)
+    known = np.sort(mesh.elements[:, local].reshape(-1, local.shape[1]), axis=1)
+    owner = {face: k // len(local) for k, face in enumerate(map(tuple, known.tolist()))}
     corners = FACES[mesh.reference.face].corners
-    hosts: dict[int, list[int]] = {}
-    for e, nodes in enumerate(mesh.elements.tolist()):
-        for node in nodes:
-            hosts.setdefault(node, []).append(e)
-    for f, face in enumerate(faces):
-        near = [e for e in hosts[int(face[0])] if np.isin(face, mesh.elements[e]).all()]
-        if not near:
+    for f, face in enumerate(mesh.pressure_faces):
+        own = owner.get(tuple(np.sort(face).tolist()))
+        if own is None:
             raise GeometryError(f"pressure face {f} {face.tolist()} is not a face of an element")
         a, b, c = np.moveaxis(mesh.nodes[face[corners]], 1, 0)
         normal = np.cross(b - a, c - a).sum(axis=0)
-        inside = mesh.nodes[mesh.elements[near[0]]].mean(axis=0)
+        inside = mesh.nodes[mesh.elements[own]].mean(axis=0)
         if normal @ (mesh.nodes[face].mean(axis=0) - inside) <= 0:
             raise GeometryError(
                 f"pressure face {f} {face.tolist()} points into the solid; reverse its node order"

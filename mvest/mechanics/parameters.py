@@ -7,7 +7,7 @@ which of the kinds of tissue they know (:attr:`mvest.mechanics.law.Law.kinds`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -147,37 +147,3 @@ def kind_of(name: str) -> Kind:
 def is_positive(name: str) -> bool:
     """Whether parameter ``name`` is positive by nature; InputError if there is none such."""
     return kind_of(name).positive
-
-
-def check_names(
-    names: Iterable[str],
-    regions: Iterable[str],
-    chords: Iterable[str],
-    modes: Mapping[str, int] | None = None,
-) -> None:
-    """Refuse names that are none of a valve's.
-
-    Parameters
-    ----------
-    names : iterable of str
-    regions : iterable of str
-        Its leaflets.
-    chords : iterable of str
-        Its families of chordae and its tips.
-    modes : mapping, optional
-        Leaflet -> number of modes of its field.
-
-    Raises
-    ------
-    InputError
-        If there is no such kind of parameter, or no such part of this valve.
-    """
-    fields = [f"{region}.{k}" for region, n in (modes or {}).items() for k in range(n)]
-    parts = {NamePart.REGION: list(regions), NamePart.CHORDS: list(chords), NamePart.MODE: fields}
-    for name in names:
-        part = name.partition(".")[2]
-        known = parts.get(kind_of(name).part, [])
-        if part and part not in known:
-            raise InputError(
-                f"parameter {name!r}: unknown {part!r}; known here: {', '.join(known) or '(none)'}"
-            )

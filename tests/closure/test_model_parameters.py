@@ -137,19 +137,19 @@ def test_a_shear_modulus_that_is_what_would_follow_changes_nothing_but_the_deriv
 
 
 @pytest.mark.parametrize(
-    ("names", "message"),
+    ("name", "message"),
     [
-        (
-            ("E_f.anterior", "E_f.posterior", "chord_stiffness.strut"),
-            "known here: .*marginal.*tip0",
-        ),
-        (("E_f.anterior", "E_f.posterior", "field.posterior.0"), "known here: field|anterior.0"),
-        (("E_f.anterior", "E_f.posterior", "viscosity"), "unknown parameter 'viscosity'"),
+        ("E_f.septal", "unknown 'septal'; known here: anterior, posterior"),
+        ("chord_stiffness.strut", "known here: .*marginal.*tip0"),
+        ("chord_rest_length.tip2", "known here: .*marginal.*tip0, tip1"),
+        ("field.posterior.0", "known here: anterior.0, .*anterior.3"),
+        ("field.anterior.4", "known here: anterior.0, .*anterior.3"),
+        ("viscosity", "unknown parameter 'viscosity'"),
     ],
 )
-def test_names_that_the_valve_does_not_have_are_refused_before_anything_is_closed(names, message):
+def test_names_that_the_valve_does_not_have_are_refused_before_anything_is_closed(name, message):
     with pytest.raises(InputError, match=message):
-        model_of(OPEN, names, **TINY, settings=FIELDS).close(np.array([6.0, 4.0, 1.0]))
+        model_of(OPEN, (*MODULI, name), **TINY, settings=FIELDS).close(np.array([*AT, 1.0]))
 
 
 def test_the_way_to_other_coefficients_is_measured_in_the_logarithm_of_the_modulus():

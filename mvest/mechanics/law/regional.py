@@ -83,10 +83,7 @@ class FieldBasis:
         InputError
             If there is no such leaflet, or it has fewer vertices than modes are asked for.
         """
-        if region not in surface.region_names:
-            raise InputError(
-                f"field of {region!r}: no such leaflet; there are {', '.join(surface.region_names)}"
-            )
+        _check_region(region, surface.region_names)
         own = surface.triangles[surface.region == surface.region_names.index(region)]
         vertices, triangles = np.unique(own, return_inverse=True)
         if len(vertices) < settings.modes:
@@ -115,6 +112,11 @@ class FieldBasis:
         return values.reshape(*np.shape(points)[:-1], -1)
 
 
+def _check_region(region: str, names: tuple[str, ...]) -> None:
+    if region not in names:
+        raise InputError(f"field of {region!r}: no such leaflet; there are {', '.join(names)}")
+
+
 def _kernel(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
     return np.asarray(np.exp(-cdist(a, b, "sqeuclidean") / (2 * length**2)))
 
@@ -124,22 +126,14 @@ def at_quadrature(
 ) -> FloatArray:
     """What a function gives at the quadrature points of a leaflet's elements, 0 in the others.
 
-    Parameters
-    ----------
-    mesh : SolidMesh
-    region : str
-    of : callable
-        Points ``(e, q, 3)`` mm of the reference frame -> ``(e, q, ...)``.
+    ``of`` maps points ``(e, q, 3)`` mm of the reference frame to values ``(e, q, ...)``.
 
     Raises
     ------
     InputError
         If the mesh has no such leaflet.
     """
-    if region not in mesh.region_names:
-        raise InputError(
-            f"field of {region!r}: no such leaflet; there are {', '.join(mesh.region_names)}"
-        )
+    _check_region(region, mesh.region_names)
     shape = mesh.reference.shape(mesh.reference.points)
     here = mesh.region == mesh.region_names.index(region)
     values = of(np.einsum("qa,eai->eqi", shape, mesh.nodes[mesh.elements[here]]))

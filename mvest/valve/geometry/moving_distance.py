@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.triangles import area_vectors
+from mvest.valve.geometry.triangles import area_vectors, unit_vectors
 
 TOUCHING = 1e-9
 """Distance in mm below which the offset from a closest point has no direction of its own."""
@@ -70,9 +70,9 @@ def _normals(
 ) -> tuple[FloatArray, BoolArray]:
     """Angle-weighted unit normals ``(q, 3)`` at closest points, and which are inside a triangle."""
     corner = vertices[triangles]
-    ahead = _unit(np.roll(corner, -1, axis=1) - corner)
-    behind = _unit(np.roll(corner, 1, axis=1) - corner)
-    face = _unit(area_vectors(vertices, triangles))
+    ahead = unit_vectors(np.roll(corner, -1, axis=1) - corner)
+    behind = unit_vectors(np.roll(corner, 1, axis=1) - corner)
+    face = unit_vectors(area_vectors(vertices, triangles))
     angle = np.arccos(np.clip(np.einsum("mck,mck->mc", ahead, behind), -1.0, 1.0))
     of_vertex = np.zeros_like(vertices)
     np.add.at(of_vertex, triangles, angle[..., None] * face[:, None])
@@ -87,7 +87,7 @@ def _normals(
     at_edge = of_edge[edge[triangle, np.argmin(barycentric, axis=1)]]
     at_vertex = of_vertex[triangles[triangle, np.argmax(barycentric, axis=1)]]
     normal = np.choose(zeros[:, None], [face[triangle], at_edge, at_vertex])
-    return _unit(normal), zeros == 0
+    return unit_vectors(normal), zeros == 0
 
 
 def smooth_distances(
@@ -268,9 +268,3 @@ def closest_on_loop(
     edge = np.argmin(np.linalg.norm(offset, axis=2), axis=1)
     rows = np.arange(len(points))
     return edge, along[rows, edge], offset[rows, edge]
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    """Vectors ``(..., 3)`` of length one; zero where they were zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)

@@ -82,19 +82,6 @@ def closest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> Vector:
 
 
 @njit(cache=True)
-def distance_to_triangle(
-    p: Vector, a: Vector, b: Vector, c: Vector
-) -> tuple[float, float, float, float]:
-    """Distance (mm) of `p` to triangle ``abc``, and the barycentric coordinates of the foot."""
-    u, v, w = closest_on_triangle(p, a, b, c)
-    squared = 0.0
-    for i in range(3):
-        difference = p[i] - (u * a[i] + v * b[i] + w * c[i])
-        squared += difference * difference
-    return np.sqrt(squared), u, v, w
-
-
-@njit(cache=True)
 def _closest_of_candidates(
     points: FloatArray,
     vertices: FloatArray,
@@ -109,9 +96,12 @@ def _closest_of_candidates(
         p = row(points, i)
         for k in range(offsets[i], offsets[i + 1]):
             t = triangles[candidates[k]]
-            d, u, v, w = distance_to_triangle(
-                p, row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
-            )
+            a, b, c = row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
+            u, v, w = closest_on_triangle(p, a, b, c)
+            squared = 0.0
+            for axis in range(3):
+                squared += (p[axis] - (u * a[axis] + v * b[axis] + w * c[axis])) ** 2
+            d = np.sqrt(squared)
             if d < distance[i]:
                 distance[i] = d
                 triangle[i] = candidates[k]

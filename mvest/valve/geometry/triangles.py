@@ -64,6 +64,11 @@ def edge_table(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray, IntAr
     return half, edges, inverse.ravel(), count
 
 
+def euler_number(triangles: IntArray) -> int:
+    """Vertices minus edges plus triangles: 2 of a sphere, 0 of a band or a torus."""
+    return len(np.unique(triangles)) - len(surface_edges(triangles)) + len(triangles)
+
+
 def edges_between(triangles: IntArray, region: IntArray) -> IntArray:
     """Edges ``(k, 2)`` on which triangles of different regions ``(m,)`` meet."""
     _, edges, number, _ = edge_table(triangles)
@@ -81,6 +86,22 @@ def unit_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 def unit_rows(vectors: FloatArray) -> FloatArray:
     """Vectors ``(n, 3)`` at length one; those of no length stay."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+def unit_vectors(vectors: FloatArray) -> FloatArray:
+    """Vectors ``(..., 3)`` of length one; zero where they were zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
+
+
+def mean_fibre(fibre: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted sum ``(..., 3)`` of the fibres ``(..., 3, 3)`` of a triangle's corners.
+
+    A fibre has no sign: they are turned to agree with that of the largest weight ``(..., 3)``.
+    """
+    lead = np.take_along_axis(fibre, weights.argmax(axis=-1)[..., None, None], axis=-2)
+    sign = np.where(np.sum(fibre * lead, axis=-1) < 0, -1.0, 1.0)
+    return np.asarray(np.einsum("...c,...ci->...i", weights * sign, fibre))
 
 
 def principal_stretches(

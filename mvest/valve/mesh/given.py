@@ -18,7 +18,7 @@ from mvest.valve.anatomy.band import Band, leaflet_normals
 from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
-from mvest.valve.geometry.triangles import area_vectors, areas
+from mvest.valve.geometry.triangles import area_vectors, areas, mean_fibre
 from mvest.valve.mesh.cells import boundary, local_faces, with_middles
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
@@ -186,12 +186,7 @@ def _fibres(nodes: FloatArray, surface: LeafletSurface) -> FloatArray:
     """Fibre of the nearest midsurface point, in the tangent plane there, ``(n, 3)`` unit."""
     nearest = closest_points(nodes, surface.vertices, surface.triangles)
     corners = surface.triangles[nearest.triangle]
-    heaviest = corners[np.arange(len(nodes)), nearest.barycentric.argmax(axis=1)]
-    lead = surface.fibre[heaviest]
-    # A fibre has no sign: turn the corners' fibres to agree before averaging them.
-    vectors = surface.fibre[corners]
-    sign = np.where(np.einsum("ncj,nj->nc", vectors, lead) < 0, -1.0, 1.0)
-    mixed = np.einsum("nc,ncj->nj", nearest.barycentric * sign, vectors)
+    mixed = mean_fibre(surface.fibre[corners], nearest.barycentric)
     normal = area_vectors(surface.vertices, surface.triangles)[nearest.triangle]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     tangent = mixed - (mixed * normal).sum(axis=1, keepdims=True) * normal

@@ -14,46 +14,19 @@ commissures above all; both are smoothed, and an element that is still inverted 
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 import scipy.sparse as sp
 
 from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.anatomy.valve import LeafletSurface, MaterialSurface
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import edge_table, unit_rows
 from mvest.valve.mesh.cells import lattice_elements, local_faces, numbered
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
-
-
-class MaterialSurface(Protocol):
-    """A valve with two leaflets in material coordinates, as template and band are.
-
-    Attributes
-    ----------
-    region_names : tuple of str
-        The leaflet of phi in (0, 180) degrees, and that of (180, 360).
-    """
-
-    @property
-    def region_names(self) -> tuple[str, ...]:
-        """Names of the two leaflets."""
-        ...
-
-    def position(
-        self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
-    ) -> FloatArray:
-        """Reference positions ``(..., 3)`` mm of material points."""
-        ...
-
-    def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
-        """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""
-        ...
 
 
 def structured_mesh(

@@ -192,27 +192,15 @@ def _checked(
 
 def _save(path: Path, mesh: Tetrahedra) -> None:
     nodes, tetrahedra = mesh
-    stored = content_sha256(nodes, tetrahedra)
-    np.savez_compressed(path, nodes=nodes, tetrahedra=tetrahedra, sha256=stored)
+    np.savez_compressed(path, nodes=nodes, tetrahedra=tetrahedra)
 
 
-def _load(path: Path) -> tuple[FloatArray, IntArray]:
+def _load(path: Path) -> Tetrahedra:
     try:
-        nodes, tetrahedra, stored = read_npz(path, ["nodes", "tetrahedra", "sha256"]).values()
+        nodes, tetrahedra = read_npz(path, ["nodes", "tetrahedra"]).values()
     except InputError as fault:
         raise MeshingError(f"{path}: stored mesh is unreadable ({fault}); delete it") from fault
-    if content_sha256(nodes, tetrahedra) != str(stored):
-        raise MeshingError(f"{path}: stored mesh does not match its hash {stored}; delete it")
     return nodes, tetrahedra
-
-
-def content_sha256(nodes: FloatArray, tetrahedra: IntArray) -> str:
-    """SHA-256 of a mesh's content: nodes rounded to 1e-9 mm, and tetrahedra."""
-    digest = hashlib.sha256()
-    # Adding zero turns -0.0 into 0.0, which has other bytes.
-    digest.update(np.ascontiguousarray(np.round(nodes, 9) + 0.0, dtype="<f8").tobytes())
-    digest.update(np.ascontiguousarray(tetrahedra, dtype="<i8").tobytes())
-    return digest.hexdigest()
 
 
 def volumes(nodes: FloatArray, tetrahedra: IntArray) -> FloatArray:
