@@ -127,15 +127,6 @@ def test_a_fixed_damping_replaces_that_of_the_settings():
     assert np.abs(one - other).max() > 0.01
 
 
-def test_a_shear_modulus_that_is_what_would_follow_changes_nothing_but_the_derivative():
-    follows = model_of(OPEN, **TINY).close(AT).simulation
-    shear = {f"G.{r}": e / (2 * 1.488) for r, e in zip(("anterior", "posterior"), AT, strict=True)}
-    own = model_of(OPEN, **TINY, fixed=shear).close(AT).simulation
-    np.testing.assert_allclose(own.frames[-1], follows.frames[-1], rtol=0, atol=1e-9)
-    change = np.linalg.norm(own.sensitivities[-1] - follows.sensitivities[-1], axis=(1, 2))
-    assert np.all(change > 0.01 * np.linalg.norm(follows.sensitivities[-1], axis=(1, 2)))
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [

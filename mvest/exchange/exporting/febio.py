@@ -22,7 +22,7 @@ from mvest.mechanics.valve_system import boundary_loading, build_system
 from mvest.problem.registration import REGISTRATION
 from mvest.reading.documents import read_mapping
 from mvest.typing import FloatArray
-from mvest.valve.mesh.given import GivenValve
+from mvest.valve.mesh.given import GivenValve, tetrahedral_leaflets
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 GENERIC = {
@@ -236,7 +236,7 @@ def model_of_case(
     if options.mesh == "structured":
         mesh = valve.layers("hex18", options.columns, options.rows)
     else:
-        mesh = valve.tetrahedra(options.edge_length, "tet10", None)
+        mesh = tetrahedral_leaflets(case.surface, options.edge_length)
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
     return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)

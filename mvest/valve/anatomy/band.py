@@ -13,7 +13,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve, sampled_valve
+from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, sampled_valve
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.thickening import smooth_normals_change, smooth_vertex_normals
 from mvest.valve.geometry.triangles import edges_between, mean_fibre
@@ -191,14 +191,14 @@ class Band:
 
     def sampled(self, columns: int, rows: int) -> Valve:
         """The same valve on a grid of ``columns x rows`` vertices, chordae and motion with it."""
-        motion = self.valve.motion
+        valve, motion = self.valve, self.valve.motion
 
-        def moved(phi: FloatArray) -> Motion:
+        def hung(phi: FloatArray) -> tuple[FloatArray, Chordae, Motion]:
             annulus = np.stack([self.annulus_positions(phi, frame) for frame in motion.annulus])
-            return Motion(motion.phase, annulus, motion.papillary_tips)
+            moved = Motion(motion.phase, annulus, motion.papillary_tips)
+            return valve.papillary_tips, valve.chordae, moved
 
-        tips, chordae = self.valve.papillary_tips, self.valve.chordae
-        return sampled_valve(self, columns, rows, tips, chordae, moved)
+        return sampled_valve(self, columns, rows, hung)
 
     def _at(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Triangles and weights of points in arrays of any shape."""

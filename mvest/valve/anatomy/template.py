@@ -302,4 +302,6 @@ class Template:
         rows : int
             Vertices from annulus to free edge, at least 3.
         """
-        return sampled_valve(self, columns, rows, self.papillary_tips, self.chordae(), self.motion)
+        return sampled_valve(
+            self, columns, rows, lambda phi: (self.papillary_tips, self.chordae(), self.motion(phi))
+        )

@@ -369,9 +369,7 @@ def sampled_valve(
     shape: MaterialSurface,
     columns: int,
     rows: int,
-    tips: FloatArray,
-    chordae: Chordae,
-    motion: Callable[[FloatArray], Motion],
+    hung: Callable[[FloatArray], tuple[FloatArray, Chordae, Motion]],
 ) -> Valve:
     """A valve on a grid of ``columns x rows`` vertices.
 
@@ -380,11 +378,9 @@ def sampled_valve(
     shape : MaterialSurface
     columns, rows : int
         Vertices around the valve, even and at least 8, and from annulus to free edge, at least 3.
-    tips : ndarray
-        ``(t, 3)`` mm.
-    chordae : Chordae
-    motion : callable
-        Angles ``(columns,)`` of the annulus' vertices -> its motion and that of the tips.
+    hung : callable
+        Angles ``(columns,)`` of the annulus' vertices -> papillary tips ``(t, 3)`` mm, chordae, and
+        the motion of annulus and tips.
 
     Raises
     ------
@@ -408,4 +404,4 @@ def sampled_valve(
     )
     annulus = np.arange(columns)
     free_edge = annulus + (rows - 1) * columns
-    return Valve(surface, annulus, free_edge, tips, chordae, motion(phi[:columns]))
+    return Valve(surface, annulus, free_edge, *hung(phi[:columns]))

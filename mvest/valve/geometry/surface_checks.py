@@ -19,8 +19,8 @@ from mvest.valve.geometry.proximity import (
 )
 from mvest.valve.geometry.triangles import edge_table
 
-ENOUGH_PAIRS = 1000
-"""Of intersecting triangles that are counted for a message."""
+MAX_LOOKED_AT = 100_000
+"""Pairs of edges and triangles among which those that intersect are sought for a message."""
 MAX_OVERLAPS = 1e7
 """Of bounding boxes of edges and triangles (0.3 GB); 50 000 triangles in good order have 1e6."""
 
@@ -80,11 +80,10 @@ def check_surface(
                 f"about {overlaps:.2g} times; are its vertices in another order?"
             )
         if has_intersections(points, faces):
-            pairs = intersecting_triangles(points, faces, ENOUGH_PAIRS)
-            which = f"{len(pairs)} pairs of triangles, if not more," if len(pairs) else "triangles"
-            among = f", among them {pairs[:5].tolist()}" if len(pairs) else " somewhere"
+            pairs = intersecting_triangles(points, faces, most=MAX_LOOKED_AT)
             raise GeometryError(
-                f"{name}: self-intersection: {which} pass through each other{among}"
+                f"{name}: self-intersection: triangles pass through each other, among them "
+                f"{pairs[:5].tolist()}"
             )
 
 

@@ -81,18 +81,6 @@ class GivenValve:
                 "number of cells, or take mesh source tetwild"
             ) from fault
 
-    def tetrahedra(self, edge_length: float, element: str, store: Path | None) -> SolidMesh:
-        """An unstructured mesh of the surface as it was given, made once and kept in ``store``.
-
-        Parameters
-        ----------
-        edge_length
-            mm.
-        element
-            ``tet10`` or ``tet4``.
-        """
-        return tetrahedral_leaflets(self.given.surface, edge_length, element, store)
-
 
 PRESSURE_AREA_TOLERANCE = 0.1
 """Largest relative difference between the pressure faces' area and the ventricular side's."""
