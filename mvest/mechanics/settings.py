@@ -173,11 +173,11 @@ class ModulusField:
     Attributes
     ----------
     correlation_length_mm : float
-        l, over which it is alike.
+        l, over which it is correlated.
     std_log : float
         Standard deviation of log E_f at a point.
     modes : int
-        How many modes are kept.
+        Number of modes.
     """
 
     correlation_length_mm: Length

@@ -37,8 +37,8 @@ In a biaxial test a thin sheet is stretched along and across its fibres. The str
 thickness is zero, which decides the stretch of the thickness. From it follows the exponential
 tissue that is as stiff as a linear one where closed leaflets are.
 
-Whether a leaflet has stiffened when it is closed cannot be told beforehand, and moduli that are
-fitted with the wrong law are off. So the stress of one region is that of both laws,
+It is not known beforehand whether a closed leaflet has stiffened, and moduli fitted with the wrong
+law are off. So the stress of one region is that of both laws,
 
 .. math::
     S = (1 - w) S_{lin} + w S_{exp}, \qquad w = \frac{\alpha}{1 + \alpha},

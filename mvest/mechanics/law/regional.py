@@ -18,7 +18,7 @@ same modulus at the same point.
 
 All stiffness of a point, damping included, is scaled by :math:`\exp(\sum_k a_k \phi_k)`.
 
-A :class:`StiffPatch` is no unknown: it is how a valve is simulated whose tissue differs somewhere.
+A :class:`StiffPatch` is not estimated: it simulates a valve whose tissue is stiffer in one place.
 
 Prestretched leaflets are stretched already in the shape in which they were seen open. The open
 valve of an image is under load, and its leaflets were grown under tension: free of stress they
@@ -81,7 +81,7 @@ class FieldBasis:
         Raises
         ------
         InputError
-            If there is no such leaflet, or it has fewer vertices than modes are asked for.
+            If there is no such leaflet, or it has fewer vertices than modes.
         """
         _check_region(region, surface.region_names)
         own = surface.triangles[surface.region == surface.region_names.index(region)]
@@ -151,7 +151,7 @@ class ModulusVariation:
     modes : mapping
         Region -> ``(e, q, k)`` modes of its field, see `at_quadrature`.
     given : ndarray or float
-        ``(e, q)`` part of log E_f that is no unknown.
+        ``(e, q)`` part of log E_f that is not estimated.
     """
 
     modes: Mapping[str, FloatArray]
@@ -180,7 +180,7 @@ class LeafletLaw:
     laws : tuple of Law
         One that knows all regions, or one per region that knows this region alone.
     region : ndarray
-        ``(e,)`` of the elements, which laws do not know when they are asked for a strain.
+        ``(e,)`` of the elements; a law is not given it with a strain.
     prestretch : ndarray
         ``(r,)`` of each region.
     scale : ndarray or float

@@ -1,9 +1,10 @@
 """Two thick leaflets on a grid, as signed distances, and the closed surface that both have.
 
-Where two leaflets meet they are either one piece of tissue, at a commissure, or only in contact,
-and a segmentation shows both alike. In an open valve they meet at the commissures alone, and how
-far down from the annulus they do is a length that a valve keeps. So in a closed one they are cut
-apart wherever they meet farther from the annulus, or farther in than they are thick.
+Where two leaflets meet they are one piece of tissue, at a commissure, or only in contact. A
+segmentation does not distinguish the two. An open valve meets at the commissures alone, and how far
+down from the annulus it does so is a length that does not change. In a closed valve the leaflets
+are therefore cut apart wherever they meet farther from the annulus, or farther in than they are
+thick.
 """
 
 from __future__ import annotations
@@ -264,7 +265,7 @@ def thick_leaflets(
             raise GeometryError("the leaflets meet nowhere, expected at two commissures")
         joined, lengths = _joined(fields, meet, tips, seams)
     cut = 0.5 * CUT_STEPS * fields.step
-    said = ""
+    found = ""
     for level in LEVELS:
         grown = level * fields.voxel_mm
         together = fields.union + grown
@@ -278,10 +279,10 @@ def thick_leaflets(
         euler = euler_number(triangles)
         if euler == 0:
             break
-        said = said or f"Euler number {euler}"
+        found = found or f"Euler number {euler}"
     else:
         raise GeometryError(
-            f"leaflets with {said}, expected 0, one orifice: fill the holes of the leaflets, join "
+            f"leaflets with {found}, expected 0, one orifice: fill the holes of the leaflets, join "
             "them at the commissures, and part them elsewhere where they are open"
         )
     touching = meet & ~joined & (np.abs(half) <= 0.5 * fields.step)

@@ -123,8 +123,8 @@ def midsurface(
     vertices, triangles
         ``(n, 3)`` mm and ``(m, 3)``.
     tips
-        ``(2, 3)`` mm, papillary tips: they tell the free edge, and at which of the places where
-        the leaflets are short the commissures are.
+        ``(2, 3)`` mm, papillary tips: the free edge is the loop nearer to them, and a commissure
+        lies where the leaflets are shortest on the side of each.
     commissures
         ``(2, 3)`` mm, if known.
     anterior

@@ -1,6 +1,6 @@
 """The two walls of a thick leaflet band: its closed surface parted along the annulus and the edge.
 
-Nothing says of a segmented surface which of its triangles face the atrium. But two points that lie
+A segmented surface does not state which of its triangles face the atrium. But two points that lie
 across the tissue from each other belong to different walls, and two neighbours on a smooth part of
 the surface to the same one. The walls are the sign of the vector that agrees best with both, the
 lowest eigenvector of a signed graph Laplacian (Kunegis et al. 2010, SIAM Int. Conf. Data Mining,

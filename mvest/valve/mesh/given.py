@@ -154,7 +154,7 @@ def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> I
             continue
         nearest = closest_points(centroids, closed.vertices, closed.triangles[numbers])
         facing = (normals * closed_normals[numbers[nearest.triangle]]).sum(axis=1) > 0
-        # A face that looks away is kept as a candidate of last resort, behind every facing one.
+        # A face that looks away is a candidate of last resort, behind every facing one.
         distance[:, kind] = nearest.distance + np.where(facing, 0.0, 1e6)
     return np.flatnonzero(distance.argmin(axis=1) == FACE_KINDS.index("ventricular"))
 

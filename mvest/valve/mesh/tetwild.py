@@ -56,7 +56,7 @@ def tetrahedralize(
     edge_length
         Target, mm.
     store
-        Folder in which the mesh is kept as ``tetwild-KEY.npz``, KEY being the hash of surface and
+        Folder in which the mesh is cached as ``tetwild-KEY.npz``, KEY being the hash of surface and
         settings. Not given, the mesh is made anew, and never the same twice.
 
     Raises
@@ -138,8 +138,8 @@ def _mesh(vertices: FloatArray, triangles: IntArray, edge_length: float) -> Tetr
 
 def _failure(code: int, stderr: str) -> str:
     lines = [line for line in stderr.splitlines() if line.strip()]
-    said = f": {lines[-1].strip()}" if lines else " without a message"
-    return f"failed: {ending(code)}{said}"
+    message = f": {lines[-1].strip()}" if lines else " without a message"
+    return f"failed: {ending(code)}{message}"
 
 
 def _checked(
