@@ -16,12 +16,6 @@ Conventions
   (thickness locking). The enhanced modes ``zeta * p(xi, eta)`` remove that (Buechter, Ramm and
   Roehl 1994, Int. J. Numer. Meth. Engng 37:2551, enhanced assumed strain of the thickness
   direction).
-* ``hex18_thin`` is ``hex18`` for thin bodies. In a biquadratic element that bends without being
-  stretched the membrane strain cannot vanish (membrane locking), and neither can the transverse
-  shear. Its covariant strains E11 and E13 are projected on what is linear in ``xi``, E22 and E23 on
-  what is linear in ``eta``, E12 on both, as if sampled at the two points of Gauss' rule in that
-  direction (assumed strains: Huang and Hinton 1986, Int. J. Numer. Meth. Engng 22:73; Bucalem and
-  Bathe 1993, ibid. 36:3729, with the same points).
 """
 
 from __future__ import annotations
@@ -64,9 +58,10 @@ class Element:
         is inside.
     face : str
         Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
-    sampling : callable or None
-        Points ``(q, 3)`` and weights ``(q,)`` of the quadrature -> ``(6, q, q)`` what the covariant
-        strains 11, 22, 33, 23, 13, 12 are multiplied by; None where they are as they are.
+    centre : ndarray
+        ``(1, 3)``.
+    top_face : ndarray
+        Local nodes of the face at ``zeta = 1`` of layered elements; empty for the others.
     """
 
     name: str
@@ -82,7 +77,6 @@ class Element:
     face: str
     centre: FloatArray
     top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    sampling: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     @property
     def layered(self) -> bool:
@@ -129,9 +123,33 @@ def _lagrange(order: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
-    points, weights = np.polynomial.legendre.leggauss(n)
-    return np.asarray(points), np.asarray(weights)
+Factors = tuple[FloatArray, ...]
+"""Arrays ``(q, k)``, ``(q, l)``, ... whose products ``(q, k l ...)`` are the shape functions."""
+
+
+def _product(*factors: FloatArray) -> FloatArray:
+    """All products ``(q, k l ...)``, the numbers of the last factor fastest."""
+    out = factors[0]
+    for factor in factors[1:]:
+        out = (out[:, :, None] * factor[:, None]).reshape(len(out), -1)
+    return out
+
+
+def _triangle6(x: FloatArray, y: FloatArray) -> tuple[Factors, Factors, Factors]:
+    """Six-node triangle: its shape functions, and their derivatives by x and by y."""
+    z = 1 - x - y
+    value = np.stack(
+        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z],
+        axis=-1,
+    )
+    o = np.zeros_like(x)
+    d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
+    d_y = np.stack([1 - 4 * z, o, 4 * y - 1, -4 * x, 4 * x, 4 * (z - y)], axis=-1)
+    return (value,), (d_x,), (d_y,)
+
+
+def _no_modes(xi: FloatArray) -> FloatArray:
+    return np.zeros((xi.shape[0], 0))
 
 
 def _simplex(xi: FloatArray) -> FloatArray:
@@ -141,167 +159,116 @@ def _simplex(xi: FloatArray) -> FloatArray:
     return np.asarray(positive / np.maximum(total, 1.0))
 
 
-# -- the plane of layered elements, and their faces -----------------------------------------------
-Factors = tuple[FloatArray, ...]
-"""Arrays ``(q, ...)`` whose product is a shape function."""
+def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
+    points, weights = np.polynomial.legendre.leggauss(n)
+    return np.asarray(points), np.asarray(weights)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+# Degree-4 rule with six points on the unit triangle (Strang and Fix 1973; weights sum to 1/2).
+_A, _B = 0.445948490915965, 0.091576213509771
+_TRIANGLE_POINTS = np.array(
+    [[_A, _A], [1 - 2 * _A, _A], [_A, 1 - 2 * _A], [_B, _B], [1 - 2 * _B, _B], [_B, 1 - 2 * _B]]
+)
+_TRIANGLE_WEIGHTS = 0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3)
+
+
+def _quad9(x: FloatArray, y: FloatArray) -> tuple[Factors, Factors, Factors]:
+    """Nine-node quadrilateral: its shape functions, and their derivatives by x and by y."""
+    (a, da), (b, db) = _lagrange(2, x), _lagrange(2, y)
+    return (b, a), (b, da), (db, a)
+
+
+@dataclass(frozen=True, slots=True)
 class _Plane:
-    """A quadratic element of the plane.
+    """What a layered element is in its plane; coordinates and points are ``(q, 2)``.
 
     Attributes
     ----------
-    face : str
-    nodes : (n, 2)
-    tables : callable
-        Coordinates -> factors of the shape functions, and of their two derivatives.
-    product : str
-        The factors' subscripts, and those of their product, for `numpy.einsum`.
-    points, weights : (q, 2), (q,)
-        Quadrature.
+    evaluate : callable
+        Both coordinates ``(q,)`` -> shape functions and their two derivatives.
+    points, weights, nodes, centre : ndarray
     modes : callable
-        ``(q, 2) -> (q, m)``, what zeta is multiplied by in the enhanced modes.
+        Polynomials ``(q, m)`` of the enhanced strain.
     outside, inside : callable
-        As those of `Element`.
-    centre : (2,)
-    corners : (m, 3)
-        As those of `Face`.
+        As those of :class:`Element`.
+    corners : ndarray
+        As those of :class:`Face`.
     """
 
-    face: str
-    nodes: FloatArray
-    tables: Callable[[FloatArray], tuple[Factors, tuple[Factors, Factors]]]
-    product: tuple[str, str]
+    evaluate: Callable[[FloatArray, FloatArray], tuple[Factors, Factors, Factors]]
     points: FloatArray
     weights: FloatArray
+    nodes: FloatArray
+    centre: FloatArray
     modes: Evaluate
     outside: Evaluate
     inside: Evaluate
-    centre: tuple[float, float]
     corners: IntArray
 
-    def as_face(self) -> Face:
-        """The face with its tables at the points of quadrature."""
-        factors, slopes = self.tables(self.points)
-        rule, q = f"{self.product[0]}->q{self.product[1]}", len(self.points)
-        shape, *by = (np.einsum(rule, *one).reshape(q, -1) for one in (factors, *slopes))
-        gradient = np.stack(by, axis=-1)
-        return Face(self.face, len(self.nodes), shape, gradient, self.weights, self.corners)
 
-
-def _square_tables(xi: FloatArray) -> tuple[Factors, tuple[Factors, Factors]]:
-    (a, da), (b, db) = _lagrange(2, xi[:, 0]), _lagrange(2, xi[:, 1])
-    return (b, a), ((b, da), (db, a))
-
-
-def _triangle_tables(xi: FloatArray) -> tuple[Factors, tuple[Factors, Factors]]:
-    """Of the six-node triangle."""
-    x, y = xi[:, 0], xi[:, 1]
-    z, o = 1 - x - y, np.zeros_like(x)
-    value = np.stack(
-        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z],
-        axis=-1,
-    )
-    d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
-    d_y = np.stack([1 - 4 * z, o, 4 * y - 1, -4 * x, 4 * x, 4 * (z - y)], axis=-1)
-    return (value,), ((d_x,), (d_y,))
-
-
-def _square() -> _Plane:
-    g, w = _gauss(3)
-    quads = [3 * j + i for j in (0, 1) for i in (0, 1)]
-    return _Plane(
-        face="quad9",
+_G3, _W3 = _gauss(3)
+_PLANES = {
+    "quad9": _Plane(
+        _quad9,
+        points=np.array([[x, y] for y in _G3 for x in _G3]),
+        weights=np.tile(_W3, 3) * np.repeat(_W3, 3),
         nodes=np.array([[x, y] for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)]),
-        tables=_square_tables,
-        product=("qj,qi", "ji"),
-        points=np.column_stack([np.tile(g, 3), np.repeat(g, 3)]),
-        weights=np.tile(w, 3) * np.repeat(w, 3),
+        centre=np.zeros(2),
         modes=lambda xi: np.column_stack([np.ones(len(xi)), xi, xi[:, 0] * xi[:, 1]]),
         outside=lambda xi: np.max(np.abs(xi), axis=1) - 1.0,
         inside=lambda xi: np.clip(xi, -1.0, 1.0),
-        centre=(0.0, 0.0),
-        corners=np.array([t for n in quads for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])]),
-    )
-
-
-def _triangle() -> _Plane:
-    # Degree-4 rule with six points (Strang and Fix 1973; weights sum to 1/2).
-    a, b = 0.445948490915965, 0.091576213509771
-    inner = [[a, a], [1 - 2 * a, a], [a, 1 - 2 * a]]
-    outer = [[b, b], [1 - 2 * b, b], [b, 1 - 2 * b]]
-    return _Plane(
-        face="tri6",
-        nodes=np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]),
-        tables=_triangle_tables,
-        product=("qa", "a"),
-        points=np.array(inner + outer),
-        weights=0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3),
+        corners=np.array(
+            [[n + k for k in corner] for n in (0, 1, 3, 4) for corner in ((0, 1, 4), (0, 4, 3))]
+        ),
+    ),
+    "tri6": _Plane(
+        _triangle6,
+        points=_TRIANGLE_POINTS,
+        weights=_TRIANGLE_WEIGHTS,
+        nodes=np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]]),
+        centre=np.full(2, 1 / 3),
         modes=lambda xi: np.column_stack([np.ones(len(xi)), xi - 1.0 / 3.0]),
-        outside=lambda xi: np.max([-xi[:, 0], -xi[:, 1], xi.sum(axis=1) - 1], axis=0),
+        outside=lambda xi: np.max(np.stack([-xi[:, 0], -xi[:, 1], xi.sum(axis=1) - 1]), axis=0),
         inside=_simplex,
-        centre=(1 / 3, 1 / 3),
         corners=np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
-    )
+    ),
+}
 
 
-SQUARE, TRIANGLE = _square(), _triangle()
-
-
-# -- elements -------------------------------------------------------------------------------------
-def _no_modes(xi: FloatArray) -> FloatArray:
-    return np.zeros((xi.shape[0], 0))
-
-
-def _reduced(xi: FloatArray, weights: FloatArray) -> FloatArray:
-    """Projections ``(6, q, q)`` of ``hex18_thin``, within each layer of points."""
-    same = (xi[:, None, 2] == xi[None, :, 2]) * weights
-
-    def without(axis: int) -> FloatArray:
-        # Along its axis, what is less than quadratic, from the values on the same line.
-        line = same * (xi[:, None, 1 - axis] == xi[None, :, 1 - axis])
-        quadratic = 1.5 * xi[:, axis] ** 2 - 0.5
-        norm = line @ quadratic**2
-        return np.asarray(np.eye(len(xi)) - (quadratic / norm)[:, None] * line * quadratic)
-
-    first, second, all_of_it = without(0), without(1), np.eye(len(xi))
-    return np.stack([first, second, all_of_it, second, first, first @ second])
-
-
-def _layered(name: str, plane: _Plane, order: int, *, thin: bool = False) -> Element:
-    """Plane times thickness, in which it is of an order."""
-    rule = f"qk,{plane.product[0]}->qk{plane.product[1]}"
-
-    def product(*factors: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum(rule, *factors).reshape(len(factors[0]), -1))
+def _layered(name: str, face: str, order: int) -> Element:
+    """The product of a plane element and a line of ``order`` through the thickness."""
+    plane = _PLANES[face]
 
     def shape(xi: FloatArray) -> FloatArray:
-        return product(_lagrange(order, xi[:, 2])[0], *plane.tables(xi)[0])
+        return _product(_lagrange(order, xi[:, 2])[0], *plane.evaluate(*xi[:, :2].T)[0])
 
     def gradient(xi: FloatArray) -> FloatArray:
-        (c, dc), (factors, (by_x, by_y)) = _lagrange(order, xi[:, 2]), plane.tables(xi)
-        return np.stack([product(c, *by_x), product(c, *by_y), product(dc, *factors)], axis=-1)
+        (c, dc), (value, d_x, d_y) = _lagrange(order, xi[:, 2]), plane.evaluate(*xi[:, :2].T)
+        return np.stack([_product(c, *d_x), _product(c, *d_y), _product(dc, *value)], axis=-1)
 
-    def with_zeta(values: FloatArray, zetas: FloatArray) -> FloatArray:
-        return np.column_stack([np.tile(values, (len(zetas), 1)), np.repeat(zetas, len(values))])
+    def modes(xi: FloatArray) -> FloatArray:
+        return np.asarray(xi[:, 2:] * plane.modes(xi[:, :2]))
 
-    (g, w), n = _gauss(2), len(plane.nodes)
+    (g2, w2), levels = _gauss(2), np.linspace(-1.0, 1.0, order + 1)
+
+    def stacked(points: FloatArray, zetas: FloatArray) -> FloatArray:
+        return np.array([[*point, zeta] for zeta in zetas for point in points])
+
+    nodes = stacked(plane.nodes, levels)
     return Element(
         name=name,
-        n_nodes=n * (order + 1),
+        n_nodes=len(nodes),
         shape=shape,
         gradient=gradient,
-        points=with_zeta(plane.points, g),
-        weights=(plane.weights * w[:, None]).ravel(),
-        enhanced=(lambda xi: xi[:, 2:3] * plane.modes(xi[:, :2])) if order == 1 else _no_modes,
-        node_coordinates=with_zeta(plane.nodes, np.linspace(-1.0, 1.0, order + 1)),
-        outside=lambda xi: np.maximum(plane.outside(xi[:, :2]), np.abs(xi[:, 2]) - 1),
+        points=stacked(plane.points, g2),
+        weights=np.array([along * across for across in w2 for along in plane.weights]),
+        enhanced=modes if order == 1 else _no_modes,
+        node_coordinates=nodes,
+        outside=lambda xi: np.maximum(plane.outside(xi[:, :2]), np.abs(xi[:, 2]) - 1.0),
         inside=lambda xi: np.column_stack([plane.inside(xi[:, :2]), np.clip(xi[:, 2], -1.0, 1.0)]),
-        face=plane.face,
-        centre=np.array([[*plane.centre, 0.0]]),
-        top_face=np.arange(n) + n * order,
-        sampling=_reduced if thin else None,
+        face=face,
+        centre=np.append(plane.centre, 0.0)[None],
+        top_face=np.arange(len(plane.nodes)) + len(plane.nodes) * order,
     )
 
 
@@ -329,14 +296,17 @@ def _tetrahedron(name: str, order: int) -> Element:
         )
         return np.concatenate([(4 * b[:, :, None] - 1) * corner, middle], axis=1)
 
-    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    points, weights = np.full((1, 3), 0.25), np.array([1 / 6])
-    if order == 2:
-        # Degree 2, four points (Hammer and Stroud 1956).
-        a, b = 0.585410196624969, 0.138196601125011
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    if order == 1:
+        points, weights, nodes = np.full((1, 3), 0.25), np.array([1 / 6]), corners
+    else:
+        a, b = (
+            0.585410196624969,
+            0.138196601125011,
+        )  # degree 2, four points (Hammer and Stroud 1956)
         points = np.array([[b, b, b], [a, b, b], [b, a, b], [b, b, a]])
         weights = np.full(4, 1 / 24)
-        nodes = np.vstack([nodes, 0.5 * (nodes[edges[:, 0]] + nodes[edges[:, 1]])])
+        nodes = np.vstack([corners, 0.5 * (corners[edges[:, 0]] + corners[edges[:, 1]])])
     return Element(
         name=name,
         n_nodes=len(nodes),
@@ -353,25 +323,33 @@ def _tetrahedron(name: str, order: int) -> Element:
     )
 
 
-_TRI3 = Face(
-    "tri3",
-    3,
-    np.full((1, 3), 1 / 3),
-    np.array([[[-1.0, -1], [1, 0], [0, 1]]]),
-    np.array([0.5]),
-    np.array([[0, 1, 2]]),
-)
-FACES = {face.name: face for face in (SQUARE.as_face(), TRIANGLE.as_face(), _TRI3)}
-ELEMENTS = {
+def _face(name: str) -> Face:
+    plane = _PLANES[name]
+    value, d_x, d_y = plane.evaluate(*plane.points.T)
+    slope = np.stack([_product(*d_x), _product(*d_y)], axis=-1)
+    return Face(name, len(plane.nodes), _product(*value), slope, plane.weights, plane.corners)
+
+
+FACES: dict[str, Face] = {
+    **{name: _face(name) for name in _PLANES},
+    "tri3": Face(
+        "tri3",
+        3,
+        np.full((1, 3), 1 / 3),
+        np.array([[[-1.0, -1], [1, 0], [0, 1]]]),
+        np.array([0.5]),
+        np.array([[0, 1, 2]]),
+    ),
+}
+ELEMENTS: dict[str, Element] = {
     e.name: e
     for e in (
         _tetrahedron("tet4", 1),
         _tetrahedron("tet10", 2),
-        _layered("hex18", SQUARE, 1),
-        _layered("hex18_thin", SQUARE, 1, thin=True),
-        _layered("hex27", SQUARE, 2),
-        _layered("wedge12", TRIANGLE, 1),
-        _layered("wedge18", TRIANGLE, 2),
+        _layered("hex18", "quad9", 1),
+        _layered("hex27", "quad9", 2),
+        _layered("wedge12", "tri6", 1),
+        _layered("wedge18", "tri6", 2),
     )
 }
 

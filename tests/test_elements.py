@@ -62,7 +62,7 @@ def monomial(name, a, b, c):
 
 
 # Highest exact degree: total (tetrahedra), in the plane and across (layered elements).
-EXACT = {"tet4": (1, 1), "tet10": (2, 2), "hex18": (5, 3), "hex18_thin": (5, 3),
+EXACT = {"tet4": (1, 1), "tet10": (2, 2), "hex18": (5, 3),
          "hex27": (5, 3), "wedge12": (4, 3), "wedge18": (4, 3)}  # fmt: skip
 
 

@@ -34,6 +34,7 @@ LEAVES = (
 )
 VALUE_OBJECTS = (
     "mvest.valve.anatomy.valve",
+    "mvest.valve.mesh.cells",
     "mvest.valve.mesh.solid_mesh",
 )
 

@@ -3,7 +3,7 @@ A thin ring, by forces and symmetry
 ===================================
 
 A ring of 0.2 mm, 20 mm across, is pulled apart by two forces. A quarter of it will do: nodes on
-the planes of symmetry keep one coordinate. So thin a body takes ``hex18_thin``.
+the planes of symmetry keep one coordinate. So thin a body takes small cells.
 """
 
 import matplotlib.pyplot as plt
@@ -12,7 +12,7 @@ import numpy as np
 import mvest
 from mvest.mechanics.body import box
 
-unit, elements = box("hex18_thin", (12, 1, 1), (1.0, 1.0, 1.0))
+unit, elements = box("hex18", (36, 1, 1), (1.0, 1.0, 1.0))
 angle, radius = np.pi / 2 * unit[:, 0], 9.8 + 0.2 * unit[:, 2]
 nodes = np.stack([radius * np.sin(angle), 2.0 * unit[:, 1], radius * np.cos(angle)], axis=1)
 top, side = unit[:, 0] == 0, unit[:, 0] == 1
@@ -22,7 +22,7 @@ pull[side, 0] = 0.01 / np.count_nonzero(side)  # N
 ring = mvest.simulate_body(
     nodes,
     elements,
-    "hex18_thin",
+    "hex18",
     material=mvest.TransverselyIsotropic.isotropic(E=100.0, nu=0.3),
     fixed_components=fixed,
     forces=lambda t: t * pull,

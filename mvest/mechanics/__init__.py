@@ -14,8 +14,8 @@ What is here, in the order data flows:
   ``solid``: strains, forces and tangents of all elements of a mesh;
 * ``forces``: what acts on the solid (pressure, chordae, annular hinge, ties, contact);
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
-* ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
-  time steps, Newton's method, sensitivities; ``approach``: the way to a far equilibrium;
+* ``solver``: sparse direct solvers; ``steps``, ``integrate``: settings and results, time steps,
+  Newton's method, sensitivities;
 * ``body``: all of it without a valve, and boxes of cells.
 
 A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):

@@ -2,25 +2,14 @@
 
 ``gradients (e, q, k, 3)`` lie along the fibre frame, ``volumes (e, q)`` are those of the quadrature
 points; an enhanced strain is ``direction (e, q, 6)`` times ``polynomials (q, m)`` times alpha.
-
-In elements for thin bodies strains are sampled at fewer points (see :mod:`mvest.elements`). The
-covariant components ``E_ij = G_i . E . G_j`` of the Green-Lagrange strain at the quadrature points
-are replaced by linear combinations of themselves, which a matrix of the element's says for each
-component. What that takes away does work on a constant stress where the element is distorted, so
-its mean over the element is given back: the patch test holds. The strain that the law gets is a
-linear function of the strains of the displacements: forces and tangents have an energy as before,
-and no new unknowns.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.elements import Element
 from mvest.typing import FloatArray, IntArray
 
 VOIGT = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
@@ -290,134 +279,3 @@ def add_tangents(
                 for i in range(3):
                     for j in range(3):
                         block[i, j] += k[b, (3 * i + j) * n_a + c]
-
-
-PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-TOGETHER = 32
-"""Elements whose tangents are computed at once, in some 10 MB."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sampling:
-    """How the strains of all elements are combined.
-
-    Attributes
-    ----------
-    combination : ndarray
-        ``(6, q, q)`` of each covariant component.
-    to_covariant, from_covariant : ndarray
-        ``(e, q, 6, 6)`` between strain (engineering shear) in the fibre frame and its covariant
-        components.
-    to_mean, from_mean : ndarray
-        ``(e, q, 6, 6)`` from the fibre frame to axes that all points share, times the share of the
-        element's volume, and back (without it).
-    """
-
-    combination: FloatArray
-    to_covariant: FloatArray
-    from_covariant: FloatArray
-    to_mean: FloatArray
-    from_mean: FloatArray
-
-    @classmethod
-    def of(cls, reference: Element, jacobian: FloatArray, frame: FloatArray) -> Sampling:
-        """From the Jacobians ``(e, q, 3, 3)`` and fibre frames ``(e, q, 3, 3)``, in columns."""
-        assert reference.sampling is not None
-        to_covariant = _components(frame.swapaxes(2, 3) @ jacobian)
-        volumes = np.linalg.det(jacobian) * reference.weights
-        share = volumes / volumes.sum(axis=1, keepdims=True)
-        to_common = _components(frame.swapaxes(2, 3))
-        return cls(
-            reference.sampling(reference.points, reference.weights),
-            to_covariant,
-            np.asarray(np.linalg.inv(to_covariant)),
-            share[:, :, None, None] * to_common,
-            np.asarray(np.linalg.inv(to_common)),
-        )
-
-    def strain(self, green: FloatArray, part: slice = slice(None)) -> FloatArray:
-        """Combined strain ``(e, q, 6, ...)`` of strain ``(e, q, 6, ...)`` in the fibre frame.
-
-        ``part`` are the elements that the strain is of.
-        """
-        given = green.reshape(*green.shape[:3], -1)
-        covariant = self.to_covariant[part] @ given
-        combined = self.combination[:, None] @ np.moveaxis(covariant, 2, 0)
-        sampled = self.from_covariant[part] @ np.moveaxis(combined, 0, 2)
-        mean = (self.to_mean[part] @ (given - sampled)).sum(axis=1, keepdims=True)
-        return np.asarray((sampled + self.from_mean[part] @ mean).reshape(green.shape))
-
-    def stress(self, stress: FloatArray, volumes: FloatArray) -> FloatArray:
-        """Stress ``(e, q, 6)`` that does the work of ``stress`` on the strain of displacements."""
-        work = volumes[..., None] * stress
-        total = _times(self.from_mean.swapaxes(2, 3), work).sum(axis=1, keepdims=True)
-        mean = _times(self.to_mean.swapaxes(2, 3), total)
-        covariant = _times(self.from_covariant.swapaxes(2, 3), work - mean)
-        combined = np.einsum("iqp,eqi->epi", self.combination, covariant)
-        work = _times(self.to_covariant.swapaxes(2, 3), combined) + mean
-        return np.asarray(work / volumes[..., None])
-
-    def add_tangents(
-        self,
-        gradients: FloatArray,
-        volumes: FloatArray,
-        deformation: FloatArray,
-        stress: FloatArray,
-        tangent: FloatArray,
-        modes: FloatArray,
-        positions: NDArray[np.int32],
-        blocks: FloatArray,
-    ) -> None:
-        """Add the tangents of all elements, N/mm, the modes ``(e, q, 6, m)`` eliminated.
-
-        ``stress`` is what `stress` gives; the others are those of :class:`Solid`.
-        """
-        n_a = gradients.shape[2]
-        for start in range(0, len(volumes), TOGETHER):
-            part = slice(start, start + TOGETHER)
-            f, g, d = deformation[part], gradients[part], volumes[part][..., None, None]
-            flat = (len(g), g.shape[1] * 6, -1)
-            # Strain by the displacements of the nodes, (e, q, 6, k, 3).
-            b = np.empty((*g.shape[:2], 6, n_a, 3))
-            for row, (i, j) in enumerate(PAIRS):
-                b[:, :, row] = g[..., i, None] * f[:, :, None, :, j]
-                if i != j:
-                    b[:, :, row] += g[..., j, None] * f[:, :, None, :, i]
-            strain = self.strain(b, part).reshape(*g.shape[:2], 6, -1)
-            work, modal = d * tangent[part] @ strain, d * tangent[part] @ modes[part]
-            m = modes[part].reshape(flat).swapaxes(1, 2)
-            k_am = m @ work.reshape(flat)
-            k = strain.reshape(flat).swapaxes(1, 2) @ work.reshape(flat)
-            k -= k_am.swapaxes(1, 2) @ np.linalg.solve(m @ modal.reshape(flat), k_am)
-            pull = np.moveaxis(g @ (d * stress[part][..., VOIGT]), 2, 1)
-            along = np.moveaxis(g, 2, 1).reshape(len(g), n_a, -1)
-            geometric = pull.reshape(along.shape) @ along.swapaxes(1, 2)
-            k = k.reshape(-1, n_a, 3, n_a, 3) + geometric[:, :, None, :, None] * np.eye(3)[:, None]
-            _scatter(k, positions[part], blocks)
-
-
-@nb.njit(cache=True)
-def _scatter(k: FloatArray, positions: NDArray[np.int32], blocks: FloatArray) -> None:
-    """Add ``k (e, k, 3, k, 3)`` to the blocks at ``positions (e, k, k)``, if not negative."""
-    for e in range(len(k)):
-        for a in range(k.shape[1]):
-            for b in range(k.shape[1]):
-                if positions[e, a, b] >= 0:
-                    blocks[positions[e, a, b]] += k[e, a, :, b]
-
-
-def _components(base: FloatArray) -> FloatArray:
-    """Map ``(e, q, 6, 6)`` of strain to its components on the columns of ``base (e, q, 3, 3)``."""
-    out = np.empty((*base.shape[:2], 6, 6))
-    for row, (i, j) in enumerate(PAIRS):
-        for column, (k, m) in enumerate(PAIRS):
-            one = base[:, :, k, i] * base[:, :, m, j]
-            # Engineering shear is twice the tensor's component, in the row and in the column.
-            if k != m:
-                one = 0.5 * (one + base[:, :, m, i] * base[:, :, k, j])
-            out[:, :, row, column] = one if i == j else 2 * one
-    return out
-
-
-def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

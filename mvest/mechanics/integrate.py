@@ -22,13 +22,12 @@ Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for ea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import HARMLESS, ContactPairs
@@ -348,17 +347,8 @@ class _Stepper:
             near = residuals[-1] <= NEAR and len(residuals) > 1
             self.solver.factorize(system.matrix(blocks, mass_factor), near=near)
 
-        def linearize(at: FloatArray, stress: FloatArray | None) -> Evaluation:
-            result = evaluate(at)
-            solid = result.solid if stress is None else replace(result.solid, stress=stress)
-            result.blocks = system.tangent(at, loads, pairs, solid)
-            return result
-
-        residuals: list[float] = []
-        if not mass_factor and system.contact is None and not newton.single_solve:
-            x, residuals = approach(system, self.solver, linearize, x, self._far)
         current = evaluate(x)
-        residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
+        residuals = [float(np.linalg.norm(current.residual)) / current.scale]
         for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
                 raise _StepError(StepReason.NO_CONVERGENCE)

@@ -7,7 +7,7 @@ which of the kinds of tissue they know (:attr:`mvest.mechanics.law.Law.kinds`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -57,8 +57,6 @@ _REGION, _CHORDS = NamePart.REGION, NamePart.CHORDS
 
 KINDS: dict[str, Kind] = {
     "E_f": Kind("MPa", _REGION, 1e-6, 1e4, "Young's modulus along the fibre"),
-    "ratio": Kind("", _REGION, 1e-3, 1e3, "E_f over E_perp, at the same E_f"),
-    "G": Kind("MPa", _REGION, 1e-6, 1e4, "shear modulus, where it does not follow E_f"),
     "field": Kind(
         "", NamePart.MODE, -10, 10, "coefficient of a mode of log E_f within a leaflet", False
     ),
@@ -83,8 +81,8 @@ class Parameter:
     """One parameter to differentiate by: its name and its current value.
 
     Names are those of ``KINDS``: for example ``E_f.REGION`` (MPa; the region's other moduli follow
-    in proportion, except those that are parameters themselves), ``field.REGION.K``,
-    ``pressure_scale`` or ``chord_stiffness.FAMILY`` (factors, which multiply).
+    in proportion), ``field.REGION.K``, ``pressure_scale`` or ``chord_stiffness.FAMILY`` (factors,
+    which multiply).
     """
 
     name: str
@@ -149,37 +147,3 @@ def kind_of(name: str) -> Kind:
 def is_positive(name: str) -> bool:
     """Whether parameter ``name`` is positive by nature; InputError if there is none such."""
     return kind_of(name).positive
-
-
-def check_names(
-    names: Iterable[str],
-    regions: Iterable[str],
-    chords: Iterable[str],
-    modes: Mapping[str, int] | None = None,
-) -> None:
-    """Refuse names that are none of a valve's.
-
-    Parameters
-    ----------
-    names : iterable of str
-    regions : iterable of str
-        Its leaflets.
-    chords : iterable of str
-        Its families of chordae and its tips.
-    modes : mapping, optional
-        Leaflet -> number of modes of its field.
-
-    Raises
-    ------
-    InputError
-        If there is no such kind of parameter, or no such part of this valve.
-    """
-    fields = [f"{region}.{k}" for region, n in (modes or {}).items() for k in range(n)]
-    parts = {NamePart.REGION: list(regions), NamePart.CHORDS: list(chords), NamePart.MODE: fields}
-    for name in names:
-        part = name.partition(".")[2]
-        known = parts.get(kind_of(name).part, [])
-        if part and part not in known:
-            raise InputError(
-                f"parameter {name!r}: unknown {part!r}; known here: {', '.join(known) or '(none)'}"
-            )

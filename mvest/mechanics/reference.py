@@ -17,8 +17,9 @@ which limits its reach, changes with the geometry.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -74,37 +75,38 @@ class RestVariation:
     def joined(cls, parts: Sequence[RestVariation]) -> RestVariation:
         """The quantities of several variations of one body, one after another."""
 
-        def of(name: str) -> FloatArray | None:
+        def one_by_one(name: str, shape: tuple[int, ...]) -> FloatArray:
+            none = [np.zeros((len(part), *shape)) for part in parts]
             own = [getattr(part, name) for part in parts]
-            given = [values for values in own if values is not None]
-            if not given:
-                return None
-            shape = given[0].shape[1:]
-            return np.concatenate(
-                [
-                    np.zeros((len(part), *shape)) if values is None else values
-                    for part, values in zip(parts, own, strict=True)
-                ]
-            )
+            return np.concatenate([n if o is None else o for n, o in zip(none, own, strict=True)])
 
-        nodes = np.concatenate([part.nodes for part in parts])
-        members = next((part.members for part in parts if part.members is not None), None)
-        return cls(nodes, **{name: of(name) for name in _OPTIONAL}, members=members)
+        return cls._of(parts, one_by_one)
 
     @classmethod
     def summed(cls, parts: Sequence[RestVariation]) -> RestVariation:
         """As many quantities, each of which does what it does in all parts at once."""
 
-        def of(name: str) -> FloatArray | None:
+        def at_once(name: str, shape: tuple[int, ...]) -> FloatArray:
             own = [values for part in parts if (values := getattr(part, name)) is not None]
-            return sum(own[1:], own[0]) if own else None
+            return np.asarray(sum(own[1:], own[0]))
 
-        members = next((part.members for part in parts if part.members is not None), None)
-        nodes = sum((part.nodes for part in parts[1:]), parts[0].nodes)
-        return cls(nodes, **{name: of(name) for name in _OPTIONAL}, members=members)
+        return cls._of(parts, at_once)
 
-
-_OPTIONAL = tuple(f.name for f in fields(RestVariation) if f.name not in ("nodes", "members"))
+    @classmethod
+    def _of(
+        cls,
+        parts: Sequence[RestVariation],
+        combined: Callable[[str, tuple[int, ...]], FloatArray],
+    ) -> RestVariation:
+        """What is combined of each field that a part has, given its name and an entry's shape."""
+        given: dict[str, Any] = {}
+        for field in fields(cls):
+            own = [values for part in parts if (values := getattr(part, field.name)) is not None]
+            if own and field.name == "members":
+                given["members"] = own[0]
+            elif own:
+                given[field.name] = combined(field.name, own[0].shape[1:])
+        return cls(**given)
 
 
 def vary_equilibrium(

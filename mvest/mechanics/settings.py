@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from mvest.errors import InputError, MaterialError, require_numbers
-from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 from mvest.quantities import (
     BeatTime,
@@ -139,22 +139,11 @@ class TissueSettings:
                 f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}"
             )
 
-    def moduli(
-        self, E_f: float, ratio: float | None = None, G: float | None = None
-    ) -> LeafletModuli:
-        """The moduli with ``E_f`` (MPa) along the fibre.
-
-        ``ratio`` replaces that of the tissue; ``G`` (MPa) is the shear modulus where it does not
-        follow ``E_f``.
-        """
-        own = self.ratio if ratio is None else ratio
-        return LeafletModuli(E_f, own, self.nu, PoissonReading(self.reading), G)
-
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of parameters that the tissue has."""
         kinds = {"exponential": EXPONENTIAL_KINDS, "stiffening": ("E_f", "stiffening")}
-        own = kinds.get(self.law, ("E_f", "ratio", "G"))
+        own = kinds.get(self.law, ("E_f",))
         return own if self.law == "corotational" else (*own, "prestretch")
 
     def coefficients(self, values: Mapping[str, float]) -> ExponentialTissue:
@@ -173,7 +162,8 @@ class TissueSettings:
 
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
-        return self.moduli(E_f).material
+        reading = PoissonReading(self.reading)
+        return TransverselyIsotropic.from_ratio(E_f, self.ratio, self.nu, reading)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,11 +173,11 @@ class ModulusField:
     Attributes
     ----------
     correlation_length_mm : float
-        l, over which it is alike.
+        l, over which it is correlated.
     std_log : float
         Standard deviation of log E_f at a point.
     modes : int
-        How many modes are kept.
+        Number of modes.
     """
 
     correlation_length_mm: Length

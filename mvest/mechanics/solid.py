@@ -14,8 +14,7 @@ Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = d p^T``: th
 the element's polynomials p. The parameters alpha of an element solve ``int M^T S dV = 0`` and are
 eliminated inside the element by Newton's method at every evaluation, so that to the outside the
 element has an energy of nodal positions only (its condensed tangent is the Schur complement). The
-modes integrate to zero against constant stress: the patch test holds. In elements for thin bodies
-E(u) is sampled at fewer points (:mod:`mvest.mechanics.element`). With the corotational law the
+modes integrate to zero against constant stress: the patch test holds. With the corotational law the
 strain is the linear one in a frame that turns with the element, which takes the place of F.
 """
 
@@ -30,8 +29,6 @@ from numpy.typing import NDArray
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
-    PAIRS,
-    Sampling,
     add_tangents,
     alpha_change,
     enhanced_strain,
@@ -44,6 +41,8 @@ from mvest.mechanics.law.biot import BiotLaw
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
+PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+"""Entries of a symmetric tensor that the components of a six-vector are."""
 ENHANCED_ITERATIONS = 12
 ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
@@ -107,7 +106,6 @@ class Solid:
         polynomials = reference.enhanced(reference.points)
         self.polynomials = np.ascontiguousarray(polynomials if enhanced else polynomials[:, :0])
         self.n_modes = self.polynomials.shape[1]
-        self.sampling = _sampling(mesh, reference)
         self.rotations = None
         if isinstance(law, BiotLaw) and law.corotational:
             at_rest = strains(mesh.nodes, mesh.elements, self.gradients)[1]
@@ -127,8 +125,6 @@ class Solid:
         """Strain, stress and tangent at nodal positions ``x (n, 3)`` mm."""
         elements, region = self.mesh.elements, self.mesh.region
         green_u, f = strains(x, elements, self.gradients)
-        if self.sampling is not None:
-            green_u = self.sampling.strain(green_u)
         if self.rotations is not None:
             green_u, f = self.rotations(x, f)
         if self.n_modes == 0:
@@ -171,16 +167,12 @@ class Solid:
         blocks : ndarray
             ``(n_blocks, 3, 3)``.
         """
-        at = (self.gradients, self.volumes, state.deformation)
-        if self.sampling is not None:
-            modes = self.direction[..., None] * self.polynomials[None, :, None, :]
-            stress = self.sampling.stress(state.stress, self.volumes)
-            self.sampling.add_tangents(*at, stress, state.tangent, modes, positions, blocks)
-            return
         # The corotational tangent is taken at fixed rotations: it has no geometric part.
         turned = self.rotations is not None
         add_tangents(
-            *at,
+            self.gradients,
+            self.volumes,
+            state.deformation,
             np.zeros_like(state.stress) if turned else state.stress,
             state.tangent,
             self.direction,
@@ -190,8 +182,6 @@ class Solid:
         )
 
     def _forces(self, state: SolidState, stress: FloatArray) -> FloatArray:
-        if self.sampling is not None:
-            stress = self.sampling.stress(stress, self.volumes)
         return internal_forces(self.gradients, self.volumes, state.deformation, stress)
 
     def extrapolated(self, state: SolidState, dx: FloatArray) -> SolidState:
@@ -227,8 +217,6 @@ class Solid:
             ``(e, q, 6)`` partial derivative of S at fixed strain.
         """
         d_green = strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
-        if self.sampling is not None:
-            d_green = self.sampling.strain(d_green)
         if self.n_modes:
             total = d_stress + np.einsum("eqij,eqj->eqi", state.tangent, d_green)
             d_green = d_green + self._enhanced_change(state, total)
@@ -334,14 +322,6 @@ def _fibre_frames(mesh: SolidMesh, reference: Element, jacobian: FloatArray) -> 
         normal = np.cross(fibre, axis)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.stack([fibre, np.cross(normal, fibre), normal], axis=-1)
-
-
-def _sampling(mesh: SolidMesh, reference: Element) -> Sampling | None:
-    if reference.sampling is None:
-        return None
-    x_e, d = mesh.nodes[mesh.elements], reference.gradient(reference.points)
-    jacobian = np.einsum("eai,qaj->eqij", x_e, d)
-    return Sampling.of(reference, jacobian, _fibre_frames(mesh, reference, jacobian))
 
 
 def _enhanced_direction(mesh: SolidMesh, reference: Element) -> FloatArray:

@@ -35,7 +35,7 @@ which it is left out of the factor. A closed valve of 25 000 nodes takes 7 itera
 TOGETHER = 4
 """Right-hand sides that are solved for in turns, with one call of PARDISO for all of them."""
 SLACK = 1.3
-"""Blocks kept over blocks needed from which the symbolic analysis is worth repeating."""
+"""Ratio of stored to needed blocks above which the symbolic analysis is repeated."""
 NESTED_FROM = 20_000
 """Nodes from which nested dissection fills less than minimum degree."""
 
@@ -84,7 +84,7 @@ class PardisoSolver:
     symmetric part (type -2: half the memory, several times faster than the unsymmetric type 11)
     without the blocks below ``NEGLIGIBLE`` and in single precision, and right-preconditioned GMRES
     (:mod:`mvest.mechanics.krylov`) solves with the whole matrix: the solution is that of the given
-    system to the tolerance asked for, whatever the factor lacks.
+    system to the requested tolerance, whatever the factor lacks.
 
     The symbolic analysis, which works on blocks and costs a fraction of a factorisation, is
     repeated when other blocks come to matter.
@@ -391,7 +391,7 @@ def linear_solver(name: str = "auto") -> LinearSolver:
     Raises
     ------
     InputError
-        If the name is unknown, or PARDISO was asked for and is not installed.
+        If the name is unknown, or PARDISO is requested and not installed.
     """
     if name not in ("auto", "pardiso", "superlu"):
         raise InputError(f"unknown linear solver {name!r}; known: auto, pardiso, superlu")

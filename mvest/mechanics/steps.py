@@ -1,4 +1,4 @@
-"""What a simulation is asked for and what it gives back: steps, settings, frames, reasons."""
+"""Input and result of a simulation: steps, settings, frames, reasons."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ class System:
         *,
         tangent: bool,
     ) -> Evaluation:
-        """Residual ``(n, 3)`` N and, if asked for, the blocks of its tangent N/mm."""
+        """Residual ``(n, 3)`` N and, with ``tangent``, the blocks of its tangent N/mm."""
         state = self.solid.evaluate(x, previous, rate)
         residual = np.zeros((self.n, 3))
         add_forces(residual, self.solid.mesh.elements, self.solid.forces(state))

@@ -20,7 +20,7 @@ from mvest.mechanics.law import Law
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw, StiffeningLaw
 from mvest.mechanics.law.regional import FieldBasis, LeafletLaw, ModulusVariation, at_quadrature
-from mvest.mechanics.parameters import NamePart, check_names, kind_of
+from mvest.mechanics.parameters import NamePart, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, MechanicsSettings
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System
@@ -129,15 +129,22 @@ def build_system(
 def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSettings) -> None:
     """Refuse names that are no parameters of this valve under these settings; InputError."""
     tips = [f"tip{k}" for k in range(len(valve.papillary_tips))]
-    modes = {region: own.modes for region, own in settings.fields.items()}
-    names = tuple(names)
-    check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips], modes)
+    parts = {
+        NamePart.REGION: valve.surface.region_names,
+        NamePart.CHORDS: (*valve.chordae.family_names, *tips),
+        NamePart.MODE: [f"{r}.{k}" for r, own in settings.fields.items() for k in range(own.modes)],
+    }
     for name in names:
-        kind, _, region = name.partition(".")
-        tissue = settings.tissue.get(region) if kind_of(name).part is NamePart.REGION else None
+        kind, _, part = name.partition(".")
+        known = parts.get(kind_of(name).part, ())
+        if part and part not in known:
+            raise InputError(
+                f"parameter {name!r}: unknown {part!r}; known here: {', '.join(known) or '(none)'}"
+            )
+        tissue = settings.tissue.get(part)
         if tissue is not None and kind not in tissue.kinds:
             raise InputError(
-                f"parameter {name!r}: the tissue of {region!r} follows the {tissue.law} law, which "
+                f"parameter {name!r}: the tissue of {part!r} follows the {tissue.law} law, which "
                 f"has {', '.join(tissue.kinds)}"
             )
 
@@ -220,11 +227,11 @@ def _law_of(
     if tissues[0].law == "stiffening":
         own = {"stiffening": tissues[0].stiffening, **given(regions[0], "E_f", "stiffening")}
         return StiffeningLaw.of(tissues[0], **own)
-    moduli = [
-        tissue.moduli(**given(region, "E_f", "ratio", "G"))
+    materials = [
+        tissue.material(values[f"E_f.{region}"])
         for tissue, region in zip(tissues, regions, strict=True)
     ]
-    return BiotLaw.of_moduli(moduli, corotational=tissues[0].law == "corotational")
+    return BiotLaw.of(materials, corotational=tissues[0].law == "corotational")
 
 
 def variation_of(

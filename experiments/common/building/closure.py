@@ -171,12 +171,13 @@ def build_mesh(anatomy: Anatomy, mesh: Values, element: str, store: Path) -> Sol
         raise ConfigurationError(
             f"mechanics.element = {element!r}: an unstructured mesh needs tet10 or tet4"
         )
-    if not isinstance(anatomy, Template):
-        return anatomy.tetrahedra(mesh["edge_length"], element, store)
     from mvest.valve.mesh.given import tetrahedral_leaflets
 
-    surface = anatomy.valve(*UNSTRUCTURED_SURFACE).surface
-    normals = anatomy.normals(*UNSTRUCTURED_SURFACE)
+    if not isinstance(anatomy, Template):
+        surface, normals = anatomy.given.surface, None
+    else:
+        surface = anatomy.valve(*UNSTRUCTURED_SURFACE).surface
+        normals = anatomy.normals(*UNSTRUCTURED_SURFACE)
     return tetrahedral_leaflets(surface, mesh["edge_length"], element, store, normals)
 
 

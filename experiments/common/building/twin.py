@@ -25,6 +25,7 @@ from experiments.common.building.closure import (
 from experiments.common.building.filters import build_filter, observation_variance, require_one_each
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import Values
+from mvest.closure.anchors import content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, SharedStart

@@ -22,7 +22,7 @@ from mvest.mechanics.valve_system import boundary_loading, build_system
 from mvest.problem.registration import REGISTRATION
 from mvest.reading.documents import read_mapping
 from mvest.typing import FloatArray
-from mvest.valve.mesh.given import GivenValve
+from mvest.valve.mesh.given import GivenValve, tetrahedral_leaflets
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 GENERIC = {
@@ -205,7 +205,7 @@ def model_of_case(
             f"{', '.join(unlike)}: the file has no law for such tissue; export a run without it"
         )
     # What has another part is an error of a frame's pressure.
-    kinds = ("E_f", "G", "ratio", "chord_stiffness", "chord_rest_length")
+    kinds = ("E_f", "chord_stiffness", "chord_rest_length")
     fixed = {name: values[name] for name in values if name.partition(".")[0] in kinds
              or "." not in name}  # fmt: skip
     estimated = {
@@ -236,7 +236,7 @@ def model_of_case(
     if options.mesh == "structured":
         mesh = valve.layers("hex18", options.columns, options.rows)
     else:
-        mesh = valve.tetrahedra(options.edge_length, "tet10", None)
+        mesh = tetrahedral_leaflets(case.surface, options.edge_length)
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
     return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)
@@ -269,15 +269,10 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     further = [opened.tips, ends, opened.hinge]
     at = np.cumsum([len(mesh.nodes), *map(len, further)])
     tip_nodes, end_nodes, hinge_nodes = (np.arange(a, b) for a, b in itertools.pairwise(at))
-    tissue = [
-        mechanics.tissue[name].moduli(
-            values[f"E_f.{name}"], values.get(f"ratio.{name}"), values.get(f"G.{name}")
-        )
-        for name in mesh.region_names
-    ]
+    tissue = [mechanics.tissue[n].material(values[f"E_f.{n}"]) for n in mesh.region_names]
     document = FebDocument(
         mesh,
-        [febio_law(moduli.material, options.law) for moduli in tissue],
+        [febio_law(material, options.law) for material in tissue],
         protocol.end if options.dynamic else protocol.ramp,
         protocol.ramp / STEPS,
         tolerance=1e-3 if options.dynamic else 1e-4,

@@ -45,7 +45,7 @@ NAMES = {
     "wedge18": ("penta15", {}, WEDGE),
 }
 """Element -> its name in FEBio, the rule of integration where it has a choice, its nodes."""
-UPRIGHT = {"hex18": "hex27", "hex18_thin": "hex27", "wedge12": "wedge18"}
+UPRIGHT = {"hex18": "hex27", "wedge12": "wedge18"}
 """Elements that get nodes halfway through the thickness."""
 
 

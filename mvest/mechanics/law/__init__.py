@@ -1,4 +1,4 @@
-"""How tissue answers strain: what a material law is, and the laws that there are.
+"""Material laws: what the solid needs from a law, and the laws of leaflet tissue.
 
 Arrays of points have the axes (element, quadrature point, component). Strain and stress are
 six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame of the point, strain with engineering shear,
@@ -14,7 +14,7 @@ from mvest.typing import FloatArray, IntArray
 
 
 class Points(NamedTuple):
-    """The state at the quadrature points of some elements, of which a law is asked.
+    """State at the quadrature points of some elements.
 
     Attributes
     ----------

@@ -43,9 +43,8 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from mvest.errors import InputError
 from mvest.mechanics.law import Points
-from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
+from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
 
@@ -70,39 +69,25 @@ class BiotLaw:
     ----------
     stiffness : ndarray
         ``(n_regions, 6, 6)`` MPa.
-    moduli : tuple of LeafletModuli
-        What the stiffness was made of, one per region; empty where it is only known itself, and
-        has a scale E_f but no ratio and no G to differentiate by.
     corotational : bool
         Whether the strain that it is given is already the linear one, in the turned frame of the
         element (:class:`mvest.mechanics.solid.EdgeRotations`), and the stress that in this frame.
     """
 
     stiffness: FloatArray
-    moduli: tuple[LeafletModuli, ...] = ()
     corotational: bool = False
 
     @classmethod
-    def of(cls, materials: Sequence[TransverselyIsotropic]) -> BiotLaw:
+    def of(
+        cls, materials: Sequence[TransverselyIsotropic], *, corotational: bool = False
+    ) -> BiotLaw:
         """The law with one material per region."""
-        return cls(np.ascontiguousarray([m.stiffness for m in materials]))
-
-    @classmethod
-    def of_moduli(cls, moduli: Sequence[LeafletModuli], *, corotational: bool = False) -> BiotLaw:
-        """The law with the moduli of each region.
-
-        Raises
-        ------
-        MaterialError
-            If some are inadmissible.
-        """
-        law = cls.of([m.material for m in moduli])
-        return cls(law.stiffness, tuple(moduli), corotational)
+        return cls(np.ascontiguousarray([m.stiffness for m in materials]), corotational)
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
-        return ("E_f", "ratio", "G")
+        return ("E_f",)
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Biot strain ``(e, q, 6)`` of Green-Lagrange strain ``(e, q, 6)``, both engineering."""
@@ -122,18 +107,8 @@ class BiotLaw:
     ) -> FloatArray:
         """Derivative of S ``(e, q, 6)``; InputError if the law does not know the parameter."""
         parameter.require(self.kinds)
-        here = at.region == which
-        if parameter.kind == "E_f" and (not self.moduli or self.moduli[which].G is None):
-            # All moduli follow E_f: S is linear in the scale of C.
-            return np.where(here[:, None, None], stress, 0.0) / parameter.value
-        if not self.moduli:
-            raise InputError(f"parameter {parameter.name!r}: the law has a stiffness, no moduli")
-        out = np.zeros_like(stress)
-        by = self.moduli[which].stiffness_by(parameter.kind)
-        green, rate = at.green[here], at.rate
-        strain = (1 + rate) * self.strain(green) - rate * at.previous[here]
-        out[here] = self._map(green, strain @ by.T, 1)
-        return out
+        # All moduli follow E_f: S is linear in the scale of C.
+        return np.where((at.region == which)[:, None, None], stress, 0.0) / parameter.value
 
     def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
         """Change of S ``(e, q, 6)`` for a change of the previous Biot strain: ``-rate L^T C d``."""

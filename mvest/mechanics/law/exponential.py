@@ -37,8 +37,8 @@ In a biaxial test a thin sheet is stretched along and across its fibres. The str
 thickness is zero, which decides the stretch of the thickness. From it follows the exponential
 tissue that is as stiff as a linear one where closed leaflets are.
 
-Whether a leaflet has stiffened when it is closed cannot be told beforehand, and moduli that are
-fitted with the wrong law are off. So the stress of one region is that of both laws,
+It is not known beforehand whether a closed leaflet has stiffened, and moduli fitted with the wrong
+law are off. So the stress of one region is that of both laws,
 
 .. math::
     S = (1 - w) S_{lin} + w S_{exp}, \qquad w = \frac{\alpha}{1 + \alpha},
@@ -328,7 +328,7 @@ def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> E
 def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
     """Factor on the tissue for a modulus of 1 MPa, to which all stresses are in proportion."""
     stretches = np.array([CLOSED_STRETCHES])
-    wanted = biaxial_stress(BiotLaw.of([linear.moduli(1.0).material]), stretches).mean()
+    wanted = biaxial_stress(BiotLaw.of([linear.material(1.0)]), stretches).mean()
     return float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
 
 
@@ -363,9 +363,8 @@ class StiffeningLaw:
         if not (np.isfinite(stiffening) and stiffening >= 0.0):
             raise InputError(f"tissue stiffening = {stiffening}, expected >= 0")
         curve = as_stiff(tissue.coefficients({}), tissue, E_f)
-        return cls(
-            BiotLaw.of_moduli([tissue.moduli(E_f)]), ExponentialLaw.of([curve]), float(stiffening)
-        )
+        linear = BiotLaw.of([tissue.material(E_f)])
+        return cls(linear, ExponentialLaw.of([curve]), float(stiffening))
 
     @property
     def kinds(self) -> tuple[str, ...]:

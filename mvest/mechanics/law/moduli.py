@@ -1,11 +1,4 @@
-r"""The moduli of a leaflet: as they are, and as functions of what is estimated.
-
-The elastic moduli of one region follow from E_f, the ratio E_f / E_perp and, where it does not
-follow E_f, the shear modulus G. With the compliance s (:attr:`TransverselyIsotropic.compliance`)
-and C its inverse,
-
-.. math:: dC/dp = -C \, (ds/dp) \, C .
-"""
+"""The elastic moduli of a leaflet, and the one-parameter family that the paper has."""
 
 from __future__ import annotations
 
@@ -14,7 +7,7 @@ from enum import Enum
 
 import numpy as np
 
-from mvest.errors import InputError, MaterialError
+from mvest.errors import MaterialError
 from mvest.typing import FloatArray
 
 
@@ -109,70 +102,3 @@ class TransverselyIsotropic:
         """``(6, 6)`` stiffness C in MPa, the inverse of the compliance, symmetrised."""
         c = np.linalg.inv(self.compliance)
         return 0.5 * (c + c.T)
-
-
-@dataclass(frozen=True, slots=True)
-class LeafletModuli:
-    """What the moduli of one region are made of.
-
-    Attributes
-    ----------
-    E_f : float
-        MPa.
-    ratio : float
-        E_f over E_perp.
-    nu : float
-        Poisson ratio of the paper.
-    reading : PoissonReading
-    G : float or None
-        MPa; None where it follows E_f, ``G = E_f / (2 (1 + nu))``.
-    """
-
-    E_f: float
-    ratio: float
-    nu: float
-    reading: PoissonReading
-    G: float | None = None
-
-    @property
-    def material(self) -> TransverselyIsotropic:
-        """The moduli themselves; MaterialError if they are inadmissible."""
-        family = TransverselyIsotropic.from_ratio(self.E_f, self.ratio, self.nu, self.reading)
-        if self.G is None:
-            return family
-        return TransverselyIsotropic(family.E_f, family.E_p, self.G, family.nu_fp, family.nu_pp)
-
-    def stiffness_by(self, kind: str) -> FloatArray:
-        """Derivative ``(6, 6)`` of the stiffness by ``E_f``, ``ratio`` or ``G``.
-
-        Raises
-        ------
-        InputError
-            If ``kind`` is none of them, or G follows E_f.
-        """
-        c = self.material.stiffness
-        return -c @ self._compliance_by(kind) @ c
-
-    def _compliance_by(self, kind: str) -> FloatArray:
-        material = self.material
-        if kind == "E_f":
-            out = -material.compliance / self.E_f
-            if self.G is not None:
-                out[4, 4] = out[5, 5] = 0.0
-            return out
-        out = np.zeros((6, 6))
-        if kind == "ratio":
-            # E_perp = E_f / ratio; the transverse Poisson ratio of reading C depends on it too.
-            literal = self.reading is PoissonReading.LITERAL
-            by_nu = 0.0 if literal else self.nu / self.ratio**2
-            cross = material.nu_pp + self.ratio * by_nu
-            out[1, 1] = out[2, 2] = 1 / self.E_f
-            out[1, 2] = out[2, 1] = -cross / self.E_f
-            out[3, 3] = 2 * (1 + cross) / self.E_f
-        elif kind == "G" and self.G is not None:
-            out[4, 4] = out[5, 5] = -1 / self.G**2
-        elif kind == "G":
-            raise InputError("G follows E_f here; expected a value of G beside that of E_f")
-        else:
-            raise InputError(f"parameter {kind!r} of a leaflet's moduli; known: E_f, ratio, G")
-        return out

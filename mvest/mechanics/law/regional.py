@@ -18,7 +18,7 @@ same modulus at the same point.
 
 All stiffness of a point, damping included, is scaled by :math:`\exp(\sum_k a_k \phi_k)`.
 
-A :class:`StiffPatch` is no unknown: it is how a valve is simulated whose tissue differs somewhere.
+A :class:`StiffPatch` is not estimated: it simulates a valve whose tissue is stiffer in one place.
 
 Prestretched leaflets are stretched already in the shape in which they were seen open. The open
 valve of an image is under load, and its leaflets were grown under tension: free of stress they
@@ -81,12 +81,9 @@ class FieldBasis:
         Raises
         ------
         InputError
-            If there is no such leaflet, or it has fewer vertices than modes are asked for.
+            If there is no such leaflet, or it has fewer vertices than modes.
         """
-        if region not in surface.region_names:
-            raise InputError(
-                f"field of {region!r}: no such leaflet; there are {', '.join(surface.region_names)}"
-            )
+        _check_region(region, surface.region_names)
         own = surface.triangles[surface.region == surface.region_names.index(region)]
         vertices, triangles = np.unique(own, return_inverse=True)
         if len(vertices) < settings.modes:
@@ -115,6 +112,11 @@ class FieldBasis:
         return values.reshape(*np.shape(points)[:-1], -1)
 
 
+def _check_region(region: str, names: tuple[str, ...]) -> None:
+    if region not in names:
+        raise InputError(f"field of {region!r}: no such leaflet; there are {', '.join(names)}")
+
+
 def _kernel(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
     return np.asarray(np.exp(-cdist(a, b, "sqeuclidean") / (2 * length**2)))
 
@@ -124,22 +126,14 @@ def at_quadrature(
 ) -> FloatArray:
     """What a function gives at the quadrature points of a leaflet's elements, 0 in the others.
 
-    Parameters
-    ----------
-    mesh : SolidMesh
-    region : str
-    of : callable
-        Points ``(e, q, 3)`` mm of the reference frame -> ``(e, q, ...)``.
+    ``of`` maps points ``(e, q, 3)`` mm of the reference frame to values ``(e, q, ...)``.
 
     Raises
     ------
     InputError
         If the mesh has no such leaflet.
     """
-    if region not in mesh.region_names:
-        raise InputError(
-            f"field of {region!r}: no such leaflet; there are {', '.join(mesh.region_names)}"
-        )
+    _check_region(region, mesh.region_names)
     shape = mesh.reference.shape(mesh.reference.points)
     here = mesh.region == mesh.region_names.index(region)
     values = of(np.einsum("qa,eai->eqi", shape, mesh.nodes[mesh.elements[here]]))
@@ -157,7 +151,7 @@ class ModulusVariation:
     modes : mapping
         Region -> ``(e, q, k)`` modes of its field, see `at_quadrature`.
     given : ndarray or float
-        ``(e, q)`` part of log E_f that is no unknown.
+        ``(e, q)`` part of log E_f that is not estimated.
     """
 
     modes: Mapping[str, FloatArray]
@@ -186,7 +180,7 @@ class LeafletLaw:
     laws : tuple of Law
         One that knows all regions, or one per region that knows this region alone.
     region : ndarray
-        ``(e,)`` of the elements, which laws do not know when they are asked for a strain.
+        ``(e,)`` of the elements; a law is not given it with a strain.
     prestretch : ndarray
         ``(r,)`` of each region.
     scale : ndarray or float

@@ -13,10 +13,10 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve, band_grid
+from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, sampled_valve
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.thickening import smooth_normals_change, smooth_vertex_normals
-from mvest.valve.geometry.triangles import directed_edges
+from mvest.valve.geometry.triangles import edges_between, mean_fibre
 
 INSIDE = 2.0
 """Degrees from the line between two leaflets at which the fibre of either is read."""
@@ -56,9 +56,7 @@ class Band:
         )
         # phi runs so that (along the leaflet) x (along phi) points to the ventricle: triangles,
         # whose normals do, are then run through clockwise in the plane of (phi, s).
-        corner = self._coordinates.strip_triangles()
-        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        self._sign = -1.0 if np.median(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0 else 1.0
+        self._sign = 1.0 if self._coordinates.clockwise else -1.0
         self._lines = self._leaflet_lines(surface)
         self._normals = leaflet_normals(surface)
 
@@ -67,14 +65,7 @@ class Band:
 
         theta runs as phi does, and is unwrapped about each line's beginning.
         """
-        ends = np.sort(directed_edges(surface.triangles), axis=1)
-        edges, number = np.unique(ends, axis=0, return_inverse=True)
-        region = np.tile(surface.region, 3)
-        low = np.full(len(edges), 2)
-        high = np.full(len(edges), -1)
-        np.minimum.at(low, number.ravel(), region)
-        np.maximum.at(high, number.ravel(), region)
-        between = np.unique(edges[low != high])
+        between = np.unique(edges_between(surface.triangles, surface.region))
         self._between = np.isin(np.arange(len(surface.vertices)), between)
         if not between.size:
             raise GeometryError("the two leaflets do not touch: no line between them")
@@ -171,10 +162,7 @@ class Band:
         own = np.where(self._between[surface.triangles[triangle]], 0.0, weights)
         total = own.sum(axis=-1, keepdims=True)
         weights = np.where(total > 1e-9, own / np.maximum(total, 1e-9), weights)
-        lead = np.take_along_axis(corners, weights.argmax(axis=-1)[..., None, None], axis=-2)
-        # A fibre has no sign: its corners are turned to agree before they are averaged.
-        sign = np.where(np.sum(corners * lead, axis=-1) < 0, -1.0, 1.0)
-        fibre = np.einsum("...c,...ci->...i", weights * sign, corners)
+        fibre = mean_fibre(corners, weights)
         return np.asarray(fibre / np.linalg.norm(fibre, axis=-1, keepdims=True))
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
@@ -203,31 +191,14 @@ class Band:
 
     def sampled(self, columns: int, rows: int) -> Valve:
         """The same valve on a grid of ``columns x rows`` vertices, chordae and motion with it."""
-        if columns < 8 or columns % 2 or rows < 3:
-            raise InputError(
-                f"valve of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
-            )
-        phi, s, triangles, region = band_grid(columns, rows)
-        vertex_region = np.where((phi > 0) & (phi < 180), 0, 1)
-        surface = LeafletSurface(
-            self.position(phi, s),
-            triangles,
-            region,
-            self.region_names,
-            self.fibre(phi, s, vertex_region),
-            self.thickness(phi, s),
-        )
-        motion = self.valve.motion
-        along = phi[:columns]
-        annulus = np.stack([self.annulus_positions(along, frame) for frame in motion.annulus])
-        return Valve(
-            surface,
-            np.arange(columns),
-            np.arange(columns) + (rows - 1) * columns,
-            self.valve.papillary_tips,
-            self.valve.chordae,
-            Motion(motion.phase, annulus, motion.papillary_tips),
-        )
+        valve, motion = self.valve, self.valve.motion
+
+        def hung(phi: FloatArray) -> tuple[FloatArray, Chordae, Motion]:
+            annulus = np.stack([self.annulus_positions(phi, frame) for frame in motion.annulus])
+            moved = Motion(motion.phase, annulus, motion.papillary_tips)
+            return valve.papillary_tips, valve.chordae, moved
+
+        return sampled_valve(self, columns, rows, hung)
 
     def _at(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Triangles and weights of points in arrays of any shape."""

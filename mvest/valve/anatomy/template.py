@@ -20,7 +20,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
-from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, band_grid
+from mvest.valve.anatomy.valve import Chordae, Motion, Valve, band_grid, sampled_valve
 
 ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")
@@ -302,24 +302,6 @@ class Template:
         rows : int
             Vertices from annulus to free edge, at least 3.
         """
-        if columns < 8 or columns % 2 or rows < 3:
-            raise InputError(
-                f"template of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
-            )
-        phi, s, triangles, region = band_grid(columns, rows)
-        surface = LeafletSurface(
-            self.position(phi, s),
-            triangles,
-            region,
-            REGIONS,
-            self.fibre(phi, s, vertex_region(phi)),
-            self.thickness(phi, s),
-        )
-        return Valve(
-            surface,
-            np.arange(columns),
-            np.arange(columns) + (rows - 1) * columns,
-            self.papillary_tips,
-            self.chordae(),
-            self.motion(phi[:columns]),
+        return sampled_valve(
+            self, columns, rows, lambda phi: (self.papillary_tips, self.chordae(), self.motion(phi))
         )

@@ -7,8 +7,9 @@ entry.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -333,3 +334,74 @@ class Valve:
                 raise GeometryError(
                     f"chord {i} is disconnected: its insertion is {gap:.1f} mm from the leaflets"
                 )
+
+
+class MaterialSurface(Protocol):
+    """A valve with two leaflets in material coordinates, as template and band are.
+
+    Attributes
+    ----------
+    region_names : tuple of str
+        The leaflet of phi in (0, 180) degrees, and that of (180, 360).
+    """
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """Names of the two leaflets."""
+        ...
+
+    def position(
+        self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Reference positions ``(..., 3)`` mm of material points."""
+        ...
+
+    def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
+        """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""
+        ...
+
+    def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
+        """Thickness ``(k,)`` mm."""
+        ...
+
+
+def sampled_valve(
+    shape: MaterialSurface,
+    columns: int,
+    rows: int,
+    hung: Callable[[FloatArray], tuple[FloatArray, Chordae, Motion]],
+) -> Valve:
+    """A valve on a grid of ``columns x rows`` vertices.
+
+    Parameters
+    ----------
+    shape : MaterialSurface
+    columns, rows : int
+        Vertices around the valve, even and at least 8, and from annulus to free edge, at least 3.
+    hung : callable
+        Angles ``(columns,)`` of the annulus' vertices -> papillary tips ``(t, 3)`` mm, chordae, and
+        the motion of annulus and tips.
+
+    Raises
+    ------
+    InputError
+        If the numbers are too small or odd.
+    """
+    if columns < 8 or columns % 2 or rows < 3:
+        raise InputError(
+            f"valve of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
+        )
+    phi, s, triangles, region = band_grid(columns, rows)
+    # Vertices between the leaflets are the second one's.
+    of_vertex = np.where((phi > 0) & (phi < 180), 0, 1)
+    surface = LeafletSurface(
+        shape.position(phi, s),
+        triangles,
+        region,
+        shape.region_names,
+        shape.fibre(phi, s, of_vertex),
+        shape.thickness(phi, s),
+    )
+    annulus = np.arange(columns)
+    free_edge = annulus + (rows - 1) * columns
+    return Valve(surface, annulus, free_edge, *hung(phi[:columns]))

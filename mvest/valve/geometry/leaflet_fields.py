@@ -1,16 +1,17 @@
 """Two thick leaflets on a grid, as signed distances, and the closed surface that both have.
 
-Where two leaflets meet they are either one piece of tissue, at a commissure, or only in contact,
-and a segmentation shows both alike. In an open valve they meet at the commissures alone, and how
-far down from the annulus they do is a length that a valve keeps. So in a closed one they are cut
-apart wherever they meet farther from the annulus, or farther in than they are thick.
+Where two leaflets meet they are one piece of tissue, at a commissure, or only in contact. A
+segmentation does not distinguish the two. An open valve meets at the commissures alone, and how far
+down from the annulus it does so is a length that does not change. In a closed valve the leaflets
+are therefore cut apart wherever they meet farther from the annulus, or farther in than they are
+thick.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -24,7 +25,7 @@ from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import euler_number, surface_edges
 
 # skimage states no types.
 marching_cubes: Any = measure.marching_cubes
@@ -74,18 +75,15 @@ class LeafletFields:
     blur_mm: float
     voxel_mm: float
 
-    def between(self, points: FloatArray) -> FloatArray:
-        """Signed distance ``(k,)`` mm from where the leaflets meet, positive in the anterior one.
+    def label(self, points: FloatArray) -> IntArray:
+        """The nearer leaflet ``(k,)`` of points, 0 anterior and 1 posterior.
 
         Points ``(k, 3)`` are mm from the first point of the grid.
         """
-        half = 0.5 * (self.distance[0] - self.distance[1])
         at = (points / self.step).T
-        return np.asarray(ndimage.map_coordinates(half, at, order=1, mode="nearest"))
-
-    def label(self, points: FloatArray) -> IntArray:
-        """The nearer leaflet ``(k,)`` of points ``(k, 3)`` mm, 0 anterior and 1 posterior."""
-        return (self.between(points) < 0).astype(np.int64)
+        apart = self.distance[0] - self.distance[1]
+        between = ndimage.map_coordinates(apart, at, order=1, mode="nearest")
+        return np.asarray((between < 0).astype(np.int64))
 
     def true_thickness(self, thickness: FloatArray) -> FloatArray:
         """What tissue of a thickness seen in the smoothed distances has.
@@ -101,8 +99,7 @@ class LeafletFields:
         return np.asarray(2 * mean)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ThickLeaflets:
+class ThickLeaflets(NamedTuple):
     """The closed surface of two leaflets, with a cut between them where they are in contact.
 
     Attributes
@@ -111,34 +108,17 @@ class ThickLeaflets:
         ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``.
     seams : (2,) mm
         How far down from the annulus the leaflets are one piece, on the side of each tip.
-    contact_mm2 : float
-        Area over which the leaflets were cut apart.
     grown_mm : float
         By which all walls lie too far out, since the leaflets had holes otherwise.
-    pieces : int
-        Loose pieces that were left out.
+    derived : tuple of str
+        What was done so that it is one closed surface.
     """
 
     vertices: FloatArray
     triangles: IntArray
     seams: FloatArray
-    contact_mm2: float
     grown_mm: float
-    pieces: int
-
-    @property
-    def derived(self) -> Iterator[str]:
-        """What was done so that it is one closed surface."""
-        if self.pieces:
-            yield f"{self.pieces} loose pieces of the leaflets left out"
-        if self.grown_mm:
-            yield f"walls drawn {self.grown_mm:.2g} mm farther out, so that no hole is left"
-        if self.contact_mm2:
-            lengths = " and ".join(f"{length:.1f}" for length in self.seams)
-            yield (
-                f"leaflets cut apart where they touch, over {self.contact_mm2:.0f} mm^2, and one "
-                f"piece within {lengths} mm of the annulus at the commissures, as in the open frame"
-            )
+    derived: tuple[str, ...]
 
 
 def fields_of_masks(
@@ -285,7 +265,7 @@ def thick_leaflets(
             raise GeometryError("the leaflets meet nowhere, expected at two commissures")
         joined, lengths = _joined(fields, meet, tips, seams)
     cut = 0.5 * CUT_STEPS * fields.step
-    said = ""
+    found = ""
     for level in LEVELS:
         grown = level * fields.voxel_mm
         together = fields.union + grown
@@ -296,18 +276,27 @@ def thick_leaflets(
         vertices, faces, _, _ = marching_cubes(together, 0.0, spacing=(fields.step,) * 3)
         triangles = faces.astype(np.int64)[:, ::-1]
         vertices, triangles, pieces = _largest(vertices.astype(np.float64), triangles)
-        euler = len(vertices) - len(surface_edges(triangles)) + len(triangles)
+        euler = euler_number(triangles)
         if euler == 0:
             break
-        said = said or f"Euler number {euler}"
+        found = found or f"Euler number {euler}"
     else:
         raise GeometryError(
-            f"leaflets with {said}, expected 0, one orifice: fill the holes of the leaflets, join "
+            f"leaflets with {found}, expected 0, one orifice: fill the holes of the leaflets, join "
             "them at the commissures, and part them elsewhere where they are open"
         )
     touching = meet & ~joined & (np.abs(half) <= 0.5 * fields.step)
     area = float(touching.sum()) * fields.step**2
-    return ThickLeaflets(vertices, triangles, lengths, area, grown, pieces)
+    derived = [f"{pieces} loose pieces of the leaflets left out"] if pieces else []
+    if grown:
+        derived.append(f"walls drawn {grown:.2g} mm farther out, so that no hole is left")
+    if area:
+        derived.append(
+            f"leaflets cut apart where they touch, over {area:.0f} mm^2, and one piece within "
+            f"{lengths[0]:.1f} and {lengths[1]:.1f} mm of the annulus at the commissures, as in "
+            "the open frame"
+        )
+    return ThickLeaflets(vertices, triangles, lengths, grown, tuple(derived))
 
 
 def _meet(fields: LeafletFields) -> tuple[BoolArray, FloatArray]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.distance import cdist
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
@@ -38,8 +39,6 @@ RIM_SHARE = 0.8
 """Of the thickness: within this distance of an edge the nearest wall is the rim."""
 FINE = 200
 """Samples of a line from annulus to free edge before its vertices are spread."""
-MIN_LEAFLET = 0.25
-"""Of a turn, from one commissure to the other."""
 TIP_CONE = 60.0
 """Degrees round the direction of a papillary tip within which its commissure lies."""
 
@@ -111,7 +110,7 @@ def midsurface(
     vertices: FloatArray,
     triangles: IntArray,
     *,
-    tips: FloatArray | None = None,
+    tips: FloatArray,
     commissures: FloatArray | None = None,
     anterior: FloatArray | None = None,
     label: Callable[[FloatArray], IntArray] | None = None,
@@ -124,8 +123,8 @@ def midsurface(
     vertices, triangles
         ``(n, 3)`` mm and ``(m, 3)``.
     tips
-        ``(t, 3)`` mm, papillary tips: they tell the free edge, and at which of the places where
-        the leaflets are short the commissures are. Without them the free edge is the shorter loop.
+        ``(2, 3)`` mm, papillary tips: the free edge is the loop nearer to them, and a commissure
+        lies where the leaflets are shortest on the side of each.
     commissures
         ``(2, 3)`` mm, if known.
     anterior
@@ -143,7 +142,9 @@ def midsurface(
     """
     first, second = walls(*closed_band(vertices, triangles))
     derived: list[str] = []
-    annulus = _annulus(first, tips, derived)
+    # The annulus is the loop farther from the tips.
+    away = [cdist(first.vertices[loop], tips).min(axis=1).mean() for loop in first.loops]
+    annulus = int(np.argmax(away))
     pair = _PairedWalls(first, second, annulus)
     perimeter = np.mean([_length(first.vertices[loop]) for loop in first.loops])
     columns = max(24, 2 * round(perimeter / edge_mm / 2))
@@ -162,8 +163,8 @@ def midsurface(
     grid = band_grid(columns, rows)
     points = sheet.reshape(-1, 3)
     triangles = grid.triangles
-    down = sheet[-1].mean(axis=0) if tips is None else np.asarray(tips).mean(axis=0)
-    if area_vectors(points, triangles).sum(axis=0) @ (down - sheet[0].mean(axis=0)) < 0:
+    down = tips.mean(axis=0) - sheet[0].mean(axis=0)
+    if area_vectors(points, triangles).sum(axis=0) @ down < 0:
         triangles = triangles[:, ::-1]
     return Midsurface(
         points,
@@ -178,19 +179,6 @@ def midsurface(
 
 def _length(loop: FloatArray) -> float:
     return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
-
-
-def _annulus(wall: Wall, tips: FloatArray | None, derived: list[str]) -> int:
-    """Which loop of a wall is the annulus."""
-    loops = [wall.vertices[loop] for loop in wall.loops]
-    if tips is None:
-        derived.append("annulus: the longer of the two edges of the leaflets")
-        return int(np.argmax([_length(loop) for loop in loops]))
-    distance = [
-        np.linalg.norm(loop[:, None] - np.asarray(tips), axis=2).min(axis=1).mean()
-        for loop in loops
-    ]
-    return int(np.argmax(distance))
 
 
 class _PairedWalls:
@@ -286,7 +274,7 @@ def _short_seams(
     lines: FloatArray,
     angle: FloatArray,
     heights: FloatArray,
-    tips: FloatArray | None,
+    tips: FloatArray,
     commissures: FloatArray | None,
     anterior: FloatArray | None,
     derived: list[str],
@@ -298,7 +286,8 @@ def _short_seams(
         away = np.linalg.norm(annulus[:, None] - np.asarray(commissures), axis=2)
         chosen = away.argmin(axis=0)
     else:
-        chosen = _shortest(annulus, angle, smooth, tips, derived)
+        derived.append("commissures: where the leaflets are shortest on the side of each tip")
+        chosen = _shortest(annulus, smooth, tips)
     a, b = sorted(chosen.tolist())
     within = (np.arange(len(angle)) > a) & (np.arange(len(angle)) < b)
     if not 2 < within.sum() < len(angle) - 2:
@@ -316,31 +305,17 @@ def _short_seams(
     return np.stack([seam, seam])
 
 
-def _shortest(
-    annulus: FloatArray,
-    angle: FloatArray,
-    heights: FloatArray,
-    tips: FloatArray | None,
-    derived: list[str],
-) -> IntArray:
+def _shortest(annulus: FloatArray, heights: FloatArray, tips: FloatArray) -> IntArray:
     """Two columns where the leaflets are shortest, each on the side of a tip."""
-    n = len(angle)
-    apart = np.abs(wrapped(angle[:, None] - angle))
-    if tips is not None and len(tips) == 2:
-        derived.append("commissures: where the leaflets are shortest on the side of each tip")
-        centre = annulus.mean(axis=0)
-        normal = np.cross(annulus - centre, np.roll(annulus, -1, axis=0) - centre).sum(axis=0)
-        normal /= np.linalg.norm(normal)
-        rays = [v - (v @ normal) * normal for v in (np.asarray(tips) - np.mean(tips, axis=0))]
-        cosine = [(annulus - centre) @ ray / np.linalg.norm(ray) for ray in rays]
-        flat = annulus - centre - ((annulus - centre) @ normal)[:, None] * normal
-        size = np.linalg.norm(flat, axis=1)
-        sides = [c / size > np.cos(np.radians(TIP_CONE)) for c in cosine]
-        return np.array([np.where(side, heights, np.inf).argmin() for side in sides])
-    derived.append("commissures: the two places where the leaflets are shortest")
-    total = heights[:, None] + heights
-    total[apart < 2 * np.pi * MIN_LEAFLET] = np.inf
-    return np.array(np.unravel_index(total.argmin(), (n, n)))
+    centre = annulus.mean(axis=0)
+    normal = np.cross(annulus - centre, np.roll(annulus, -1, axis=0) - centre).sum(axis=0)
+    normal /= np.linalg.norm(normal)
+    rays = [v - (v @ normal) * normal for v in (tips - np.mean(tips, axis=0))]
+    cosine = [(annulus - centre) @ ray / np.linalg.norm(ray) for ray in rays]
+    flat = annulus - centre - ((annulus - centre) @ normal)[:, None] * normal
+    size = np.linalg.norm(flat, axis=1)
+    sides = [c / size > np.cos(np.radians(TIP_CONE)) for c in cosine]
+    return np.array([np.where(side, heights, np.inf).argmin() for side in sides])
 
 
 def _sheet(pair: _PairedWalls, seams: FloatArray, columns: int, rows: int) -> FloatArray:

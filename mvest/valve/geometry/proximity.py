@@ -21,8 +21,6 @@ from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 SAMPLED_EDGES = 100
 """Whose boxes are compared with all others, to know how many overlap."""
-MAX_LOOKED_AT = 100_000
-"""Pairs of edges and triangles, when only some intersections are looked for."""
 Vector = tuple[float, float, float]
 """A point or a vector in compiled code, where an array of three takes longer than its sums."""
 
@@ -82,19 +80,6 @@ def closest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> Vector:
 
 
 @njit(cache=True)
-def distance_to_triangle(
-    p: Vector, a: Vector, b: Vector, c: Vector
-) -> tuple[float, float, float, float]:
-    """Distance (mm) of `p` to triangle ``abc``, and the barycentric coordinates of the foot."""
-    u, v, w = closest_on_triangle(p, a, b, c)
-    squared = 0.0
-    for i in range(3):
-        difference = p[i] - (u * a[i] + v * b[i] + w * c[i])
-        squared += difference * difference
-    return np.sqrt(squared), u, v, w
-
-
-@njit(cache=True)
 def _closest_of_candidates(
     points: FloatArray,
     vertices: FloatArray,
@@ -109,9 +94,12 @@ def _closest_of_candidates(
         p = row(points, i)
         for k in range(offsets[i], offsets[i + 1]):
             t = triangles[candidates[k]]
-            d, u, v, w = distance_to_triangle(
-                p, row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
-            )
+            a, b, c = row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
+            u, v, w = closest_on_triangle(p, a, b, c)
+            squared = 0.0
+            for axis in range(3):
+                squared += (p[axis] - (u * a[axis] + v * b[axis] + w * c[axis])) ** 2
+            d = np.sqrt(squared)
             if d < distance[i]:
                 distance[i] = d
                 triangle[i] = candidates[k]
@@ -236,7 +224,7 @@ def overlapping_boxes(vertices: FloatArray, triangles: IntArray) -> float:
 
 
 def intersecting_triangles(
-    vertices: FloatArray, triangles: IntArray, enough: int | None = None
+    vertices: FloatArray, triangles: IntArray, most: int | None = None
 ) -> IntArray:
     """Pairs of intersecting triangles ``(k, 2)``, lower number first, each pair once.
 
@@ -247,9 +235,8 @@ def intersecting_triangles(
     ----------
     vertices, triangles
         ``(n, 3)`` mm and ``(m, 3)``.
-    enough
-        Edges and triangles that intersect after which no more are looked for, nor after
-        `MAX_LOOKED_AT` pairs of which boxes overlap, when there may be none; without it all are.
+    most
+        Edges and triangles with overlapping boxes that are looked at; without it all are.
     """
     if not has_intersections(vertices, triangles):
         return np.zeros((0, 2), dtype=np.int64)
@@ -263,15 +250,11 @@ def intersecting_triangles(
     )
     sides = np.sort(directed_edges(triangles), axis=1) @ [len(vertices), 1]
     pairs: set[tuple[int, int]] = set()
-    found = 0
-    for looked_at, candidate in enumerate(phase.detect_edge_face_candidates()):
-        if enough is not None and (found >= enough or looked_at > MAX_LOOKED_AT):
-            break
+    for candidate in phase.detect_edge_face_candidates()[:most]:
         edge, face = edges[candidate.edge_id], int(candidate.face_id)
         if not np.isin(edge, triangles[face]).any() and ipctk.is_edge_intersecting_triangle(
             *vertices[edge], *vertices[triangles[face]]
         ):
-            found += 1
             for owner in np.flatnonzero(sides == edge @ [len(vertices), 1]) % len(triangles):
                 pairs.add((min(int(owner), face), max(int(owner), face)))
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)

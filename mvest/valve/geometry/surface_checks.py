@@ -17,9 +17,10 @@ from mvest.valve.geometry.proximity import (
     intersecting_triangles,
     overlapping_boxes,
 )
+from mvest.valve.geometry.triangles import edge_table
 
-ENOUGH_PAIRS = 1000
-"""Of intersecting triangles that are counted for a message."""
+MAX_LOOKED_AT = 100_000
+"""Pairs of edges and triangles among which those that intersect are sought for a message."""
 MAX_OVERLAPS = 1e7
 """Of bounding boxes of edges and triangles (0.3 GB); 50 000 triangles in good order have 1e6."""
 
@@ -79,11 +80,10 @@ def check_surface(
                 f"about {overlaps:.2g} times; are its vertices in another order?"
             )
         if has_intersections(points, faces):
-            pairs = intersecting_triangles(points, faces, ENOUGH_PAIRS)
-            which = f"{len(pairs)} pairs of triangles, if not more," if len(pairs) else "triangles"
-            among = f", among them {pairs[:5].tolist()}" if len(pairs) else " somewhere"
+            pairs = intersecting_triangles(points, faces, most=MAX_LOOKED_AT)
             raise GeometryError(
-                f"{name}: self-intersection: {which} pass through each other{among}"
+                f"{name}: self-intersection: triangles pass through each other, among them "
+                f"{pairs[:5].tolist()}"
             )
 
 
@@ -128,18 +128,6 @@ def _check_triangles(points: FloatArray, faces: IntArray, name: str) -> None:
             f"{name}: duplicate triangle: triangles {listed(first[count > 1])} occur again with "
             f"the same three vertices; keep one of each"
         )
-
-
-def edge_table(faces: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Half-edges ``(3 m, 2)``, edges ``(e, 2)``, the edge of each half-edge, and their number.
-
-    Half-edge ``3 t + i`` runs from corner i of triangle t to the next.
-    """
-    half = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    edges, inverse, count = np.unique(
-        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return half, edges, inverse.ravel(), count
 
 
 def _check_edges(faces: IntArray, closed: bool, name: str) -> None:

@@ -32,7 +32,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.triangles import directed_edges, unit_rows
+from mvest.valve.geometry.triangles import edge_table, unit_rows
 
 MIN_WEIGHT = 0.05
 """To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
@@ -69,10 +69,13 @@ class SurfaceCoordinates:
 
     def strip_triangles(self) -> FloatArray:
         """Corners ``(m, 3, 2)`` of all triangles in the strip, unwrapped about the first corner."""
-        theta = self.theta[self.triangles]
-        first = theta[:, :1]
-        theta = first + wrapped(theta - first)
+        theta = unwrapped(self.theta[self.triangles])
         return np.stack([theta, self.modulus * self.s[self.triangles]], axis=-1)
+
+    @property
+    def clockwise(self) -> bool:
+        """Whether most triangles run clockwise in the strip."""
+        return bool(np.median(_signed_area(self.strip_triangles())) < 0)
 
     def folded(self) -> IntArray:
         """Triangles ``(k,)`` that lie in the strip the other way round than most."""
@@ -110,15 +113,11 @@ def boundary_loops(triangles: IntArray) -> list[IntArray]:
         vertex has more than two boundary edges.
     """
     triangles = np.asarray(triangles)
-    directed = directed_edges(triangles)
-    undirected = np.sort(directed, axis=1)
-    _, inverse, count = np.unique(undirected, axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.ravel()
+    directed, edges, number, count = edge_table(triangles)
     if count.max() > 2:
-        bad = undirected[np.argmax(count[inverse])]
         raise GeometryError(
-            f"surface is not a manifold: edge {bad.tolist()} belongs to {count.max()} triangles "
-            "(at most 2 expected)"
+            f"surface is not a manifold: edge {edges[np.argmax(count)].tolist()} belongs to "
+            f"{count.max()} triangles (at most 2 expected)"
         )
     unique_directed = np.unique(directed, axis=0)
     if len(unique_directed) < len(directed):
@@ -126,7 +125,7 @@ def boundary_loops(triangles: IntArray) -> list[IntArray]:
             f"{len(directed) - len(unique_directed)} edges are run through in the same direction "
             "by both their triangles: orient all triangles alike"
         )
-    boundary = directed[count[inverse] == 1]
+    boundary = directed[count[number] == 1]
     following = dict(boundary.tolist())
     if len(following) < len(boundary):
         raise GeometryError("a boundary vertex has more than two boundary edges (two loops touch)")
@@ -389,3 +388,9 @@ def _signed_area(corner: FloatArray) -> FloatArray:
 def wrapped(angle: FloatArray) -> FloatArray:
     """Angles (rad) in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def unwrapped(theta: FloatArray) -> FloatArray:
+    """Angles (rad) of the corners ``(m, 3)`` of triangles, without a jump from the first one."""
+    first = theta[:, :1]
+    return np.asarray(first + wrapped(theta - first))

@@ -10,8 +10,13 @@ import scipy.sparse as sp
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
-from mvest.valve.geometry.surface_checks import check_surface, edge_table, listed
-from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, surface_edges
+from mvest.valve.geometry.surface_checks import check_surface, listed
+from mvest.valve.geometry.triangles import (
+    area_vectors,
+    area_vectors_change,
+    edge_table,
+    surface_edges,
+)
 
 FACE_KINDS = ("ventricular", "atrial", "rim")
 """What a triangle of a thickened leaflet bounds."""

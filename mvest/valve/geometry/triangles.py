@@ -51,6 +51,33 @@ def surface_edges(triangles: IntArray) -> IntArray:
     return np.unique(np.sort(directed_edges(triangles), axis=1), axis=0)
 
 
+def edge_table(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Half-edges ``(3 m, 2)``, edges ``(e, 2)``, the edge of each half-edge, and their number.
+
+    Half-edge ``3 t + i`` runs from corner i of triangle t to the next. Edges are sorted by their
+    lower and then by their higher vertex.
+    """
+    half = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+    edges, inverse, count = np.unique(
+        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return half, edges, inverse.ravel(), count
+
+
+def euler_number(triangles: IntArray) -> int:
+    """Vertices minus edges plus triangles: 2 of a sphere, 0 of a band or a torus."""
+    return len(np.unique(triangles)) - len(surface_edges(triangles)) + len(triangles)
+
+
+def edges_between(triangles: IntArray, region: IntArray) -> IntArray:
+    """Edges ``(k, 2)`` on which triangles of different regions ``(m,)`` meet."""
+    _, edges, number, _ = edge_table(triangles)
+    low, high = np.full(len(edges), np.max(region)), np.full(len(edges), -1)
+    np.minimum.at(low, number, np.repeat(region, 3))
+    np.maximum.at(high, number, np.repeat(region, 3))
+    return edges[low != high]
+
+
 def unit_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Unit normals ``(m, 3)`` of triangles."""
     return unit_rows(area_vectors(vertices, triangles))
@@ -59,6 +86,22 @@ def unit_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 def unit_rows(vectors: FloatArray) -> FloatArray:
     """Vectors ``(n, 3)`` at length one; those of no length stay."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+def unit_vectors(vectors: FloatArray) -> FloatArray:
+    """Vectors ``(..., 3)`` of length one; zero where they were zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
+
+
+def mean_fibre(fibre: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted sum ``(..., 3)`` of the fibres ``(..., 3, 3)`` of a triangle's corners.
+
+    A fibre has no sign: they are turned to agree with that of the largest weight ``(..., 3)``.
+    """
+    lead = np.take_along_axis(fibre, weights.argmax(axis=-1)[..., None, None], axis=-2)
+    sign = np.where(np.sum(fibre * lead, axis=-1) < 0, -1.0, 1.0)
+    return np.asarray(np.einsum("...c,...ci->...i", weights * sign, fibre))
 
 
 def principal_stretches(
@@ -147,16 +190,14 @@ def refined(
 def _halved(vertices: FloatArray, coarse: Refinement) -> Refinement:
     x, triangles = coarse.weights @ vertices, coarse.triangles
     n = len(x)
-    edges, number = np.unique(
-        np.sort(directed_edges(triangles), axis=1), axis=0, return_inverse=True
-    )
+    _, edges, number, _ = edge_table(triangles)
     a, b = edges.T
     own = sparse.eye_array(n, format="csr")
     middle = 0.5 * (own[a] + own[b])
     for along, slope in zip((x[b] - x[a]).T, _slopes(x, triangles), strict=True):
         middle = middle + sparse.diags_array(along / 8.0) @ (slope[a] - slope[b])
     # Of each triangle the middles of its edges from corner 0, from 1 and from 2.
-    p, q, r = n + number.reshape(3, -1)
+    p, q, r = n + number.reshape(-1, 3).T
     i, j, k = triangles.T
     parts = np.array([[i, p, r], [p, j, q], [r, q, k], [p, q, r]])
     return Refinement(

@@ -1,6 +1,6 @@
 """The two walls of a thick leaflet band: its closed surface parted along the annulus and the edge.
 
-Nothing says of a segmented surface which of its triangles face the atrium. But two points that lie
+A segmented surface does not state which of its triangles face the atrium. But two points that lie
 across the tissue from each other belong to different walls, and two neighbours on a smooth part of
 the surface to the same one. The walls are the sign of the vector that agrees best with both, the
 lowest eigenvector of a signed graph Laplacian (Kunegis et al. 2010, SIAM Int. Conf. Data Mining,
@@ -23,7 +23,7 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import lumped_areas, vertex_normals
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import euler_number, surface_edges
 
 MAX_THICKNESS = 8.0
 """mm, diameter of the first ball; a thickened leaflet of a diseased valve has 5 mm."""
@@ -87,7 +87,7 @@ def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
             f"thick leaflets: {pieces} pieces ({', '.join(map(str, sizes[:5]))} vertices), "
             "expected one closed surface round the orifice; give parted leaflets one by one"
         )
-    euler = len(vertices) - len(edges) + len(triangles)
+    euler = euler_number(triangles)
     if euler != 0:
         what = (
             "no orifice, as if leaflets that touch were one; give a label or a surface for each"
@@ -113,7 +113,7 @@ def walls(vertices: FloatArray, triangles: IntArray) -> tuple[Wall, Wall]:
         own = faces[chosen]
         loops = boundary_loops(own)
         used, inverse = np.unique(own, return_inverse=True)
-        euler = len(used) - len(surface_edges(own)) + len(own)
+        euler = euler_number(own)
         if len(loops) != 2 or euler != 0:
             raise GeometryError(
                 f"thick leaflets: one wall has {len(loops)} edges and Euler number {euler}, "

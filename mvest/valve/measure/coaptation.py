@@ -156,14 +156,24 @@ def orifice_area(
     return float((image.inside & np.isinf(image.depth)).sum() * resolution**2)
 
 
-def _contact_fraction(
+def _in_contact(
     points: FloatArray,
     normals: FloatArray,
     vertices: FloatArray,
     opposing: IntArray,
     contact_distance: float,
 ) -> BoolArray:
-    """Say which points lie within the contact distance of an opposing, facing leaflet."""
+    """Which points lie within the contact distance of an opposing, facing leaflet.
+
+    Raises
+    ------
+    GeometryError
+        If the contact distance is not positive.
+    """
+    if not (np.isfinite(contact_distance) and contact_distance > 0):
+        raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
+    if len(points) == 0 or len(opposing) == 0:
+        return np.zeros(len(points), dtype=np.bool_)
     corners = vertices[opposing]
     centroids = corners.mean(axis=1)
     # Nothing of a triangle is farther from its centroid than its corners are.
@@ -205,21 +215,16 @@ def coaptation_length(
     sampling
         mm between the points tested along a section; the answer is that fine.
     """
-    if not (np.isfinite(contact_distance) and contact_distance > 0):
-        raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
     lengths = []
     for own, other in ((first, second), (second, first)):
         segments, triangle = plane_section(vertices, own, plane.origin, plane.lateral)
-        if len(segments) == 0 or len(other) == 0:
-            lengths.append(0.0)
-            continue
         size = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
         pieces = np.maximum(np.ceil(size / sampling), 1).astype(np.int64)
         owner = np.repeat(np.arange(len(segments)), pieces)
         position = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         fraction = ((position + 0.5) / pieces[owner])[:, None]
         points = segments[owner, 0] * (1 - fraction) + segments[owner, 1] * fraction
-        near = _contact_fraction(
+        near = _in_contact(
             points,
             unit_normals(vertices, own)[triangle[owner]],
             vertices,
@@ -242,18 +247,13 @@ def coaptation_area(
     Mean of the two leaflets' own areas within `contact_distance` of the other and facing it, each
     triangle counted by ``subdivisions²`` equal parts. Parameters as in `coaptation_length`.
     """
-    if not (np.isfinite(contact_distance) and contact_distance > 0):
-        raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
     weights = _part_centroids(subdivisions)
     touching = []
     for own, other in ((first, second), (second, first)):
-        if len(own) == 0 or len(other) == 0:
-            touching.append(0.0)
-            continue
         corners = vertices[own]
         points = np.einsum("qk,mkd->mqd", weights, corners).reshape(-1, 3)
         normals = np.repeat(unit_normals(vertices, own), len(weights), axis=0)
-        near = _contact_fraction(points, normals, vertices, other, contact_distance)
+        near = _in_contact(points, normals, vertices, other, contact_distance)
         part = np.repeat(areas(vertices, own) / len(weights), len(weights))
         touching.append(float(part[near].sum()))
     return 0.5 * (touching[0] + touching[1])

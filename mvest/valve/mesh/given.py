@@ -18,10 +18,11 @@ from mvest.valve.anatomy.band import Band, leaflet_normals
 from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
-from mvest.valve.geometry.triangles import area_vectors, areas
+from mvest.valve.geometry.triangles import area_vectors, areas, mean_fibre
+from mvest.valve.mesh.cells import boundary, local_faces, with_middles
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetwild import outer_faces, promote_to_tet10, tetrahedralize, tri6_faces
+from mvest.valve.mesh.tetwild import tetrahedralize
 
 
 class GivenValve:
@@ -80,18 +81,6 @@ class GivenValve:
                 "number of cells, or take mesh source tetwild"
             ) from fault
 
-    def tetrahedra(self, edge_length: float, element: str, store: Path | None) -> SolidMesh:
-        """An unstructured mesh of the surface as it was given, made once and kept in ``store``.
-
-        Parameters
-        ----------
-        edge_length
-            mm.
-        element
-            ``tet10`` or ``tet4``.
-        """
-        return tetrahedral_leaflets(self.given.surface, edge_length, element, store)
-
 
 PRESSURE_AREA_TOLERANCE = 0.1
 """Largest relative difference between the pressure faces' area and the ventricular side's."""
@@ -133,15 +122,15 @@ def tetrahedral_leaflets(
         raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")
     closed = thicken(surface, normals)
     nodes, elements = tetrahedralize(closed.vertices, closed.triangles, edge_length, store)
-    faces, owner = outer_faces(elements)
+    owner, which = boundary(elements, "tet4")
+    faces = elements[owner[:, None], local_faces("tet4")[which]]
     pressure = _ventricular(nodes, faces, closed)
-    faces, owner = faces[pressure], owner[pressure]
-    _check_pressure_area(nodes, faces, closed)
+    _check_pressure_area(nodes, faces[pressure], closed)
     centroids = nodes[elements].mean(axis=1)
     nearest = closest_points(centroids, surface.vertices, surface.triangles)
     if element_type == "tet10":
-        nodes, elements = promote_to_tet10(nodes, elements)
-        faces = tri6_faces(faces, elements, owner)
+        nodes, elements = with_middles(nodes, elements)
+        faces = elements[owner[:, None], local_faces("tet10")[which]]
     return SolidMesh(
         nodes=nodes,
         elements=elements,
@@ -149,7 +138,7 @@ def tetrahedral_leaflets(
         region=surface.region[nearest.triangle],
         region_names=surface.region_names,
         fibre=_alike_within_elements(_fibres(nodes, surface)[elements]),
-        pressure_faces=faces,
+        pressure_faces=faces[pressure],
     )
 
 
@@ -165,7 +154,7 @@ def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> I
             continue
         nearest = closest_points(centroids, closed.vertices, closed.triangles[numbers])
         facing = (normals * closed_normals[numbers[nearest.triangle]]).sum(axis=1) > 0
-        # A face that looks away is kept as a candidate of last resort, behind every facing one.
+        # A face that looks away is a candidate of last resort, behind every facing one.
         distance[:, kind] = nearest.distance + np.where(facing, 0.0, 1e6)
     return np.flatnonzero(distance.argmin(axis=1) == FACE_KINDS.index("ventricular"))
 
@@ -185,12 +174,7 @@ def _fibres(nodes: FloatArray, surface: LeafletSurface) -> FloatArray:
     """Fibre of the nearest midsurface point, in the tangent plane there, ``(n, 3)`` unit."""
     nearest = closest_points(nodes, surface.vertices, surface.triangles)
     corners = surface.triangles[nearest.triangle]
-    heaviest = corners[np.arange(len(nodes)), nearest.barycentric.argmax(axis=1)]
-    lead = surface.fibre[heaviest]
-    # A fibre has no sign: turn the corners' fibres to agree before averaging them.
-    vectors = surface.fibre[corners]
-    sign = np.where(np.einsum("ncj,nj->nc", vectors, lead) < 0, -1.0, 1.0)
-    mixed = np.einsum("nc,ncj->nj", nearest.barycentric * sign, vectors)
+    mixed = mean_fibre(surface.fibre[corners], nearest.barycentric)
     normal = area_vectors(surface.vertices, surface.triangles)[nearest.triangle]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     tangent = mixed - (mixed * normal).sum(axis=1, keepdims=True) * normal

@@ -20,11 +20,12 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import (
-    SurfaceCoordinates,
     boundary_loops,
     surface_coordinates,
+    unwrapped,
+    wrapped,
 )
-from mvest.valve.geometry.triangles import areas, directed_edges
+from mvest.valve.geometry.triangles import areas, edge_table, edges_between
 
 LLOYD_ITERATIONS = 40
 """Cap of the iteration; on the valves tried it stops earlier or moves no vertex visibly."""
@@ -85,44 +86,41 @@ def remesh(
         )
     coordinates = surface_coordinates(surface.vertices, surface.triangles, annulus, free_edge)
     edge_length = _edge_length(surface, annulus, free_edge, vertices)
-    fixed_edges, rings, lines = _sample_feature_lines(surface, annulus, free_edge, edge_length)
-    fixed = np.array([[*edge, t] for edge, t in fixed_edges])
-    fixed_triangle, fixed_weights = _on_edges(surface.triangles, fixed)
-    n_interior = max(vertices - len(fixed), 0)
-    triangle, weights = _spread_interior(
-        surface, _evaluate(surface, fixed_triangle, fixed_weights), n_interior
+    fixed, rings, lines = _sample_feature_lines(surface, annulus, free_edge, edge_length)
+    triangle, weights = _on_edges(surface.triangles, fixed)
+    corner = surface.vertices[surface.triangles]
+    inner = _spread_interior(
+        corner,
+        areas(surface.vertices, surface.triangles),
+        np.einsum("ij,ijk->ik", weights, corner[triangle]),
+        max(vertices - len(fixed), 0),
     )
-    triangle = np.concatenate([fixed_triangle, triangle])
-    weights = np.vstack([fixed_weights, weights])
-    points = _evaluate(surface, triangle, weights)
+    triangle = np.concatenate([triangle, inner[0]])
+    weights = np.vstack([weights, inner[1]])
 
-    strip = _strip_positions(coordinates, triangle, weights)
+    def at(corners: FloatArray) -> FloatArray:
+        return np.einsum("ij,ij...->i...", weights, corners[triangle])
+
+    points, strip = at(corner), at(coordinates.strip_triangles())
     triangles = _triangulate(strip, coordinates.modulus, rings[0], rings[1])
     locked = {(min(pair), max(pair)) for line in lines for pair in itertools.pairwise(line)}
     triangles = _flip_to_delaunay(points, triangles, strip, locked, rings)
-    if _mirrored(coordinates):
+    if coordinates.clockwise:
         triangles = triangles[:, [0, 2, 1]]
     _check_band(triangles, rings)
-    return Remeshed(
-        surface=LeafletSurface(
-            vertices=points,
-            triangles=triangles,
-            region=_labels(surface, coordinates, triangles, strip),
-            region_names=surface.region_names,
-            fibre=np.einsum("ij,ijk->ik", weights, surface.fibre[surface.triangles[triangle]]),
-            thickness=np.einsum(
-                "ij,ij->i", weights, surface.thickness[surface.triangles[triangle]]
-            ),
-        ),
-        annulus=rings[0],
-        free_edge=rings[1],
-        triangle=triangle,
-        weights=weights,
+    # A triangle is of the leaflet of the fine one at its centre.
+    theta = unwrapped(strip[triangles][..., 0]).mean(axis=1)
+    s = strip[triangles][..., 1].mean(axis=1) / coordinates.modulus
+    hosts, _ = coordinates.locate(np.mod(theta, 2 * np.pi), np.clip(s, 0, 1))
+    coarse = LeafletSurface(
+        vertices=points,
+        triangles=triangles,
+        region=surface.region[hosts],
+        region_names=surface.region_names,
+        fibre=at(surface.fibre[surface.triangles]),
+        thickness=at(surface.thickness[surface.triangles]),
     )
-
-
-def _evaluate(surface: LeafletSurface, triangle: IntArray, weights: FloatArray) -> FloatArray:
-    return np.einsum("ij,ijk->ik", weights, surface.vertices[surface.triangles[triangle]])
+    return Remeshed(coarse, rings[0], rings[1], triangle, weights)
 
 
 def _edge_length(
@@ -140,20 +138,21 @@ def _edge_length(
 
 def _sample_feature_lines(
     surface: LeafletSurface, annulus: IntArray, free_edge: IntArray, edge_length: float
-) -> tuple[list[tuple[tuple[int, int], float]], list[IntArray], list[list[int]]]:
+) -> tuple[list[tuple[int, int, float]], list[IntArray], list[list[int]]]:
     """Points at equal arc length on both loops and on the lines between leaflets.
 
-    Each is (fine edge, fraction along it). Also the point numbers of both loops and of each line.
+    Each is (vertex a, vertex b, fraction from a) on an edge of the fine surface. Also the point
+    numbers of both loops and of each line.
     """
     lines = _region_lines(surface)
     corners = {end for line in lines for end in (line[0], line[-1])}
-    samples: list[tuple[tuple[int, int], float]] = []
+    samples: list[tuple[int, int, float]] = []
     number: dict[int, int] = {}
 
     def corner(vertex: int, neighbour: int) -> int:
         if vertex not in number:
             number[vertex] = len(samples)
-            samples.append(((vertex, neighbour), 0.0))
+            samples.append((vertex, neighbour, 0.0))
         return number[vertex]
 
     def walk(path: IntArray, minimum: int) -> list[int]:
@@ -165,7 +164,7 @@ def _sample_feature_lines(
         for target in np.arange(1, pieces) * arc[-1] / pieces:
             i = int(np.searchsorted(arc, target, side="right")) - 1
             result.append(len(samples))
-            samples.append(((int(path[i]), int(path[i + 1])), (target - arc[i]) / step[i]))
+            samples.append((int(path[i]), int(path[i + 1]), (target - arc[i]) / step[i]))
         return [*result, corner(int(path[-1]), int(path[-2]))]
 
     rings = []
@@ -184,15 +183,8 @@ def _sample_feature_lines(
 
 def _region_lines(surface: LeafletSurface) -> list[list[int]]:
     """Chains of edges between two leaflets, each from end to end (closed chains are left out)."""
-    t = surface.triangles
-    edges = np.sort(directed_edges(t), axis=1)
-    owner = np.tile(np.arange(len(t)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    same = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    crossing = same[surface.region[owner[same]] != surface.region[owner[same + 1]]]
     neighbours: dict[int, list[int]] = {}
-    for a, b in edges[crossing].tolist():
+    for a, b in edges_between(surface.triangles, surface.region).tolist():
         neighbours.setdefault(a, []).append(b)
         neighbours.setdefault(b, []).append(a)
     done: set[tuple[int, int]] = set()
@@ -210,33 +202,29 @@ def _region_lines(surface: LeafletSurface) -> list[list[int]]:
     return lines
 
 
-def _on_edges(triangles: IntArray, edge_points: FloatArray) -> tuple[IntArray, FloatArray]:
+def _on_edges(
+    triangles: IntArray, points: list[tuple[int, int, float]]
+) -> tuple[IntArray, FloatArray]:
     """Triangle and weights of points ``(vertex a, vertex b, fraction from a)``."""
-    owner: dict[tuple[int, int], tuple[int, int]] = {}
-    for number, corner in enumerate(triangles.tolist()):
-        for i in range(3):
-            a, b = corner[i], corner[(i + 1) % 3]
-            owner.setdefault((a, b), (number, i))
-    triangle = np.zeros(len(edge_points), dtype=np.int64)
-    weights = np.zeros((len(edge_points), 3))
-    for k, (a, b, t) in enumerate(edge_points):
-        if (int(a), int(b)) not in owner:
+    owner = {edge: k for k, edge in enumerate(map(tuple, edge_table(triangles)[0].tolist()))}
+    triangle = np.zeros(len(points), dtype=np.int64)
+    weights = np.zeros((len(points), 3))
+    for k, (a, b, t) in enumerate(points):
+        if (a, b) not in owner:
             a, b, t = b, a, 1 - t
-        number, i = owner[int(a), int(b)]
-        triangle[k] = number
+        triangle[k], i = divmod(owner[a, b], 3)
         weights[k, i], weights[k, (i + 1) % 3] = 1 - t, t
     return triangle, weights
 
 
 def _spread_interior(
-    surface: LeafletSurface, fixed: FloatArray, count: int
+    corner: FloatArray, area: FloatArray, fixed: FloatArray, count: int
 ) -> tuple[IntArray, FloatArray]:
     """Triangles and weights of interior points: farthest points, then Lloyd's iteration."""
     # Centroids of the four sub-triangles of every triangle, with a quarter of its area each.
     local = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6
-    corner = surface.vertices[surface.triangles]
     samples = np.einsum("ql,mlk->mqk", local, corner).reshape(-1, 3)
-    area = np.repeat(areas(surface.vertices, surface.triangles), 4)
+    area = np.repeat(area, 4)
     nearest = cKDTree(fixed).query(samples)[0]
     chosen = np.zeros(count, dtype=np.int64)
     for k in range(count):
@@ -262,12 +250,6 @@ def _spread_interior(
             break
         chosen = moved
     return chosen // 4, local[chosen % 4]
-
-
-def _strip_positions(
-    coordinates: SurfaceCoordinates, triangle: IntArray, weights: FloatArray
-) -> FloatArray:
-    return np.einsum("ij,ijk->ik", weights, coordinates.strip_triangles()[triangle])
 
 
 def _triangulate(
@@ -314,7 +296,7 @@ def _flip_to_delaunay(
 
     def admissible(a: int, b: int, c: int) -> bool:
         u, v = strip[b] - strip[a], strip[c] - strip[a]
-        x = (np.array([u[0], v[0]]) + np.pi) % (2 * np.pi) - np.pi
+        x = wrapped(np.array([u[0], v[0]]))
         on_one_edge = ring_of[a] > 0 and ring_of[a] == ring_of[b] == ring_of[c]
         return bool(x[0] * v[1] - x[1] * u[1] > 1e-12) and not on_one_edge
 
@@ -341,28 +323,6 @@ def _flip_to_delaunay(
             raise GeometryError("edge flips do not end: the surface given is degenerate")
         queue += [(min(e), max(e)) for e in ((a, d), (d, b), (b, c), (c, a))]
     return np.array(mesh, dtype=np.int64)
-
-
-def _mirrored(coordinates: SurfaceCoordinates) -> bool:
-    """Whether the fine triangles run clockwise in the strip."""
-    corner = coordinates.strip_triangles()
-    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    return bool(np.median(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) < 0)
-
-
-def _labels(
-    surface: LeafletSurface,
-    coordinates: SurfaceCoordinates,
-    triangles: IntArray,
-    strip: FloatArray,
-) -> IntArray:
-    """Leaflet of each triangle: that of the fine triangle at its centre."""
-    corner = strip[triangles]
-    first = corner[:, :1, 0]
-    theta = first + (corner[:, :, 0] - first + np.pi) % (2 * np.pi) - np.pi
-    s = corner[:, :, 1].mean(axis=1) / coordinates.modulus
-    hosts, _ = coordinates.locate(np.mod(theta.mean(axis=1), 2 * np.pi), np.clip(s, 0, 1))
-    return surface.region[hosts]
 
 
 def _check_band(triangles: IntArray, rings: list[IntArray]) -> None:

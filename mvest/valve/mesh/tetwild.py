@@ -25,6 +25,7 @@ from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
+from mvest.valve.mesh.cells import outer_faces
 
 WORKER = Path(__file__).with_name("_tetwild_worker.py")
 
@@ -42,12 +43,6 @@ VOLUME_TOLERANCE = 0.05
 DISTANCE_TOLERANCE = 0.5
 """mm, largest distance from the given surface's vertices to the mesh's surface."""
 
-_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-"""Corners of the face opposite to each corner, normals outwards when the volume is positive."""
-
-_MIDDLES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
-"""Corners whose middle is node 4, 5, ... of a ``tet10`` (order of `mvest.elements`)."""
-
 
 def tetrahedralize(
     vertices: FloatArray, triangles: IntArray, edge_length: float, store: Path | None = None
@@ -61,7 +56,7 @@ def tetrahedralize(
     edge_length
         Target, mm.
     store
-        Folder in which the mesh is kept as ``tetwild-KEY.npz``, KEY being the hash of surface and
+        Folder in which the mesh is cached as ``tetwild-KEY.npz``, KEY being the hash of surface and
         settings. Not given, the mesh is made anew, and never the same twice.
 
     Raises
@@ -143,8 +138,8 @@ def _mesh(vertices: FloatArray, triangles: IntArray, edge_length: float) -> Tetr
 
 def _failure(code: int, stderr: str) -> str:
     lines = [line for line in stderr.splitlines() if line.strip()]
-    said = f": {lines[-1].strip()}" if lines else " without a message"
-    return f"failed: {ending(code)}{said}"
+    message = f": {lines[-1].strip()}" if lines else " without a message"
+    return f"failed: {ending(code)}{message}"
 
 
 def _checked(
@@ -168,7 +163,7 @@ def _checked(
         flat = np.flatnonzero(size <= 0)
         raise MeshingError(f"pytetwild returned flat tetrahedra: {flat[:8].tolist()}")
     try:
-        faces, _ = outer_faces(tetrahedra)
+        faces = outer_faces(tetrahedra, "tet4")
         check_surface(nodes, faces, closed=True, self_intersections=False, name="mesh's surface")
     except GeometryError as fault:
         raise MeshingError(f"pytetwild returned a mesh that is no solid: {fault}") from fault
@@ -197,27 +192,15 @@ def _checked(
 
 def _save(path: Path, mesh: Tetrahedra) -> None:
     nodes, tetrahedra = mesh
-    stored = content_sha256(nodes, tetrahedra)
-    np.savez_compressed(path, nodes=nodes, tetrahedra=tetrahedra, sha256=stored)
+    np.savez_compressed(path, nodes=nodes, tetrahedra=tetrahedra)
 
 
-def _load(path: Path) -> tuple[FloatArray, IntArray]:
+def _load(path: Path) -> Tetrahedra:
     try:
-        nodes, tetrahedra, stored = read_npz(path, ["nodes", "tetrahedra", "sha256"]).values()
+        nodes, tetrahedra = read_npz(path, ["nodes", "tetrahedra"]).values()
     except InputError as fault:
         raise MeshingError(f"{path}: stored mesh is unreadable ({fault}); delete it") from fault
-    if content_sha256(nodes, tetrahedra) != str(stored):
-        raise MeshingError(f"{path}: stored mesh does not match its hash {stored}; delete it")
     return nodes, tetrahedra
-
-
-def content_sha256(nodes: FloatArray, tetrahedra: IntArray) -> str:
-    """SHA-256 of a mesh's content: nodes rounded to 1e-9 mm, and tetrahedra."""
-    digest = hashlib.sha256()
-    # Adding zero turns -0.0 into 0.0, which has other bytes.
-    digest.update(np.ascontiguousarray(np.round(nodes, 9) + 0.0, dtype="<f8").tobytes())
-    digest.update(np.ascontiguousarray(tetrahedra, dtype="<i8").tobytes())
-    return digest.hexdigest()
 
 
 def volumes(nodes: FloatArray, tetrahedra: IntArray) -> FloatArray:
@@ -232,68 +215,4 @@ def orient(nodes: FloatArray, tetrahedra: IntArray) -> IntArray:
     result = np.array(tetrahedra, dtype=np.int64)
     negative = volumes(nodes, result) < 0
     result[negative, 2], result[negative, 3] = result[negative, 3], result[negative, 2].copy()
-    return result
-
-
-def outer_faces(tetrahedra: IntArray) -> tuple[IntArray, IntArray]:
-    """Faces that bound the mesh, normals outwards.
-
-    Returns
-    -------
-    faces
-        ``(f, 3)`` corner nodes.
-    owner
-        ``(f,)`` the tetrahedron of each.
-
-    Raises
-    ------
-    GeometryError
-        A face belongs to more than two tetrahedra.
-    """
-    faces = tetrahedra[:, :4][:, _FACES].reshape(-1, 3)
-    _, inverse, count = np.unique(
-        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    if (count > 2).any():
-        owners = np.unique(np.flatnonzero(np.isin(inverse, np.flatnonzero(count > 2))) // 4)
-        raise GeometryError(
-            f"{int((count > 2).sum())} faces belong to more than two tetrahedra (elements "
-            f"{owners[:8].tolist()}); expected at most two"
-        )
-    outer = np.flatnonzero(count[inverse.ravel()] == 1)
-    return faces[outer], outer // 4
-
-
-def promote_to_tet10(nodes: FloatArray, tetrahedra: IntArray) -> tuple[FloatArray, IntArray]:
-    """Add a node at the middle of every edge.
-
-    Returns
-    -------
-    nodes
-        ``(n + n_edges, 3)`` mm, the corners first.
-    elements
-        ``(m, 10)`` in the order of `mvest.elements`.
-    """
-    pairs = np.sort(tetrahedra[:, _MIDDLES].reshape(-1, 2), axis=1)
-    edges, inverse = np.unique(pairs, axis=0, return_inverse=True)
-    middle = len(nodes) + inverse.reshape(-1, 6)
-    return (
-        np.concatenate([nodes, nodes[edges].mean(axis=1)]),
-        np.concatenate([tetrahedra, middle], axis=1),
-    )
-
-
-def tri6_faces(faces: IntArray, elements: IntArray, owner: IntArray) -> IntArray:
-    """Six-node faces ``(f, 6)`` of ``tet10`` elements: corners, then the middles of 01, 12, 20."""
-    result = np.empty((len(faces), 6), dtype=np.int64)
-    result[:, :3] = faces
-    cells = elements[owner]
-    # Local corner number of each face corner in its element.
-    local = np.argmax(cells[:, None, :4] == faces[:, :, None], axis=2)
-    number = np.full((4, 4), -1)
-    for k, (a, b) in enumerate(_MIDDLES):
-        number[a, b] = number[b, a] = 4 + k
-    for i in range(3):
-        position = number[local[:, i], local[:, (i + 1) % 3]]
-        result[:, 3 + i] = cells[np.arange(len(faces)), position]
     return result

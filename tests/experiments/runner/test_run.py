@@ -103,7 +103,7 @@ ERRORS = [
     ("filter.method.max_iterations=0", "max_iterations = 0"),
     ("observation.noise_mm=-1", "observation.noise_mm = -1, expected 0 to 1000 mm"),
     ("observation.frames=[shut]", "observed frames ['shut']"),
-    ("observation.columns=7", "template of 7 x 7 vertices"),
+    ("observation.columns=7", "valve of 7 x 7 vertices"),
     ("mechanics.element=hex99", "hex99"),
     ("mechanics.support=glue", "annulus support 'glue'"),
     ("mechanics.solver=magic", "unknown linear solver 'magic'"),

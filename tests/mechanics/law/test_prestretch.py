@@ -12,7 +12,7 @@ from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
 
 TISSUE = TissueSettings(2.6)
-LINEAR = BiotLaw.of_moduli([TISSUE.moduli(5.0), TISSUE.moduli(2.0)])
+LINEAR = BiotLaw.of([TISSUE.material(5.0), TISSUE.material(2.0)])
 EXPONENTIAL = ExponentialLaw.of([ExponentialTissue(0.06, 4.3, 900.0)] * 2)
 RNG = np.random.default_rng(3)
 GREEN = RNG.uniform(-0.08, 0.12, (8, 3, 6))
@@ -138,7 +138,7 @@ def test_derivative_by_a_prestretch_agrees_with_differences(base, which):
 
 def test_derivative_by_a_modulus_agrees_with_differences():
     def stress(E):
-        base = BiotLaw.of_moduli([TISSUE.moduli(E), TISSUE.moduli(2.0)])
+        base = BiotLaw.of([TISSUE.material(E), TISSUE.material(2.0)])
         return prestretched(base).response(Points(GREEN, REGION, NONE, 0.0))[0]
 
     by = (stress(5.0 + 1e-6) - stress(5.0 - 1e-6)) / 2e-6

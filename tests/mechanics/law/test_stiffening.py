@@ -39,7 +39,7 @@ def partial(name, stiffening, value):
 
 
 def test_without_stiffening_it_is_the_linear_law():
-    linear = BiotLaw.of_moduli([TISSUE.moduli(E)])
+    linear = BiotLaw.of([TISSUE.material(E)])
     law = StiffeningLaw.of(TISSUE, E, 0.0)
     for one, other in zip(
         law.response(Points(GREEN, REGION, PREVIOUS, RATE)),
@@ -59,7 +59,7 @@ def test_its_limit_is_the_exponential_law():
 @pytest.mark.parametrize("stiffening", [0.0, 0.3, 1.0, 20.0])
 def test_closed_leaflets_are_as_stiff_whatever_the_share(stiffening):
     at = np.array([CLOSED_STRETCHES])
-    linear = biaxial_stress(BiotLaw.of_moduli([TISSUE.moduli(E)]), at).sum()
+    linear = biaxial_stress(BiotLaw.of([TISSUE.material(E)]), at).sum()
     found = biaxial_stress(StiffeningLaw.of(TISSUE, E, stiffening), at).sum()
     # Both parts are stress-free across the thickness only each at its own thickness.
     assert found == pytest.approx(linear, rel=0.05)
@@ -87,7 +87,7 @@ def test_derivatives_agree_with_differences(stiffening):
 
 @pytest.mark.parametrize("stiffening", [0.0, 0.3, 50.0])
 def test_damping_is_that_of_the_linear_law(stiffening):
-    linear = BiotLaw.of_moduli([TISSUE.moduli(E)])
+    linear = BiotLaw.of([TISSUE.material(E)])
     alone = (
         linear.response(Points(GREEN, REGION, PREVIOUS, RATE))[0]
         - linear.response(Points(GREEN, REGION, PREVIOUS, 0.0))[0]

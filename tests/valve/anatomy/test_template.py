@@ -355,7 +355,7 @@ def test_values_are_changed_by_their_dotted_names():
 
 @pytest.mark.parametrize("size", [(6, 5), (15, 5), (16, 2)])
 def test_too_coarse_a_sampling_is_refused(size):
-    with pytest.raises(InputError, match=f"template of {size[0]} x {size[1]} vertices"):
+    with pytest.raises(InputError, match=f"valve of {size[0]} x {size[1]} vertices"):
         TEMPLATE.valve(*size)
 
 

@@ -116,7 +116,7 @@ def test_labels_decide_where_they_are_known(valve: Valve, solid: ClosedSurface) 
 def test_a_point_says_which_leaflet_is_anterior(valve: Valve, solid: ClosedSurface) -> None:
     surface = valve.surface
     back = surface.vertices[valve.annulus[3 * len(valve.annulus) // 4]]
-    turned = midsurface(solid.vertices, solid.triangles, anterior=back)
+    turned = midsurface(solid.vertices, solid.triangles, tips=valve.papillary_tips, anterior=back)
     centres = turned.vertices[turned.triangles].mean(axis=1)
     truth = surface.region[closest_points(centres, surface.vertices, surface.triangles).triangle]
     assert (truth == turned.region).mean() < 0.05

@@ -68,7 +68,7 @@ def flat_triangle(shapes):
 BAD = {
     "non-manifold vertex: .*vertices 6": bow_tie,
     r"non-manifold edge: .*\[0, 4\]": fin,
-    "self-intersection: .* pairs": crossed,
+    "self-intersection: triangles": crossed,
     "inconsistent orientation: .*5": flipped_one,
     "not finite: vertices 3": with_nan,
     "degenerate triangle: triangles 12": flat_triangle,
