@@ -236,7 +236,7 @@ def run(job: Job[Settings]) -> Result:
             model = model_of(task, name, len(y))
             records[seen, name] = _estimate(f"{name}, from {seen}", model, y, task)
             if isinstance(model, ProcessModel):
-                about_runs = {"runs": model.runs, "served again": model.reused}
+                about_runs = {"runs": model.counts.misses, "served again": model.counts.hits}
                 programs[seen, name] = about_runs | {"own derivatives": model.own_jacobian}
     rows = [
         {"data": seen, "model": name}

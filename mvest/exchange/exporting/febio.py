@@ -23,7 +23,6 @@ from mvest.problem.registration import REGISTRATION
 from mvest.reading.documents import read_mapping
 from mvest.typing import FloatArray
 from mvest.valve.mesh.given import GivenValve
-from mvest.valve.mesh.solid_mesh import SolidMesh
 
 GENERIC = {
     "E_f": {"anterior": 6.23, "posterior": 2.09},
@@ -34,7 +33,7 @@ CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
 """Points at which the valve is sampled for patches of chordae and the annulus."""
 MAX_RECORD = 1 << 28
 """Bytes of a run's record that are read."""
-CONTACTS = ("potential", "sliding", "none")
+CONTACTS = ("potential", "none")
 SAMPLES, TOE_POINTS = 61, 41
 """Points of pressure and motion over the ramp, and of a chord's force over its toe."""
 STEPS = 30
@@ -68,13 +67,12 @@ class FebioOptions:
         Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
         keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
     contact : str
-        ``potential``: FEBio's contact potential between the atrial faces; ``sliding``: its
-        ``sliding-elastic`` between the leaflets; ``none``.
+        ``potential`` (FEBio's contact potential between the atrial faces) or ``none``.
     contact_gap_mm : float
         Between the atrial faces of two flat leaflets that press on each other with the reference
-        pressure of the contact (potential), or that touch (sliding).
+        pressure of the contact.
     contact_reach_mm : float
-        Gap at which contact begins (potential), or within which it is looked for (sliding).
+        Gap at which contact begins.
     dynamic : bool
         With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
         of its ramp.
@@ -105,13 +103,11 @@ class FebioOptions:
         for name, known in choices.items():
             if (given := getattr(self, name)) not in known:
                 raise InputError(f"{name} {given!r}, expected one of {', '.join(known)}")
-        if not 0 <= self.contact_gap_mm < self.contact_reach_mm:
+        if not 0 < self.contact_gap_mm < self.contact_reach_mm:
             raise InputError(
                 f"contact_gap_mm = {self.contact_gap_mm}, contact_reach_mm = "
-                f"{self.contact_reach_mm}; expected 0 <= gap < reach"
+                f"{self.contact_reach_mm}; expected 0 < gap < reach"
             )
-        if self.contact == "potential" and self.contact_gap_mm == 0:
-            raise InputError("contact_gap_mm = 0; expected a gap, which a potential keeps")
         require_numbers(self, "FEBio", "density_factor")
 
 
@@ -206,26 +202,25 @@ def model_of_case(
         )
     # What has another part is an error of a frame's pressure.
     kinds = ("E_f", "G", "ratio", "chord_stiffness", "chord_rest_length")
-    fixed = {name: values[name] for name in values if name.partition(".")[0] in kinds
-             or "." not in name}  # fmt: skip
-    estimated = {
-        "E_f": {name.removeprefix("E_f."): fixed[name] for name in fixed},
-        "ratio": {name: own.ratio for name, own in tissue.items()},
-    }
-    chosen: dict[str, dict[str, float]] = {}
+    fixed = {k: v for k, v in values.items() if k.partition(".")[0] in kinds or "." not in k}
+    estimated = {f"ratio.{name}": own.ratio for name, own in tissue.items()} | fixed
+    chosen: dict[str, list[float]] = {}
     for what, given in (("E_f", options.E_f), ("ratio", options.ratio)):
         if given is not None and len(given) != len(names):
             raise InputError(
                 f"{what}: {len(given)} values, expected one of each of {', '.join(names)}"
             )
-        stated = {} if given is None else dict(zip(names, given, strict=True))
-        chosen[what] = GENERIC[what] | estimated[what] | stated
-        if missing := [name for name in names if name not in chosen[what]]:
-            raise InputError(f"no {what} of leaflet {missing[0]!r}; give {what}=[...]")
-    fixed |= {f"E_f.{name}": chosen["E_f"][name] for name in names}
+        known = [estimated.get(f"{what}.{name}", GENERIC[what].get(name)) for name in names]
+        if None in (given or known):
+            raise InputError(
+                f"no {what} of leaflet {names[known.index(None)]!r}; give {what}=[...]"
+            )
+        chosen[what] = [float(value) for value in given or known if value is not None]
+    fixed |= {f"E_f.{name}": value for name, value in zip(names, chosen["E_f"], strict=True)}
     usual = TissueSettings(1.0, options.nu, options.reading)
     settings = {
-        name: replace(tissue.get(name, usual), ratio=chosen["ratio"][name]) for name in names
+        name: replace(tissue.get(name, usual), ratio=ratio)
+        for name, ratio in zip(names, chosen["ratio"], strict=True)
     }
     pressure = options.pressure_mmHg
     if pressure is None:
@@ -292,7 +287,12 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     if options.dynamic and mechanics.damping.alpha:
         document.damp(mechanics.damping.alpha)
     if options.contact != "none" and mechanics.contact.active:
-        _add_contact(document, mesh, mechanics.contact.reference_pressure, options)
+        gap, reach = options.contact_gap_mm, options.contact_reach_mm
+        inner = 0.5 * (gap + reach)
+        # Each pair of elements of one surface is counted twice.
+        kc = 0.5 * mechanics.contact.reference_pressure
+        kc /= _pressure_of_sheets(gap, EXPONENT, inner, reach)
+        document.touch(opposite_faces(mesh), kc=kc, p=EXPONENT, R_in=inner, R_out=reach)
     pairs = np.stack([tip_nodes[cables.tip], end_nodes], axis=1)
     document.pull(pairs, _chord_forces(system, document.nodes[pairs]))
     document.support(hinge_nodes, hinge.points, hinge.stiffness)
@@ -311,26 +311,6 @@ def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
     elongation = length[:, None] * (1 + strain) - apart[:, None]
     force = stiffness[:, None] * cable_force(strain, toe)[0]
     return list(np.stack([elongation, force], axis=2))
-
-
-def _add_contact(
-    document: FebDocument, mesh: SolidMesh, pressure: float, options: FebioOptions
-) -> None:
-    faces, gap, reach = opposite_faces(mesh), options.contact_gap_mm, options.contact_reach_mm
-    if options.contact == "potential":
-        inner = 0.5 * (gap + reach)
-        # Each pair of elements of one surface is counted twice.
-        kc = 0.5 * pressure / _pressure_of_sheets(gap, EXPONENT, inner, reach)
-        own = {"kc": kc, "p": EXPONENT, "R_in": inner, "R_out": reach}
-        document.touch("contact potential", {"atrial": faces}, **own)
-    elif len(mesh.region_names) > 1:
-        # A face is of the region of the first element that has all its nodes.
-        hosts = [np.isin(mesh.elements, face).sum(axis=1).argmax() for face in faces]
-        region = mesh.region[hosts]
-        surfaces = {f"{n}_atrial": faces[region == k] for k, n in enumerate(mesh.region_names)}
-        own = {"laugon": 0, "penalty": 1.0, "auto_penalty": 1, "two_pass": 1,
-               "search_radius": reach, "offset": gap}  # fmt: skip
-        document.touch("sliding-elastic", surfaces, **own)
 
 
 def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> float:
@@ -354,14 +334,13 @@ def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
     mesh, mechanics = model.mesh, model.settings
     contact, damping = mechanics.contact, mechanics.damping
     law = f"linear in the Biot strain; in this file {LAWS[options.law]} with the same moduli"
-    gap, reach = options.contact_gap_mm, options.contact_reach_mm
-    theirs = {
-        "potential": f"a contact potential, atrial faces {gap:g} mm apart under this pressure and "
-        f"contact from {reach:g} mm on; nothing keeps leaflets from passing through each other",
-        "sliding": f"sliding-elastic between the atrial faces of different leaflets, {gap:g} mm "
-        "apart; none of a leaflet with itself",
-        "none": "none",
-    }[options.contact if contact.active else "none"]
+    theirs = "none"
+    if contact.active and options.contact != "none":
+        theirs = (
+            f"a contact potential, atrial faces {options.contact_gap_mm:g} mm apart under this "
+            f"pressure and contact from {options.contact_reach_mm:g} mm on; nothing keeps leaflets "
+            "from passing through each other"
+        )
     time = "a static equilibrium at each time"
     if options.dynamic:
         time = f"the generalised alpha rule with {options.density_factor:g} times the density"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -191,26 +191,14 @@ class FebDocument:
             _fill(function, interpolate="linear", extend="extrapolate")
             _points(function, force)
 
-    def touch(self, kind: str, surfaces: Mapping[str, IntArray], **parameters: float) -> None:
-        """Contact of the first surface with each other one, or of a single one with itself.
-
-        Parameters
-        ----------
-        kind : str
-            FEBio's name of it.
-        surfaces : mapping
-            Name -> faces ``(f, k)``.
-        **parameters : float
-            FEBio's.
-        """
-        for name, faces in surfaces.items():
-            self._surface(name, faces)
-        first, *others = surfaces
-        for other in others or [first]:
-            name = f"{first}_{other}"
-            pair = _add(self._at["Mesh"], "SurfacePair", name=name)
-            _fill(pair, primary=first, secondary=other)
-            _fill(_add(self._at["Contact"], "contact", type=kind, surface_pair=name), **parameters)
+    def touch(self, faces: IntArray, **parameters: float) -> None:
+        """Contact potential of faces of the mesh with themselves; parameters are FEBio's."""
+        self._surface("atrial", faces)
+        pair = _add(self._at["Mesh"], "SurfacePair", name="atrial_pair")
+        _fill(pair, primary="atrial", secondary="atrial")
+        contact = _add(self._at["Contact"], "contact", type="contact potential")
+        contact.set("surface_pair", "atrial_pair")
+        _fill(contact, **parameters)
 
     def write(self, path: Path, remarks: Sequence[str] = ()) -> Path:
         """Write the file, with remarks at its head; FEBio logs positions into `positions_file`.

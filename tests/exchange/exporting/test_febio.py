@@ -165,12 +165,10 @@ def test_contact_presses_as_its_reference_pressure(root):
     assert pressure == pytest.approx(0.016, rel=2e-3)
 
 
-def test_sliding_contact_and_inertia(folder, tmp_path):
-    options = FebioOptions(columns=12, rows=2, contact="sliding", density_factor=10)
+def test_inertia_without_contact(folder, tmp_path):
+    options = FebioOptions(columns=12, rows=2, contact="none", density_factor=10)
     root = Xml.parse(export_febio(folder, tmp_path / "a.feb", options)).getroot()
-    assert root.find("Contact/contact").get("type") == "sliding-elastic"
-    pair = root.find("Mesh/SurfacePair")
-    assert [child.text for child in pair] == ["anterior_atrial", "posterior_atrial"]
+    assert root.find("Contact") is None
     assert root.find("Control/analysis").text == "DYNAMIC"
     assert float(root.find("Material/material/density").text) == pytest.approx(1.04e-8)
     assert float(root.find("Loads/body_load/C").text) == pytest.approx(0.1)
@@ -221,7 +219,7 @@ def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, u
     ("given", "words"),
     [
         ({"E_f": (3.0,)}, "expected one of each of anterior, posterior"),
-        ({"contact": "glue"}, "potential, sliding, none"),
+        ({"contact": "glue"}, "potential, none"),
         ({"contact_gap_mm": 2.0}, "gap < reach"),
         ({"law": "mooney"}, "orthotropic, neo-hookean"),
         ({"mesh": "voxels"}, "structured, tetwild"),
