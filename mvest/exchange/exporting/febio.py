@@ -14,7 +14,7 @@ from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
 from mvest.exchange.febio.document import FebDocument
-from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh, opposite_faces
+from mvest.exchange.febio.mesh import LAWS, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.system import System
@@ -115,8 +115,7 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     """Write the closure of a case folder, or of the folder of a run of one, for FEBio.
 
     Run it with ``febio4 -i TARGET``. The positions of all nodes at every step are then in
-    ``TARGET_positions.csv``, and all else in FEBio's own plot file. What is not the same in FEBio
-    stands at the head of the file.
+    ``TARGET_positions.csv``, and all else in FEBio's own plot file.
 
     Raises
     ------
@@ -136,8 +135,9 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     case = read_case(source)
     model = model_of_case(case, options, values, tissue)
     document = valve_document(model, np.zeros(0), options)
-    head = f"{case.name}: closure under {model.settings.protocol.pressure_mmHg:g} mmHg."
-    return document.write(target, [head, *differences(model, options)])
+    pressure, law = model.settings.protocol.pressure_mmHg, LAWS[options.law]
+    head = f"{case.name}: closure under {pressure:g} mmHg. The law here is {law} in place of one"
+    return document.write(target, f"{head} linear in the Biot strain; contact: {options.contact}.")
 
 
 def read_run(folder: Path) -> tuple[str, dict[str, float], dict[str, TissueSettings]]:
@@ -327,32 +327,3 @@ def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> flo
         return 2 * np.pi * gap * parabola
     power = (gap ** (1 - p) - inner ** (1 - p)) / (p - 1) - c2 * (inner - gap)
     return 2 * np.pi * gap * (power + parabola)
-
-
-def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
-    """What is not the same in FEBio, a line each."""
-    mesh, mechanics = model.mesh, model.settings
-    contact, damping = mechanics.contact, mechanics.damping
-    law = f"linear in the Biot strain; in this file {LAWS[options.law]} with the same moduli"
-    theirs = "none"
-    if contact.active and options.contact != "none":
-        theirs = (
-            f"a contact potential, atrial faces {options.contact_gap_mm:g} mm apart under this "
-            f"pressure and contact from {options.contact_reach_mm:g} mm on; nothing keeps leaflets "
-            "from passing through each other"
-        )
-    time = "a static equilibrium at each time"
-    if options.dynamic:
-        time = f"the generalised alpha rule with {options.density_factor:g} times the density"
-    return [
-        f"element: here {mesh.element_type}; in this file "
-        f"{NAMES[febio_mesh(mesh).element_type][0]} without enhanced or assumed strains.",
-        f"law: here {law}.",
-        "direction of the fibre: here at every node; in this file at the centre of each element.",
-        f"contact: here a potential, midsurfaces {contact.reference_distance:g} thicknesses apart "
-        f"under {1e3 * contact.reference_pressure:g} kPa; in this file {theirs}.",
-        f"time: here implicit Euler with damping {damping.alpha:g} 1/s of mass and "
-        f"{damping.beta:g} s of stiffness; in this file {time} and damping by mass alone.",
-        "chordae: here cables with a toe of the fourth power; in this file springs whose force is "
-        f"linear between {TOE_POINTS} points of that toe.",
-    ]

@@ -195,8 +195,8 @@ class FebDocument:
         contact.set("surface_pair", "atrial_pair")
         _fill(contact, **parameters)
 
-    def write(self, path: Path, remarks: Sequence[str] = ()) -> Path:
-        """Write the file, with remarks at its head; FEBio logs positions into `positions_file`.
+    def write(self, path: Path, remark: str = "") -> Path:
+        """Write the file, with a remark at its head; FEBio logs positions into `positions_file`.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class FebDocument:
         self._log.set("file", positions_file(path).name)
         root = Xml.Element("febio_spec", version="4.0")
         # Two hyphens end a comment.
-        root.extend(Xml.Comment(f" {remark.replace('--', '- -')} ") for remark in remarks)
+        root.append(Xml.Comment(f" {remark.replace('--', '- -')} "))
         root.extend(section for section in self._at.values() if len(section) or section.attrib)
         Xml.indent(root, " ")
         text = Xml.tostring(root, encoding="unicode")
