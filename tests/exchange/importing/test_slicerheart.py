@@ -22,13 +22,14 @@ from tests.exchange.importing.slicerheart_exports import (
     batch_export,
     fem_export,
     in_lps,
-    vtk,
+    pyvista,
     write_lines,
     write_model,
 )
 
 OPTIONS = SlicerheartOptions(pressure_mmHg=120.0)
 TRUTH = template_case(64, 16)
+SPHERE = pyvista.Sphere(radius=10.0)
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +41,6 @@ def exported(tmp_path_factory):
 def folder(exported, tmp_path):
     """A copy to change."""
     return shutil.copytree(exported, tmp_path / "P001")
-
-
-def sphere():
-    source = vtk.vtkSphereSource()
-    source.SetRadius(10)
-    source.Update()
-    return source.GetOutput()
 
 
 def away(frame, truth):
@@ -184,7 +178,7 @@ def test_surfaces_of_other_names_are_the_same_valve(folder, case, names):
 
 def test_the_atrial_side_is_taken_before_closed_segments(folder, case):
     for file in folder.glob("*_atrial_*"):
-        write_model(file.with_name(file.name.replace("_atrial", "")), sphere())
+        write_model(file.with_name(file.name.replace("_atrial", "")), SPHERE)
     assert np.array_equal(
         import_slicerheart(folder, OPTIONS).surface.vertices, case.surface.vertices
     )
@@ -274,7 +268,7 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     file.write_bytes(content[:2000])
     refused(folder, "anterior_leaflet.vtk: damaged")
     file.write_bytes(content)
-    write_model(file, sphere())
+    write_model(file, SPHERE)
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
 
 
