@@ -1,9 +1,8 @@
-"""A case, or what was estimated of it, as input of FEBio (file format 4)."""
+"""A case as input of FEBio (file format 4)."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,8 +18,6 @@ from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading, build_system
-from mvest.problem.registration import REGISTRATION
-from mvest.reading.documents import read_mapping
 from mvest.typing import FloatArray
 from mvest.valve.mesh.given import GivenValve
 
@@ -31,8 +28,6 @@ GENERIC = {
 """E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
 CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
 """Points at which the valve is sampled for patches of chordae and the annulus."""
-MAX_RECORD = 1 << 28
-"""Bytes of a run's record that are read."""
 CONTACTS = ("potential", "none")
 SAMPLES, TOE_POINTS = 61, 41
 """Points of pressure and motion over the ramp, and of a chord's force over its toe."""
@@ -48,13 +43,11 @@ class FebioOptions:
 
     Attributes
     ----------
-    case : str, optional
-        Folder of the case of a run; by default where the run says that it was.
     E_f, ratio : tuple of float, optional
-        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; by default
-        what the run estimated, or the generic ones of an anterior and a posterior leaflet.
+        MPa and E_f over E_perp of each leaflet, in the order of the case's regions, as a run of
+        `own-valve` estimated them; by default those of a generic anterior and posterior leaflet.
     nu, reading : float, str
-        Poisson ratio and how it is read (A or C), where no run says so.
+        Poisson ratio and how it is read (A or C).
     pressure_mmHg : float, optional
         By default that of the closed frame.
     mesh : str
@@ -81,7 +74,6 @@ class FebioOptions:
         rest where lighter ones do.
     """
 
-    case: str | None = None
     E_f: tuple[float, ...] | None = None
     ratio: tuple[float, ...] | None = None
     nu: float = 0.488
@@ -112,7 +104,7 @@ class FebioOptions:
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
-    """Write the closure of a case folder, or of the folder of a run of one, for FEBio.
+    """Write the closure of a case folder for FEBio.
 
     Run it with ``febio4 -i TARGET``. The positions of all nodes at every step are then in
     ``TARGET_positions.csv``, and all else in FEBio's own plot file.
@@ -124,102 +116,26 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     """
     if target.suffix.lower() != ".feb":
         raise InputError(f"{target}: expected a name that ends in .feb")
-    values: dict[str, float] = {}
-    tissue: dict[str, TissueSettings] = {}
-    if (source / "result.json").is_file():
-        folder, values, tissue = read_run(source)
-        place = Path(options.case or folder)
-        if not place.is_dir():
-            raise InputError(f"{source}: its case is not at {str(place)!r}; give case=FOLDER")
-        source = place
-    case = read_case(source)
-    model = model_of_case(case, options, values, tissue)
+    model = model_of_case(read_case(source), options)
     document = valve_document(model, np.zeros(0), options)
     pressure, law = model.settings.protocol.pressure_mmHg, LAWS[options.law]
-    head = f"{case.name}: closure under {pressure:g} mmHg. The law here is {law} in place of one"
+    head = f"Closure under {pressure:g} mmHg. The law here is {law} in place of one"
     return document.write(target, f"{head} linear in the Biot strain; contact: {options.contact}.")
 
 
-def read_run(folder: Path) -> tuple[str, dict[str, float], dict[str, TissueSettings]]:
-    """What the run of a case left: the folder of the case, its parameters and its tissue.
-
-    Returns
-    -------
-    case : str
-    values : dict
-        Parameter -> estimate, or what it was held at.
-    tissue : dict
-        Region -> its tissue.
-
-    Raises
-    ------
-    InputError
-        If it is no such run.
-    """
-    record = folder / "result.json"
-    try:
-        found = read_mapping(record, MAX_RECORD)["findings"]["case"]
-        values = {
-            str(row["name"]): float(
-                row["prior_mean"] if row["estimate"] is None else row["estimate"]
-            )
-            for row in found["unknowns"]
-            if row["name"] not in REGISTRATION
-        }
-        tissue = {
-            str(name): TissueSettings(float(own["ratio"]), float(own["nu"]), str(own["reading"]))
-            for name, own in found["settings"]["mechanics"]["tissue"].items()
-        }
-        case = read_mapping(folder / "config.json", MAX_RECORD)["case"]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{record}: no run that estimated a case") from error
-    return str(case), values, tissue
-
-
-def model_of_case(
-    case: ValveCase,
-    options: FebioOptions,
-    values: Mapping[str, float],
-    tissue: Mapping[str, TissueSettings],
-) -> ClosureModel:
-    """The closure of a case with everything at its value: nothing in it is a parameter.
-
-    Parameters
-    ----------
-    case : ValveCase
-    options : FebioOptions
-        What they state goes before ``values`` and ``tissue``.
-    values : mapping
-        Parameter -> value.
-    tissue : mapping
-        Region -> its tissue.
-    """
+def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
+    """The closure of a case with everything at its value: nothing in it is a parameter."""
     names = case.surface.region_names
-    unlike = [name for name in values if name.startswith(("stiffening.", "prestretch."))]
-    if unlike:
-        raise InputError(
-            f"{', '.join(unlike)}: the file has no law for such tissue; export a run without it"
-        )
-    # What has another part is an error of a frame's pressure.
-    kinds = ("E_f", "G", "ratio", "chord_stiffness", "chord_rest_length")
-    fixed = {k: v for k, v in values.items() if k.partition(".")[0] in kinds or "." not in k}
-    estimated = {f"ratio.{name}": own.ratio for name, own in tissue.items()} | fixed
     chosen: dict[str, list[float]] = {}
     for what, given in (("E_f", options.E_f), ("ratio", options.ratio)):
-        if given is not None and len(given) != len(names):
+        values = given or [GENERIC[what][name] for name in names if name in GENERIC[what]]
+        if len(values) != len(names):
             raise InputError(
-                f"{what}: {len(given)} values, expected one of each of {', '.join(names)}"
+                f"{what}: {len(values)} values, expected one of each of {', '.join(names)}"
             )
-        known = [estimated.get(f"{what}.{name}", GENERIC[what].get(name)) for name in names]
-        if None in (given or known):
-            raise InputError(
-                f"no {what} of leaflet {names[known.index(None)]!r}; give {what}=[...]"
-            )
-        chosen[what] = [float(value) for value in given or known if value is not None]
-    fixed |= {f"E_f.{name}": value for name, value in zip(names, chosen["E_f"], strict=True)}
-    usual = TissueSettings(1.0, options.nu, options.reading)
+        chosen[what] = list(map(float, values))
     settings = {
-        name: replace(tissue.get(name, usual), ratio=ratio)
+        name: TissueSettings(ratio, options.nu, options.reading)
         for name, ratio in zip(names, chosen["ratio"], strict=True)
     }
     pressure = options.pressure_mmHg
@@ -234,6 +150,7 @@ def model_of_case(
         mesh = valve.tetrahedra(options.edge_length, "tet10", None)
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
+    fixed = {f"E_f.{name}": value for name, value in zip(names, chosen["E_f"], strict=True)}
     return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)
 
 

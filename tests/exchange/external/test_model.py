@@ -31,6 +31,8 @@ def test_its_own_derivatives_are_taken_as_they_are(tmp_path):
     np.testing.assert_allclose(prediction.y, y, rtol=1e-15)
     np.testing.assert_allclose(prediction.jacobian, jacobian, rtol=1e-15)
     assert (program.counts.misses, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
+    missing = model(tmp_path, differences=None)(M)
+    assert "jacobian.csv is missing" in missing.reason
 
 
 @pytest.mark.parametrize("processes", [1, 3])
@@ -84,10 +86,6 @@ def test_an_interrupted_study_stops_its_programs(tmp_path):
             os.kill(int(path.name), 0)
 
 
-def test_without_derivatives_and_differences_there_is_no_prediction(tmp_path):
-    assert "jacobian.csv is missing" in model(tmp_path, differences=None)(M).reason
-
-
 def test_a_filter_finds_the_truth_through_files(tmp_path):
     y, _ = springs(*M)
     program = model(tmp_path, "exact", differences=None)
@@ -120,13 +118,10 @@ def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_p
 
 def test_a_changed_input_makes_finished_runs_worthless(tmp_path):
     mesh = tmp_path / "mesh.txt"
-    mesh.write_text("coarse")
-    model(tmp_path, inputs=[mesh])(M)
-    model(tmp_path, inputs=[mesh])(M)
-    assert ran(tmp_path) == 5
-    mesh.write_text("finer!")
-    model(tmp_path, inputs=[mesh])(M)
-    assert ran(tmp_path) == 10
+    for content, runs in (("coarse", 5), ("coarse", 5), ("finer!", 10)):
+        mesh.write_text(content)
+        model(tmp_path, inputs=[mesh])(M)
+        assert ran(tmp_path) == runs
     with pytest.raises(InputError, match="cannot read"):
         model(tmp_path, inputs=[tmp_path / "absent"])
 
@@ -177,16 +172,13 @@ def test_whatever_goes_wrong_is_the_reason_of_a_failed_prediction(tmp_path, body
 def test_what_the_program_says_of_its_failure_is_told(tmp_path):
     program = model(tmp_path)
     assert program(np.array([-1.0, 2.0])).reason.endswith("k1 = -1.0: expected > 0")
+    prior = Gaussian(np.array([-1.0, 2.0]), np.eye(2))
+    found = IteratedFilter()(program, prior, springs(*M)[0], 1e-4)
+    assert found.reason is Reason.MODEL_FAILED
+    assert "expected > 0" in found.detail
     # The model stands; the lower neighbour does not.
     near_zero = model(tmp_path, differences=Differences(floor=1.0))(np.array([1e-4, 2.0]))
     assert near_zero.reason.startswith("run for a difference at k1 = -0.0009, k2 = 2: run-")
-
-
-def test_a_filter_ends_with_the_reason_of_a_program_that_fails_at_the_start(tmp_path):
-    prior = Gaussian(np.array([-1.0, 2.0]), np.eye(2))
-    found = IteratedFilter()(model(tmp_path), prior, springs(*M)[0], 1e-4)
-    assert found.reason is Reason.MODEL_FAILED
-    assert "expected > 0" in found.detail
 
 
 def test_parameters_without_a_size_need_a_floor(tmp_path):

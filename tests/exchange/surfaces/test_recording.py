@@ -11,7 +11,6 @@ from mvest.errors import GeometryError, InputError
 from mvest.exchange.abaqus.chordae import trace_cables, truss_stiffness
 from mvest.exchange.abaqus.recording import Recording, deck_sets, read_recording
 from mvest.exchange.child import in_child
-from mvest.valve.mesh.structured import layered_wedges
 from tests.exchange.surfaces.recorded import CASE, DOWN, NAMES, OGDEN, ROUND, skirt, write
 from tests.places import ROOT
 
@@ -260,14 +259,6 @@ def test_a_heading_in_latin_1(tmp_path, recording):
     assert in_child(deck_sets, shared) == ["ALL"]
 
 
-@pytest.mark.parametrize("content", [b"", b"no deck", b"*\n", bytes(range(256)), b"*Node\n1,2\n"])
-def test_unreadable_files(tmp_path, content):
-    write(tmp_path, skirt()).write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        read(tmp_path)
-    assert len(str(caught.value).splitlines()) == 1
-
-
 REAL = ({name: f"{name}_Leaflet_Elements" for name in OGDEN}, "Annular_Nodes", "Free_Edge_Nodes")
 
 
@@ -329,11 +320,3 @@ def test_the_real_chordae(real):
     # of them are drawn nearly straight in the closed valve.
     assert stretch.max() < 1.008
     assert np.mean(stretch[-1] > 0.98) > 0.6
-
-
-def test_the_real_mesh(real):
-    coarse, valve = real.remeshed(520)
-    mesh = layered_wedges(coarse.surface, real.valve.surface)
-    assert 3000 <= len(mesh.nodes) <= 5000
-    seen = real.positions(coarse.triangle, coarse.weights, -1)[coarse.annulus]
-    assert valve.motion.annulus[-1] == pytest.approx(seen, abs=1e-4)
