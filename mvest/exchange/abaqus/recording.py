@@ -177,12 +177,6 @@ def read_recording(
     return Recording(valve, np.array(frames), times, found["pressure"], found["pressure_share"])
 
 
-def deck_sets(path: Path) -> list[str]:
-    """Names of the element and node sets of a deck; called in the child."""
-    sets = Deck(path).sets
-    return [*sets["ELSET"], *sets["NSET"]]
-
-
 def recorded(
     path: Path,
     leaflets: Sequence[str],

@@ -179,7 +179,7 @@ class ProcessModel:
             raise InputError(f"{m.size} parameters, expected {', '.join(self.names)}")
         if not np.all(np.isfinite(m)):
             return Prediction.failed(f"the parameters {m} are not finite")
-        (first,) = self._all([m], jacobian=True)
+        (first,) = self._all(m[None], jacobian=True)
         self.own_jacobian = first.differentiated
         if not first.converged or first.differentiated:
             return first
@@ -224,7 +224,7 @@ class ProcessModel:
         }
         return validated(RunRequest, request, "request")
 
-    def _all(self, points: Sequence[FloatArray], jacobian: bool) -> list[Prediction]:
+    def _all(self, points: FloatArray, jacobian: bool) -> list[Prediction]:
         """Answers at all points, several at a time; leaving early ends the programs."""
         requests = [self._request(m, jacobian) for m in points]
         folders = [self._place(request) for request in requests]
