@@ -192,10 +192,17 @@ def _frames(
         with named(label):
             tips = _tips_of(seen, role, options, frames, notes)
             leaflets, commissures, down = _placed(seen, tips, options.mirrored, notes)
-            sizes = {"seam_mm": options.seam_mm, "edge_mm": options.edge_mm}
-            place = (leaflets, commissures, seen.contour, down)
             # The closed edges lie side by side all along: joined as far as the open ones.
-            surface, seams, gap = joined(*place, **sizes, offset_mm=offset, seams=seams)
+            surface, seams, gap = joined(
+                leaflets,
+                commissures,
+                seen.contour,
+                down,
+                seam_mm=options.seam_mm,
+                edge_mm=options.edge_mm,
+                offset_mm=offset,
+                seams=seams,
+            )
         shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
         notes.append(
             f"leaflets joined at the commissures over {shares} % of their free edges, across at "

@@ -144,15 +144,17 @@ def run_febio(
     if logged.is_file():
         times, frames = read_positions(logged, len(rest))
     frames = np.concatenate([rest[None], frames])
+    counts = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", said)
+    version = re.search(r"version\s+(\d[\d.]*)", said)
     return FebRun(
         converged,
         reason,
         np.concatenate([[0.0], times]),
         restored(mesh, frames),
         len(times),
-        _iterations(said),
+        int(counts[-1]) if counts else 0,
         seconds,
-        _version(said),
+        version.group(1) if version else "",
     )
 
 
@@ -170,13 +172,3 @@ def read_positions(path: Path, n: int) -> tuple[FloatArray, FloatArray]:
             times.append(float(re.findall(r"^\*Time\s*=\s*(\S+)", part, re.MULTILINE)[0]))
             frames.append(values[:, 1:])
     return np.array(times), np.array(frames).reshape(len(frames), n, 3)
-
-
-def _iterations(said: str) -> int:
-    counts = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", said)
-    return int(counts[-1]) if counts else 0
-
-
-def _version(said: str) -> str:
-    found = re.search(r"version\s+(\d[\d.]*)", said)
-    return found.group(1) if found else ""

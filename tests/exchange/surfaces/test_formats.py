@@ -12,7 +12,7 @@ from vtkmodules.vtkFiltersSources import vtkSphereSource
 
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.surfaces import part_of, read_mesh, read_regions, read_surface
-from tests.exchange.surfaces.glb import Glb
+from tests.exchange.surfaces.glb import described, write_parts
 
 REGIONS = {0: "anterior", 1: "posterior"}
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.5], [2, 1, 0.25]])
@@ -101,17 +101,22 @@ def test_parts_are_taken_by_their_names(tmp_path):
 
 
 def test_nodes_place_what_is_below_them(tmp_path):
-    file = Glb()
-    mesh = file.mesh(POINTS, TRIANGLES)
-    quarter = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # about z: x becomes y
-    inner = file.node("inner", top=False, mesh=mesh, scale=[2, 2, 2], translation=[1, 0, 0])
-    file.node("outer", children=[inner], rotation=quarter, translation=[0, 0, 5])
-    # By columns: the last one moves.
-    file.node("matrix", mesh=mesh, matrix=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 7, 8, 9, 1])
-    file.node("mirror", mesh=mesh, scale=[-1, 1, 1])
-    file.node("elsewhere", top=False, mesh=mesh)
-    file.document["meshes"][mesh]["primitives"] *= 2
-    found = read_surface(file.write(tmp_path / "a.glb"))
+    def place(scene):
+        quarter = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # about z: x becomes y
+        scene["nodes"] = [
+            {"name": "inner", "mesh": 0, "scale": [2, 2, 2], "translation": [1, 0, 0]},
+            {"name": "outer", "children": [0], "rotation": quarter, "translation": [0, 0, 5]},
+            # By columns: the last one moves.
+            {"name": "matrix", "mesh": 0, "matrix": [*np.eye(4).ravel().tolist()[:12], 7, 8, 9, 1]},
+            {"name": "mirror", "mesh": 0, "scale": [-1, 1, 1]},
+            {"name": "elsewhere", "mesh": 0},
+        ]
+        scene["scenes"] = [{"nodes": [1, 2, 3]}]
+        scene["meshes"][0]["primitives"] *= 2
+
+    path = write_parts(tmp_path / "a.glb", {"all": (POINTS, TRIANGLES)})
+    path.write_bytes(described(path.read_bytes(), place))
+    found = read_surface(path)
     groups = np.array(found.groups)
     corners = {name: found.vertices[found.triangles[groups == name]][:3] for name in set(groups)}
     assert set(corners) == {"inner", "matrix", "mirror"}
