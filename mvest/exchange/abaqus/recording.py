@@ -184,14 +184,14 @@ def recorded(
     free_edge: str,
     count: int,
 ) -> dict[str, Any]:
-    """What a deck says of a recording of so many frames; called in the child.
+    """Read what a deck states of a recording of ``count`` frames; runs in the child process.
 
     Returns
     -------
     dict
-        Parts of the valve, whose ``vertices`` are numbers of ``nodes``, and of its pressure.
-        ``held`` are the nodes of the annulus, then the anchors of the chordae; ``anchor`` is the
-        number of each chord's.
+        Parts of the valve, and its pressure. ``vertices`` are numbers of ``nodes``; ``held`` are
+        the nodes of the annulus, then the anchors of the chordae; ``anchor`` is the number of the
+        anchor of each chord.
     """
     deck = Deck(path)
     nodes, times = np.array(deck.nodes), np.linspace(0.0, deck.period, count)

@@ -65,7 +65,7 @@ class FebioOptions:
         Between the atrial faces of two flat leaflets that press on each other with the reference
         pressure of the contact.
     contact_reach_mm : float
-        Gap at which contact begins.
+        Gap (mm) at which contact begins.
     dynamic : bool
         With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
         of its ramp.

@@ -1,16 +1,16 @@
-"""How a program is started and asked for a prediction, and how it answers.
+"""The command of an external program, and the files of its requests and responses.
 
 Text only: JSON and comma-separated numbers. One folder is one run::
 
-    request.json      what is asked: parameters with values and units, settings
+    request.json      the request: parameters with values and units, settings
     points.csv        x,y,z mm: reference positions of the points to be observed, where given
     response.json     status, and the reason if there is no prediction; written last
     observation.csv   x,y,z mm of every observed point
     jacobian.csv      optional: one row for each coordinate (x, y, z of the first point, then of the
                       next), one column for each parameter, headed by its name
-    stdout.txt, stderr.txt  what the program says
+    stdout.txt, stderr.txt  the program's output
 
-Reading is strict: what is not exactly that is refused with the file and the row.
+Reading is strict: any other content is refused with the file and the row.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class RequestParameter(BaseModel):
 
 
 class RunRequest(BaseModel):
-    """What one run is asked for, as it stands in ``request.json``.
+    """The request of one run, as ``request.json`` holds it.
 
     Attributes
     ----------
@@ -239,7 +239,7 @@ def write_request(folder: Path, request: RunRequest, points: FloatArray | None =
 
 
 def read_request(file: Path) -> RunRequest:
-    """What ``request.json`` asks for: the program's side.
+    """Read ``request.json``: the program's side.
 
     Raises
     ------
@@ -269,12 +269,12 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
 
 
 def read_answer(folder: Path, request: RunRequest) -> Prediction:
-    """What a run has answered in its folder; undifferentiated without ``jacobian.csv``.
+    """Read the answer of a run from its folder; undifferentiated without ``jacobian.csv``.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged, or its shape or its numbers are not what was asked for.
+        If a file is missing or damaged, or its shape or its numbers differ from the request's.
     """
     data = read_mapping(folder / RESPONSE, MAX_JSON_SIZE, RESPONSE)
     answer = validated(_Response, data, RESPONSE)

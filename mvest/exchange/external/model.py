@@ -41,7 +41,7 @@ class Differences:
 
     Central ones cost two runs for each parameter and err by the square of the step, forward ones
     cost one and err by the step itself. A program that solves to a tolerance puts that tolerance,
-    divided by the step, on top: the step is not to be small beside it.
+    divided by the step, on top: choose the step much larger than the tolerance.
 
     Attributes
     ----------

@@ -39,8 +39,8 @@ from mvest.valve.geometry.segmented import (
 )
 
 OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
-"""Standard deviation of where a person or a network draws a leaflet's wall, and over which length
-along the leaflets such errors are alike; those which a case has without any statement."""
+"""Standard deviation of the wall that a person or a network draws, and the length along the
+leaflets over which such errors are correlated: the values of a case that states none."""
 CLOSED_AT = 0.35
 """s after the open frame, in a generic cardiac cycle."""
 
@@ -197,7 +197,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
     derived.append(
         f"observation: {std:.3g} mm by voxels, smoothing and observer_mm={options.observer_mm:g}, "
-        f"alike over {correlated:g} mm"
+        f"correlated over {correlated:g} mm"
     )
     document = {
         "name": "segmented valve",  # names of files may be those of patients

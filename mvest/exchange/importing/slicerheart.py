@@ -31,7 +31,7 @@ TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}
 GENERIC_PRESSURE = 110.0
 """mmHg on the closed valve: ventricle less atrium from mid to end of systole."""
 CORRELATED_MM = 10.0
-"""Along the leaflets over which errors of a segmentation are alike."""
+"""Along the leaflets, over which errors of a segmentation are correlated."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
 MARGINAL_MM = 4.0
