@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import InputError, MvestError
-from mvest.reading.text import MAX_NUMBER, one_line
+from mvest.reading.text import MAX_NUMBER, one_line, read_bytes
 from mvest.typing import FloatArray, IntArray
 
 CORNERS = {"S4R": 4, "S3": 3, "T3D2": 2}
@@ -109,7 +109,7 @@ class Deck:
         self._amplitudes: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._axes: dict[int, set[int]] = defaultdict(set)
         self._material = self._instance = ""
-        for block in _blocks(path.read_bytes().decode("utf-8-sig", "replace")):
+        for block in _blocks(read_bytes(path).decode("utf-8-sig", "replace")):
             try:
                 self._read(block)
             except KeyError as fault:

@@ -26,9 +26,8 @@ from scipy.sparse.csgraph import connected_components
 from mvest.errors import InputError
 from mvest.exchange.abaqus.chordae import TOE_STRAIN, trace_cables, truss_stiffness
 from mvest.exchange.abaqus.deck import Deck
-from mvest.exchange.child import in_child
 from mvest.exchange.surfaces import read_mesh
-from mvest.reading.text import named, one_line
+from mvest.reading.text import named, one_line, refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
@@ -142,84 +141,54 @@ def read_recording(
         contradict each other.
     """
     path, *files = recording_files(folder)
-    sets = [list(leaflets.values()), annulus, free_edge]
-    found = in_child(recorded, path, *sets, len(files), seconds=600.0)
-    rest, vertices = found["nodes"], found["vertices"]
-    frames, held_path = [], []
-    for k, file in enumerate(files):
-        points = read_mesh(file).vertices
-        if points.shape != rest.shape:
-            raise InputError(f"{file}: {len(points)} points, the deck has {len(rest)} nodes")
-        if k == 0 and not np.abs(points - rest).max() <= TOLERANCE_MM:
-            raise InputError(f"{file}: points are not the nodes of the deck")
-        frames.append(points[vertices])
-        held_path.append(points[found["held"]])
+    with refusing(path, "input deck"):
+        deck = Deck(path)
+        nodes, times = np.array(deck.nodes), np.linspace(0.0, deck.period, len(files))
+        shells = [deck.members("ELSET", name) for name in leaflets.values()]
+        pressure, share = _pressure(deck, np.concatenate(shells), times)
+        surface, vertices, rims = _leaflets(deck, shells, annulus, free_edge, turned=pressure < 0)
+        fibre = surface_coordinates(nodes[vertices], surface["triangles"], *rims).circumferential
+        anchors, chordae = _chordae(deck, nodes, vertices)
+    points = np.stack([_frame(file, nodes) for file in files])
+    if not np.abs(points[0] - nodes).max() <= TOLERANCE_MM:
+        raise InputError(f"{files[0]}: points are not the nodes of the deck")
     # Frames are stored in single precision, the motion begins at the nodes of the deck.
-    path_of_held = rest[found["held"]] + (np.array(held_path) - held_path[0])
-    ring, times = len(found["annulus"]), found["times"]
+    ring, held = (nodes[k] + (points[:, k] - points[0, k]) for k in (vertices[rims[0]], anchors))
     with named(folder):
-        tips, tip = _group_anchors(path_of_held[:, ring:])
+        tips, tip = _group_anchors(held)
     t = times / times[-1]
     valve = Valve(
-        surface=LeafletSurface(**found["surface"], region_names=tuple(leaflets)),
-        annulus=found["annulus"],
-        free_edge=found["free_edge"],
-        papillary_tips=tips[0],
-        chordae=Chordae(
-            **found["chordae"],
-            tip=tip[found["anchor"]],
-            family_names=tuple(found["family_names"]),
-            toe_strain=TOE_STRAIN,
+        surface=LeafletSurface(
+            nodes[vertices], fibre=fibre, region_names=tuple(leaflets), **surface
         ),
+        annulus=rims[0],
+        free_edge=rims[1],
+        papillary_tips=tips[0],
+        chordae=replace(chordae, tip=tip[chordae.tip]),
         # The phase is that by which a closure is paced.
-        motion=Motion(t**3 * (10 - 15 * t + 6 * t**2), path_of_held[:, :ring], tips),
+        motion=Motion(t**3 * (10 - 15 * t + 6 * t**2), ring, tips),
     )
-    return Recording(valve, np.array(frames), times, found["pressure"], found["pressure_share"])
+    return Recording(valve, points[:, vertices], times, abs(pressure), share)
 
 
-def recorded(
-    path: Path,
-    leaflets: Sequence[str],
-    annulus: str,
-    free_edge: str,
-    count: int,
-) -> dict[str, Any]:
-    """Read what a deck states of a recording of ``count`` frames; runs in the child process.
+def _frame(file: Path, nodes: FloatArray) -> FloatArray:
+    """Recorded positions of the nodes of the deck."""
+    points = read_mesh(file).vertices
+    if points.shape != nodes.shape:
+        raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
+    return points
 
-    Returns
-    -------
-    dict
-        Parts of the valve, and its pressure. ``vertices`` are numbers of ``nodes``; ``held`` are
-        the nodes of the annulus, then the anchors of the chordae; ``anchor`` is the number of the
-        anchor of each chord.
-    """
-    deck = Deck(path)
-    nodes, times = np.array(deck.nodes), np.linspace(0.0, deck.period, count)
-    groups = [deck.members("ELSET", name) for name in leaflets]
-    elements = np.concatenate(groups)
-    if not all(map(len, groups)) or np.isin(elements, deck.trusses).any():
-        listed = one_line(", ".join(leaflets), 160)
-        raise InputError(f"element sets {listed}: expected shells, one or more in each")
-    if len(np.unique(elements)) != len(elements):
-        raise InputError("leaflets share elements")
-    pressure, share = _pressure(deck, elements, times)
-    surface, vertices, rims = _leaflets(deck, groups, annulus, free_edge, turned=pressure < 0)
-    at_rest = nodes[vertices]
-    extent = float(np.ptp(at_rest, axis=0).max())
-    if not EXTENT_MM[0] <= extent <= EXTENT_MM[1]:
-        raise InputError(
-            f"the leaflets span {extent:g}, expected {EXTENT_MM[0]:g} to {EXTENT_MM[1]:g}: lengths "
-            "must be mm"
-        )
-    fibre = surface_coordinates(at_rest, surface["triangles"], *rims).circumferential
+
+def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArray, Chordae]:
+    """The anchors of the chordae, and these with the number of the anchor as that of their tip."""
     trusses = deck.trusses
     edges, section = np.array([deck.cells[k] for k in trusses]), deck.section[trusses]
     if not trusses.size or section.min() < 0:
         raise InputError("no chordae: expected elements of type T3D2, each in a section")
-    anchors = np.intersect1d(np.setdiff1d(edges, vertices), deck.held)
+    anchors = np.intersect1d(np.setdiff1d(edges, leaflets), deck.held)
     if not anchors.size:
         raise InputError("no node of the chordae is held, so no papillary muscle is known")
-    anchor, insertion, length, stiffness_share = trace_cables(nodes, edges, anchors, vertices)
+    anchor, insertion, length, share = trace_cables(nodes, edges, anchors, leaflets)
     # The family of a cable is the section of the first truss in the deck at its insertion.
     ends, first = np.unique(edges, return_index=True)
     used, of_truss = np.unique(section, return_inverse=True)
@@ -230,25 +199,15 @@ def recorded(
             if material not in deck.ogden:
                 raise InputError("expected *HYPERELASTIC, OGDEN")
             stiffness.append(truss_stiffness(deck.sections[k][2], deck.ogden[material]))
-    return {
-        "nodes": nodes,
-        "vertices": vertices,
-        "held": np.concatenate([vertices[rims[0]], anchors]),
-        "anchor": np.searchsorted(anchors, anchor),
-        "times": times,
-        "surface": {"vertices": at_rest, "fibre": fibre, **surface},
-        "annulus": rims[0],
-        "free_edge": rims[1],
-        "chordae": {
-            "insertion": nodes[insertion],
-            "family": family,
-            "rest_length": length,
-            "axial_stiffness": np.array(stiffness)[family] * stiffness_share,
-        },
-        "family_names": [material.lower() for material in materials],
-        "pressure": abs(pressure),
-        "pressure_share": share,
-    }
+    return anchors, Chordae(
+        tip=np.searchsorted(anchors, anchor),
+        insertion=nodes[insertion],
+        family=family,
+        rest_length=length,
+        axial_stiffness=np.array(stiffness)[family] * share,
+        family_names=tuple(material.lower() for material in materials),
+        toe_strain=TOE_STRAIN,
+    )
 
 
 def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float, FloatArray]:
@@ -288,10 +247,20 @@ def _leaflets(
         Vertices of annulus and free edge in loop order.
     """
     elements = np.concatenate(groups)
+    if not all(map(len, groups)) or np.isin(elements, deck.trusses).any():
+        raise InputError("element sets of leaflets: expected shells, one or more in each")
+    if len(np.unique(elements)) != len(elements):
+        raise InputError("leaflets share elements")
     region = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     cells = np.array([deck.cells[k] for k in elements])
     vertices, corners = np.unique(cells, return_inverse=True)
     corners = corners.reshape(cells.shape)
+    extent = float(np.ptp(np.array(deck.nodes)[vertices], axis=0).max())
+    if not EXTENT_MM[0] <= extent <= EXTENT_MM[1]:
+        raise InputError(
+            f"the leaflets span {extent:g}, expected {EXTENT_MM[0]:g} to {EXTENT_MM[1]:g}: lengths "
+            "must be mm"
+        )
     on_rim = np.zeros(len(vertices), dtype=np.int64)
     wanted = []
     for number, name in enumerate((annulus, free_edge), 1):
