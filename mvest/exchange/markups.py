@@ -32,7 +32,6 @@ MM_PER = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 FCSV_AXES = {**TO_LPS, "0": TO_LPS["RAS"], "1": TO_LPS["LPS"]}
 """As numbers before Slicer 4.11."""
 FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label"
-DEFAULTS = {"selected": True, "locked": False, "visibility": True, "positionStatus": "defined"}
 MAX_BYTES = 2**24
 
 
@@ -92,19 +91,15 @@ def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
         {
             "type": item.kind,
             "name": name,
-            "coordinateSystem": "LPS",
-            "coordinateUnits": "mm",
-            "locked": False,
-            "labelFormat": "%N-%d",
             "controlPoints": [
-                {"id": str(k + 1), "label": label, "position": point.tolist(), **DEFAULTS}
-                for k, (label, point) in enumerate(zip(item.labels, item.points, strict=True))
+                {"id": str(k), "label": label, "position": point.tolist()}
+                for k, (label, point) in enumerate(zip(item.labels, item.points, strict=True), 1)
             ],
         }
         for name, item in lists.items()
     ]
-    text = json.dumps({"@schema": SCHEMA, "markups": markups}, indent=1)
-    return write_atomically(target, text + "\n")
+    content = _File.model_validate({"@schema": SCHEMA, "markups": markups})
+    return write_atomically(target, content.model_dump_json(by_alias=True, indent=1) + "\n")
 
 
 def read_markups(path: Path | str) -> dict[str, PointList]:
@@ -148,11 +143,15 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER
 class _Point(BaseModel):
     """A control point; of one that was not placed Slicer writes an empty text as position."""
 
+    id: Any = ""
     label: str = ""
     position: Annotated[
         Annotated[list[Number], Field(min_length=3, max_length=3)] | None,
         BeforeValidator(lambda given: None if given == "" else given),
     ] = None
+    selected: Any = True
+    locked: Any = False
+    visibility: Any = True
     status: Literal["undefined", "preview", "defined"] = Field("defined", alias="positionStatus")
 
     @property
@@ -172,6 +171,8 @@ class _Markup(BaseModel):
     unit: Annotated[Literal["um", "mm", "cm", "m"], BeforeValidator(_code)] = Field(
         "mm", alias="coordinateUnits"
     )
+    locked: Any = False
+    label_format: Any = Field("%N-%d", alias="labelFormat")
     listed: list[_Point] = Field([], alias="controlPoints")
 
     def points(self) -> PointList:

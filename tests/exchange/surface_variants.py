@@ -107,10 +107,9 @@ def xml(path: Path, mode: str, packed: str, header: str, order: str, ids: str) -
     saved(writer, vtk_data(kind), path)
 
 
-def more_xml(path: Path, what: str) -> None:
+def more(what: str, points: str) -> vtkPolyData:
     """Other cells beside or in place of the triangles, other types."""
-    writer = vtkXMLPolyDataWriter()
-    data = vtk_data(points="float32" if what == "single precision" else "float64")
+    data = vtk_data(points=points)
     if what == "int8 labels":
         data = vtk_data(of="int8")
     elif what == "labels of points":
@@ -119,12 +118,17 @@ def more_xml(path: Path, what: str) -> None:
     elif what == "quads":
         data = vtk_data(cells=QUADS, labels=[1, 2])
     elif what == "boundary lines":
-        data = vtk_data(labels=[9, *LABELS])
+        data = vtk_data(labels=[9, *LABELS], points=points)
         data.SetLines(vtk_cells([LINE]))
     elif what == "triangle strips":
         data = vtk_data(cells=TRIANGLES[:1], labels=[1, 2])
         data.SetStrips(vtk_cells([STRIP]))
-    saved(writer, data, path)
+    return data
+
+
+def more_xml(path: Path, what: str) -> None:
+    points = "float32" if what == "single precision" else "float64"
+    saved(vtkXMLPolyDataWriter(), more(what, points), path)
 
 
 def legacy(path: Path, version: str, form: str, of: str, field: str) -> None:
@@ -136,20 +140,13 @@ def legacy(path: Path, version: str, form: str, of: str, field: str) -> None:
 
 def more_legacy(path: Path, what: str, version: str, form: str) -> None:
     """Cells of other kinds, and a grid in place of a surface."""
-    writer = vtkUnstructuredGridWriter() if what == "unstructured grid" else vtkPolyDataWriter()
+    grid = what == "unstructured grid"
+    writer = vtkUnstructuredGridWriter() if grid else vtkPolyDataWriter()
     writer.SetFileVersion(int(version.replace(".", "")))
     writer.SetFileType(2 if form == "binary" else 1)
-    data = vtk_data("vtu" if what == "unstructured grid" else "vtp", points="float32")
-    if what == "boundary lines":
-        data = vtk_data(labels=[9, *LABELS], points="float32")
-        data.SetLines(vtk_cells([LINE]))
-    elif what == "triangle strips":
-        data = vtk_data(cells=TRIANGLES[:1], labels=[1, 2])
-        data.SetStrips(vtk_cells([STRIP]))
-    elif what == "quads":
-        data = vtk_data(cells=QUADS, labels=[1, 2])
-    elif what == "header of 3D Slicer":
+    if what == "header of 3D Slicer":
         writer.SetHeader("3D Slicer output. SPACE=LPS")
+    data = vtk_data("vtu", points="float32") if grid else more(what, "float32")
     saved(writer, data, path)
 
 

@@ -1,7 +1,7 @@
 """Files of kinds that people have: read as the reference library reads them.
 
-The files lie beside the checkout and are no part of it. Two further ones of each kind are among
-those that other programs' libraries make (`tests.exchange.variants`).
+The files lie beside the checkout and are no part of it. Others of each kind are among those that
+other programs' libraries make (`tests.exchange.variants`).
 """
 
 import json
@@ -27,48 +27,9 @@ from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface
 from mvest.exchange.volumes import read_labels, read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
-from tests.exchange.variants import LABELS, MARKUPS, SURFACES, VOLUMES
 from tests.places import field_input
 
 TIPS = "tips=[-16,-0.24,-25,16,-0.24,-25]"
-
-FURTHER = {
-    "cells_idtype.vtk": (
-        "VTK: 4.2, binary, vtkIdType, scalars", "VTK: 5.1, binary, vtkIdType, a field"
-    ),
-    "pv_region_uint8_ascii.vtk": (
-        "VTK: 4.2, text, uint8, scalars", "VTK: 5.1, text, uint8, scalars"
-    ),
-    "obj_tabs.obj": ("OBJ: tabs", "OBJ: VTK with tabs"),
-    "ply_ascii_tex.ply": ("PLY: texcoord, ascii", "PLY: texcoord, binary little endian"),
-    "itk3d.nhdr": (
-        "NRRD by ITK: .nhdr, 3D, int16, plain", "NRRD by ITK: .nhdr, 3D, uint8, compressed"
-    ),
-    "itk4d.nrrd": (
-        "NRRD by ITK: .nrrd, 4D, float32, plain", "NRRD by ITK: .nhdr, 4D, int16, compressed"
-    ),
-    "slicer_text_index.seq.nrrd": ("NRRD: phases as text", "NRRD: slicerio with phases as text"),
-    "rec.dcm": (
-        "Philips Cartesian DICOM: explicit, preamble", "Philips Cartesian DICOM: implicit, bare"
-    ),
-    "no_system.mrk.json": ("Markups: 1.0.0, no system", "Markups: 1.0.3, no system"),
-    "line_and_points.mrk.json": ("Markups: beside: Line", "Markups: beside: an empty list"),
-    "overlapping.seg.nrrd": (
-        "Slicer segmentation: overlapping layers", "Slicer segmentation: before 4.11"
-    ),
-    "overlapping_empty_layer.seg.nrrd": (
-        "Slicer segmentation: an empty layer", "Slicer segmentation: before 4.11"
-    ),
-    "sparse4d_ms.nii.gz": ("NIfTI labels: 4D in ms", "NIfTI labels: 4D without a unit"),
-    "full4d_default_times.nii.gz": ("NIfTI labels: 4D without a unit", "NIfTI labels: 4D in ms"),
-    "int64_labels.nrrd": ("NRRD labels: int64", "MetaImage labels: int64"),
-    "child_cropped.nii.gz": ("NIfTI labels: uint8", "MetaImage labels: int16"),
-}  # fmt: skip
-
-
-def test_there_are_two_further_files_of_each_kind() -> None:
-    made = {str(variant) for variant in (*SURFACES, *VOLUMES, *LABELS, *MARKUPS)}
-    assert {name for names in FURTHER.values() for name in names} <= made
 
 
 def reference(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

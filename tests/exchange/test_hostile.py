@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import nibabel
 import numpy as np
@@ -23,6 +24,7 @@ from mvest.exchange.surfaces import read_surface
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from tests.cases import folders
+from tests.exchange.surfaces.glb import described
 from tests.exchange.variants import MARKUPS, SURFACES, VOLUMES
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits are those of Linux")
@@ -30,6 +32,10 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits are thos
 MIB = 2**20
 LONG = b"1" + 400 * b"0"
 VARIANTS = {str(variant): variant for variant in (*SURFACES, *VOLUMES, *MARKUPS)}
+VTK = "VTK: 4.2, text, int32, scalars"
+STL = "STL: VTK text"
+PLY = "PLY: ascii, float, uchar"
+OBJ = "OBJ: groups"
 VTP = "VTP: text, plain, UInt64, LittleEndian, Int64"
 VTU = "VTU: text, plain, UInt64, LittleEndian, Int64"
 NRRD = "NRRD by pynrrd: .seq.nrrd, frames last, gzip, uint8"
@@ -125,13 +131,16 @@ HOSTILE: dict[str, tuple[str, Change] | tuple[str, Change, str]] = {
     "appended VTP inflates to 4 GiB": (VTP, lambda whole: vtk_bomb(whole, True)),
     "VTU inflates to 4 GiB": (VTU, vtk_bomb),
     "VTP of entities of entities": (VTP, billion_laughs),
+    "VTP of an entity outside": (VTP, lambda whole: (
+        b'<!DOCTYPE l [<!ENTITY x SYSTEM "/etc/hostname">]>' + whole.replace(b"40 0 1", b"&x;")
+    )),
     "VTP of an index without end": (VTP, replaced(b"0 1 2", b"0 1 " + LONG)),
     "VTU of offsets that fall": (VTU, replaced(b"3 6 9", b"6 3 9")),
     "VTP in an unknown encoding": (
         VTP, lambda whole: b'<?xml version="1.0" encoding="x"?>' + whole
     ),
-    "OBJ of an index without end": ("OBJ: groups", replaced(b"f 1 2 3", b"f 1 2 " + LONG)),
-    "OBJ in another encoding": ("OBJ: groups", lambda whole: whole.decode().encode("utf-16")),
+    "OBJ of an index without end": (OBJ, replaced(b"f 1 2 3", b"f 1 2 " + LONG)),
+    "OBJ in another encoding": (OBJ, lambda whole: whole.decode().encode("utf-16")),
     "NRRD inflates to 4 GiB": (NRRD, nrrd_bomb, "needs more than 1 GiB"),
     "NRRD of 9000^3 voxels": (NRRD, replaced(b"16 17 21 3", b"9000 9000 9000 3"), HELD),
     "NRRD skips 10^9 lines": (NRRD, replaced(b"encoding", b"line skip: 1000000000\nencoding")),
@@ -155,6 +164,64 @@ HOSTILE: dict[str, tuple[str, Change] | tuple[str, Change, str]] = {
 }  # fmt: skip
 
 
+STRUCTURED = b"# vtk DataFile Version 4.2\nx\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS "
+POINTS = b" 1\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+CELLS = b"POLYGONS 3 12\n3 0 1 2 \n3 2 1 3 \n3 1 4 3 \n"
+ABSENT = "points that do not exist"
+DAMAGED: tuple[tuple[str, bytes | None, bytes, str], ...] = (
+    (VTK, None, b"", "damaged"),
+    (VTK, b"POINTS 5", b"POINTS 2147483648", "damaged"),
+    (VTK, b"POINTS 5", b"POINTS -3", "damaged"),
+    (VTK, None, b"# vtk DataFile Version 4.2\nx\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n0 0 1",
+     "damaged: Error reading ascii"),
+    (VTK, b"40 0 1", b"x 0 1", "damaged: Error reading ascii"),
+    (VTK, b"40 0 1", b"nan 0 1", r"points \[4\] are not finite"),
+    (VTK, b"POLYGONS 3 12", b"POLYGONS 2147483648 8589934592", "damaged"),
+    (VTK, b"3 1 4 3", b"3 1 5 3", ABSENT),
+    (VTK, b"3 1 4 3", b"3 1 4 -1", ABSENT),
+    (VTK, b"3 1 4 3", b"300 1 4 3", ABSENT),
+    ("VTK: 5.1, text, int32, scalars", b"0 3 6 9", b"0 900 6 9", ABSENT),
+    (VTK, b"SCALARS region int \nLOOKUP_TABLE default", b"FIELD f 1\nregion 1 9 int\n1 2 2 1 2 2",
+     "'region' has 9 rows, expected 3 cells"),
+    (VTK, CELLS, CELLS.replace(b"POLYGONS", b"LINES"), "no triangles"),
+    (VTK, CELLS, b"", "no triangles|damaged"),
+    (VTK, None, STRUCTURED + b"9000 9000 9000\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA "
+     b"729000000000\nSCALARS a double 1\nLOOKUP_TABLE default\n1\n", r"a\.vtk: "),
+    (VTK, None, STRUCTURED + b"1 1" + POINTS, "expected PolyData"),
+    (VTP, None, b"nonsense", "damaged: Error parsing XML"),
+    (VTU, None, b"nonsense", "damaged: Error parsing XML"),
+    (VTP, None, b"<VTKFile type='ImageData'/>", "damaged: Cannot find PolyData"),
+    (VTP, b'NumberOfPolys="3"', b'NumberOfPolys="2147483648"', "damaged"),
+    (VTP, b'NumberOfPoints="5"', b'NumberOfPoints="2147483648"', "damaged"),
+    (VTP, b'NumberOfPoints="5"', b'NumberOfPoints="4611686018427387904"', "damaged"),
+    (VTP, b"1 4 3", b"1 5 3", ABSENT),
+    (VTP, b"3 6 9", b"3 6 900", "damaged"),
+    (VTP, b"40 0 1", b"x 0 1", "damaged"),
+    (STL, None, b"", "0 bytes, expected 84"),
+    (STL, None, bytes(80) + b"\xff\xff\xff\xff" + bytes(150), "expected 214748364834 for"),
+    (STL, None, bytes(84), "no points"),
+    (STL, b"endsolid", b"", "9 corners, expected three of each facet and endsolid"),
+    (STL, b"vertex 40", b"vertex x", "damaged"),
+    (PLY, None, b"nonsense", "damaged or no PLY"),
+    (PLY, b"ascii", b"EBCDIC", "format EBCDIC, expected ascii, binary_"),
+    (PLY, b"end_header", b"", "damaged or no PLY file"),
+    (PLY, b"vertex 5", b"vertex 2147483648", "rows too early"),
+    (PLY, b"vertex 5", b"vertex -5", "damaged"),
+    (PLY, b"float x", b"float w", "no element vertex with x, y and z"),
+    (PLY, b"3 1 4 3", b"3 1 4 3 5", "1 numbers more than its header says"),
+    (OBJ, None, b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
+    (OBJ, b"f 2 5 4", b"f 2 9 4", ABSENT),
+    (OBJ, b"f 2 5 4", b"f 2 0 4", ABSENT),
+    (OBJ, b"f 2 5 4", b"f 2 -6 4", ABSENT),
+    (OBJ, b"v 40.0", b"v 1e12", r"points \[4\] .* 1e\+09"),
+    (OBJ, b"v 40.0 0.0 1.0", b"v 40.0 0.0", "damaged"),
+)  # fmt: skip
+"""What stands in a file in place of something, or of all, and what is said of it."""
+for number, (kind, before, after, words) in enumerate(DAMAGED):
+    change = (lambda _, content=after: content) if before is None else replaced(before, after)
+    HOSTILE[f"{kind}: {number}"] = kind, change, words
+
+
 def read(path: Path) -> object:
     if path.suffix == ".json":
         return read_markups(path)
@@ -167,23 +234,60 @@ def read(path: Path) -> object:
 @pytest.mark.parametrize("name", HOSTILE)
 def test_it_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     kind, change, *words = HOSTILE[name]
-    variant = VARIANTS[kind]
-    path = tmp_path / variant.file
-    variant.write(path)
-    read(path)
-    path.write_bytes(change(path.read_bytes()))
+    path = tmp_path / VARIANTS[kind].file
+    VARIANTS[kind].write(path)
+    whole = path.read_bytes()
+    path.write_bytes(change(whole))
     with pytest.raises(MvestError, match=words[0] if words else None) as caught:
         read(path)
     message = str(caught.value)
-    assert message.startswith(str(path))
+    assert message.startswith(f"{path}: ")
     assert message.isprintable()
     assert len(message) < 400 + len(str(path))
+    # Whatever became of the child, another file is read.
+    path.write_bytes(whole)
+    read(path)
+
+
+def test_files_that_are_not_there_or_of_no_kind_are_named(tmp_path: Path) -> None:
+    with pytest.raises(MvestError, match=r"a\.stl: no such file"):
+        read(tmp_path / "a.stl")
+    with pytest.raises(
+        MvestError, match=r"extension '\.off', expected .*\.stl, \.obj, \.ply, \.vtk"
+    ):
+        read(tmp_path / "a.off")
+
+
+SCENES: dict[str, tuple[Callable[[Any], object], str]] = {
+    "compressed": (lambda d: d.update(extensionsRequired=["KHR_draco"]), "needs KHR_draco"),
+    "data elsewhere": (lambda d: d["buffers"][0].update(uri="a.bin"), "damaged"),
+    "more numbers": (lambda d: d["accessors"][0].update(count=7), "damaged"),
+    "far more": (lambda d: d["accessors"][0].update(count=2**40), "damaged"),
+    "no numbers": (lambda d: d["accessors"][0].pop("bufferView"), "needs sparse or compressed"),
+    "sparse": (lambda d: d["accessors"][0].update(sparse={}), "needs sparse or compressed arrays"),
+    "more bytes": (lambda d: d["bufferViews"][0].update(byteLength=10**6), "damaged"),
+    "no such node": (lambda d: d["scenes"][0].update(nodes=[-1]), "damaged"),
+    "far away": (lambda d: d["nodes"][0].update(translation=[1e300, 0, 0]), "not finite numbers"),
+    "no nodes": (lambda d: d["scenes"][0].update(nodes=[]), "no points"),
+    "version 1": (lambda _: None, "only GLTF 2"),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_that_are_damaged_or_packed_otherwise(name: str, tmp_path: Path) -> None:
+    change, words = SCENES[name]
+    path = tmp_path / "a.glb"
+    VARIANTS["GLB: one mesh"].write(path)
+    version = 1 if name == "version 1" else 2
+    path.write_bytes(described(path.read_bytes(), change, version))
+    with pytest.raises(MvestError, match=words):
+        read(path)
 
 
 CUT = (
     *(VTP, VTU, "VTP: base64, zlib, UInt64, LittleEndian, Int64", "GLB: one mesh"),
     *(f"VTK: {v}, {form}, int32, scalars" for v in ("4.2", "5.1") for form in ("text", "binary")),
-    *("STL: VTK binary", "STL: VTK text", "PLY: ascii, float, uchar"),
+    *("STL: VTK binary", STL, PLY),
     "PLY: binary little endian, float, uchar",
     *(NRRD, "NRRD by pynrrd: .seq.nrrd, frames last, raw, uint8", META),
     *("MetaImage: .mha, 4D, uint8, plain", NIFTI, "NIfTI: NIfTI-1, uint8, .nii", DICOM),

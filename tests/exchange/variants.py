@@ -26,10 +26,10 @@ separates options that are combined.
 |---|---|---|
 """
 FOOT = """
-[Folders of SlicerHeart](slicer.md), [Abaqus decks](own_valve.md) and [FEBio](febio.md) have pages
-of their own. What a file does not state (units, times, which leaflet is which) is asked for in one
-line. Every file is read by a child process whose memory and time are bounded; a damaged one costs
-one line. This page is made by `python -m tests.exchange.variants`.
+[Folders of SlicerHeart](slicer.md) and [FEBio](febio.md) have pages of their own. What a file does
+not state (units, times, which leaflet is which) is asked for in one line. Every file is read by a
+child process whose memory and time are bounded; a damaged one costs one line. This page is made by
+`python -m tests.exchange.variants`.
 """
 
 

@@ -23,6 +23,7 @@ SHAPE = (3, 16, 17, 21)
 SPACING = np.array([1.5, 1.25, 1.0])
 ORIGIN = np.array([-12.5, 4.0, 30.25])
 DIRECTION = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
+MIRRORED = DIRECTION * [1.0, 1.0, -1.0]
 TIMES = np.array([0.0, 0.04, 0.08])
 """s"""
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -31,9 +32,9 @@ AFFINE = np.eye(4)
 AFFINE[:3, :3], AFFINE[:3, 3] = DIRECTION * SPACING, ORIGIN
 
 
-def frames(dtype: str = "uint8") -> np.ndarray:
+def frames(dtype: str = "uint8", shape: tuple[int, ...] = SHAPE) -> np.ndarray:
     """Voxels ``(T, I, J, K)``, different wherever axes are swapped."""
-    return np.random.default_rng(7).integers(0, 100, SHAPE).astype(dtype)
+    return np.random.default_rng(7).integers(0, 100, shape).astype(dtype)
 
 
 def label_map() -> np.ndarray:
@@ -43,39 +44,44 @@ def label_map() -> np.ndarray:
     return result
 
 
-def itk(values: np.ndarray, step: float = 0.04) -> SimpleITK.Image:
+def itk(values: np.ndarray, step: float = 0.04, direction=DIRECTION) -> SimpleITK.Image:
     """An image of three or, with time as the last, of four axes."""
     image = SimpleITK.GetImageFromArray(
         np.ascontiguousarray(values.transpose(*range(values.ndim - 3), -1, -2, -3)), isVector=False
     )
     more, size = values.ndim - 3, values.ndim
-    direction = np.eye(size)
-    direction[:3, :3] = DIRECTION
+    whole = np.eye(size)
+    whole[:3, :3] = direction
     image.SetSpacing([*SPACING, *[step] * more])
     image.SetOrigin([*ORIGIN, *[0.0] * more])
-    image.SetDirection(direction.ravel().tolist())
+    image.SetDirection(whole.ravel().tolist())
     return image
 
 
-def by_itk(path: Path, what: str, dtype: str, packed: str) -> None:
+def by_itk(
+    path: Path, what: str = "4D", dtype: str = "uint8", packed: str = "plain", direction=DIRECTION
+) -> Path:
     values = frames(dtype)
-    image = itk(values if what == "4D" else values[0])
+    image = itk(values if what == "4D" else values[0], direction=direction)
     SimpleITK.WriteImage(image, str(path), packed == "compressed")
+    return path
 
 
-def nifti(path: Path, version: str, dtype: str, more: str = "") -> None:
-    values = frames(dtype)
+def nifti(path: Path, version: str, dtype: str, more: str = "", direction=DIRECTION) -> Path:
+    values, matrix = frames(dtype), AFFINE.copy()
+    matrix[:3, :3] = direction * SPACING
     values = values[0] if more == "3D" else np.moveaxis(values, 0, 3)
     kind = nibabel.Nifti2Image if version == "NIfTI-2" else nibabel.Nifti1Image
-    image = kind(values * 1.0 if more == "scaled" else values, RAS @ AFFINE)
+    image = kind(values * 1.0 if more == "scaled" else values, RAS @ matrix)
     if more in ("sform only", "qform only"):
-        image.set_sform(RAS @ AFFINE, code=int(more == "sform only"))
-        image.set_qform(RAS @ AFFINE, code=int(more == "qform only"))
+        image.set_sform(RAS @ matrix, code=int(more == "sform only"))
+        image.set_qform(RAS @ matrix, code=int(more == "qform only"))
     image.set_data_dtype(dtype)
     image.header.set_xyzt_units("mm", "sec" if more == "seconds" else "msec")
     if more != "3D":
         image.header["pixdim"][4] = 0.04 if more == "seconds" else 40
     nibabel.save(image, path)
+    return path
 
 
 def directions(axis: int | None) -> np.ndarray:
@@ -181,10 +187,10 @@ PHILIPS = "1.2.840.113543.6.6.1.3.10002"
 """Class of Philips Cartesian DICOM: 3D echo over time in private fields, lengths in cm."""
 
 
-def philips(path: Path, syntax: str, start: str) -> None:
+def dataset(shape: tuple[int, ...] = SHAPE, before: bytes = b"") -> Dataset:
     """As QLAB exports it; voxels of the class have no direction but their own axes."""
-    values = frames()
-    count, i, j, k = values.shape
+    values = frames(shape=shape)
+    count, i, j, k = shape
     data = Dataset()
     data.SOPClassUID, data.Modality, data.FrameTime = PHILIPS, "US", "40"
     data.PhysicalUnitsXDirection = data.PhysicalUnitsYDirection = 3
@@ -195,11 +201,18 @@ def philips(path: Path, syntax: str, start: str) -> None:
     data.add_new((0x3001, 0x0010), "LO", "Philips3D")
     for element, kind, value in ((1, "UL", k), (2, "US", 3), (3, "FD", SPACING[2] / 10)):
         data.add_new((0x3001, 0x1000 + element), kind, value)
-    voxels = values.transpose(0, 3, 2, 1).tobytes()
+    voxels = before + values.transpose(0, 3, 2, 1).tobytes()
     data.add_new((0x7FE0, 0x0010), "OB", voxels + b"\0" * (len(voxels) % 2))
+    return data
+
+
+def philips(
+    path: Path, syntax: str = "explicit", start: str = "bare", data: Dataset | None = None
+) -> Path:
+    data = dataset() if data is None else data
     if start == "bare":
         pydicom.dcmwrite(path, data, implicit_vr=syntax == "implicit", little_endian=True)
-        return
+        return path
     data.file_meta = FileMetaDataset()
     data.file_meta.MediaStorageSOPClassUID = PHILIPS
     data.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
@@ -207,6 +220,7 @@ def philips(path: Path, syntax: str, start: str) -> None:
         ImplicitVRLittleEndian if syntax == "implicit" else ExplicitVRLittleEndian
     )
     pydicom.dcmwrite(path, data, enforce_file_format=True)
+    return path
 
 
 def volume_variants() -> Iterator[Variant]:

@@ -17,7 +17,7 @@ from experiments.studies.case import STUDY, Settings
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
-from tests.exchange.volumes import test_nifti, test_philips
+from tests.exchange import volume_variants
 from tests.exchange.volumes import volumes as v
 from tests.experiments.common.test_inputs import own_case, own_program, own_volume, typed
 from tests.experiments.configured import composed, plain
@@ -28,10 +28,10 @@ SECRETS = (NAME, "DOE_JANE", NUMBER, DATE)
 
 
 def philips(folder: Path) -> Path:
-    data = test_philips.dataset()
+    data = volume_variants.dataset()
     data.PatientName, data.PatientID = NAME, NUMBER
     data.PatientBirthDate = data.StudyDate = DATE
-    return test_philips.save(folder / "a.dcm", data)
+    return volume_variants.philips(folder / "a.dcm", data=data)
 
 
 def nrrd(folder: Path) -> Path:
@@ -42,7 +42,7 @@ def nrrd(folder: Path) -> Path:
 
 
 def nifti(folder: Path) -> Path:
-    image = test_nifti.image(v.frames())
+    image = nibabel.load(volume_variants.nifti(folder / "b.nii", "NIfTI-1", "uint8"))
     image.header["descrip"], image.header["db_name"] = NAME, NUMBER
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", DATE.encode()))
     nibabel.save(image, folder / "a.nii")

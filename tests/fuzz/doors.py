@@ -19,7 +19,6 @@ from mvest.exchange.external.contract import (
     read_answer,
     write_answer,
 )
-from mvest.exchange.febio.document import read_positions
 from mvest.exchange.importing.slicerheart import SlicerheartOptions, import_slicerheart
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_regions
@@ -94,13 +93,6 @@ def answer(folder: Path) -> None:
     write_answer(folder, Prediction(y, np.outer(y, [1.0, -1e-9])), REQUEST.names)
 
 
-def positions(folder: Path) -> None:
-    """As FEBio logs the positions of two nodes."""
-    rows = "1,-0.5,0.25,-3.5e-05\n2,0.5,0.5,-3.5e-05\n"
-    steps = (f"*Step  = {k}\n*Time  = {0.1 * k:g}\n*Data  = positions\n{rows}" for k in range(3))
-    (folder / "a.csv").write_text("".join(steps))
-
-
 def surface(path: Path) -> object:
     """STL has no place for labels."""
     labelled = path.suffix != ".stl"
@@ -172,5 +164,4 @@ DOORS: dict[str, tuple[Enter, Makers]] = {
         lambda path: read_answer(path.parent, REQUEST),
         beside(answer, "response.json", "observation.csv", "jacobian.csv"),
     ),
-    "febio": (lambda path: read_positions(path, 2), beside(positions, "a.csv")),
 }  # fmt: skip

@@ -20,15 +20,12 @@ sideways; straight cables do not.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 
 from mvest.errors import GeometryError, InputError
-from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 
 TOE_STRAIN = 0.01
@@ -117,46 +114,33 @@ def _stiffness_shares(distance: FloatArray, predecessor: IntArray, ends: IntArra
     return np.asarray(distance[ends] / np.array(give))
 
 
-def truss_stiffness(
-    material: str, area: float, law: Mapping[str, Mapping[str, Any]], strain: float = TOE_STRAIN
-) -> float:
-    """Secant stiffness (N for mm and MPa) of a truss: force over ``strain``.
+def truss_stiffness(area: float, ogden: FloatArray, strain: float = TOE_STRAIN) -> float:
+    """Secant stiffness (N for mm and MPa) of an incompressible Ogden truss: force over ``strain``.
 
-    Linear elastic, or incompressible Ogden with the nominal stress
-    ``sum 2 mu/alpha (l^(alpha-1) - l^(-alpha/2-1))`` at stretch ``l = 1 + strain`` (Ogden 1972,
-    Proc. R. Soc. A 326:565, in Abaqus' convention).
+    The nominal stress is ``sum 2 mu/alpha (l^(alpha-1) - l^(-alpha/2-1))`` at stretch
+    ``l = 1 + strain`` (Ogden 1972, Proc. R. Soc. A 326:565, in Abaqus' convention).
 
     Parameters
     ----------
-    material : str
-        Its name.
     area : float
-        mm^2; NaN where none is given.
-    law : mapping
-        As in `mvest.exchange.abaqus.deck.Deck.laws`.
+        mm^2.
+    ogden : ndarray
+        ``(t, 2)`` mu (MPa) and alpha of each term.
     strain : float
 
     Raises
     ------
     InputError
-        If there is no area, or the material is neither.
+        If area or stress is not positive.
     """
-    linear, ogden = law.get("ELASTIC"), law.get("HYPERELASTIC", {"options": {}})
-    what, stress = f"trusses of {one_line(material, 40)}", np.nan
-    if linear is not None and linear["options"].get("TYPE", "ISO").upper()[:3] == "ISO":
-        stress = linear["values"][0] * strain if len(linear["values"]) else np.nan
-    elif "OGDEN" in ogden["options"]:
-        count = 2 * int(ogden["options"].get("N", "1"))
-        if len(ogden["values"]) < count:
-            raise InputError(f"{what}: N = {count // 2}, expected so many pairs mu, alpha")
-        mu, alpha = ogden["values"][:count].reshape(-1, 2).T
-        stretch = 1 + strain
-        with np.errstate(all="ignore"):
-            terms = stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1)
-            stress = sum(2 * mu / alpha * terms)
+    mu, alpha = ogden.T
+    stretch = 1 + strain
+    with np.errstate(all="ignore"):
+        terms = stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1)
+        stress = sum(2 * mu / alpha * terms)
     if not 0 < area * stress < float("inf"):
         raise InputError(
-            f"{what}: {area:g} mm2 and {stress:g} MPa at a strain of {strain:g}, expected a cross "
-            "section and isotropic *ELASTIC or *HYPERELASTIC, OGDEN with a stress > 0"
+            f"{area:g} mm2 and {stress:g} MPa at a strain of {strain:g}, expected a cross section "
+            "and a stress > 0"
         )
     return float(area * (stress / strain))

@@ -2,9 +2,9 @@
 
 A folder ``NAME`` holds ``NAME.inp`` and ``NAME_0.vtu``, ``NAME_1.vtu``, ..., the positions of all
 nodes of the deck at equal intervals of its step. Lengths are mm, stresses MPa, times s. Leaflets
-are shells, chordae trusses; which sets are leaflets, annulus and free edge is given by their names,
-and the deck itself says what else there is: thickness, chord materials and sections, which chord
-nodes are held (the papillary muscles), how annulus and papillary muscles move, and the pressure.
+are shells, chordae trusses; which sets are leaflets, annulus and free edge is given by their names.
+The deck states thickness, chord materials and sections, which chord nodes are held (the papillary
+muscles), and the pressure. The frames state how annulus and papillary muscles move.
 
 Such a case is the Texas TriValve 1.1 (SoftTissueBiomechanicsLab/Texas_TriValve_1.1, CC BY 4.0;
 Mathur et al. 2022, Engineering with Computers, doi 10.1007/s00366-022-01659-w), a human donor
@@ -25,10 +25,9 @@ from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import InputError
 from mvest.exchange.abaqus.chordae import TOE_STRAIN, trace_cables, truss_stiffness
-from mvest.exchange.abaqus.deck import Deck, lookup, some
-from mvest.exchange.child import in_child
+from mvest.exchange.abaqus.deck import Deck
 from mvest.exchange.surfaces import read_mesh
-from mvest.reading.text import one_line
+from mvest.reading.text import named, one_line, refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
@@ -53,7 +52,7 @@ class Recording:
     ----------
     valve : Valve
         On its fine midsurface in frame 0, normals to the ventricle, fibres parallel to the annulus.
-        Its motion is that which the deck prescribes, at the times of the frames.
+        Its motion is that of the frames.
     frames : ndarray
         ``(f, n, 3)`` mm, recorded positions of the vertices.
     times : ndarray
@@ -142,124 +141,73 @@ def read_recording(
         contradict each other.
     """
     path, *files = recording_files(folder)
-    sets = [list(leaflets.values()), annulus, free_edge]
-    found = in_child(recorded, path, *sets, len(files), seconds=600.0)
-    nodes, vertices, held = found["nodes"], found["vertices"], found["held"]
-    frames = []
-    for k, file in enumerate(files):
-        points = read_mesh(file).vertices
-        if points.shape != nodes.shape:
-            raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
-        if k == 0 and not np.abs(points - nodes).max() <= TOLERANCE_MM:
-            raise InputError(f"{file}: points are not the nodes of the deck")
-        error = np.abs(points[held] - found["held_path"][k]).max()
-        if not error <= TOLERANCE_MM:
-            raise InputError(
-                f"{file}: {error:.2g} mm away from the deck's prescribed motion (tolerance "
-                f"{TOLERANCE_MM} mm)"
-            )
-        frames.append(points[vertices])
-    names = tuple(found["family_names"])
+    with refusing(path, "input deck"):
+        deck = Deck(path)
+        nodes, times = np.array(deck.nodes), np.linspace(0.0, deck.period, len(files))
+        shells = [deck.members("ELSET", name) for name in leaflets.values()]
+        pressure, share = _pressure(deck, np.concatenate(shells), times)
+        surface, vertices, rims = _leaflets(deck, shells, annulus, free_edge, turned=pressure < 0)
+        fibre = surface_coordinates(nodes[vertices], surface["triangles"], *rims).circumferential
+        anchors, chordae = _chordae(deck, nodes, vertices)
+    points = np.stack([_frame(file, nodes) for file in files])
+    if not np.abs(points[0] - nodes).max() <= TOLERANCE_MM:
+        raise InputError(f"{files[0]}: points are not the nodes of the deck")
+    # Frames are stored in single precision, the motion begins at the nodes of the deck.
+    ring, held = (nodes[k] + (points[:, k] - points[0, k]) for k in (vertices[rims[0]], anchors))
+    with named(folder):
+        tips, tip = _group_anchors(held)
+    t = times / times[-1]
     valve = Valve(
-        surface=LeafletSurface(**found["surface"], region_names=tuple(leaflets)),
-        annulus=found["annulus"],
-        free_edge=found["free_edge"],
-        papillary_tips=found["motion"]["papillary_tips"][0],
-        chordae=Chordae(**found["chordae"], family_names=names, toe_strain=TOE_STRAIN),
-        motion=Motion(**found["motion"]),
+        surface=LeafletSurface(
+            nodes[vertices], fibre=fibre, region_names=tuple(leaflets), **surface
+        ),
+        annulus=rims[0],
+        free_edge=rims[1],
+        papillary_tips=tips[0],
+        chordae=replace(chordae, tip=tip[chordae.tip]),
+        # The phase is that by which a closure is paced.
+        motion=Motion(t**3 * (10 - 15 * t + 6 * t**2), ring, tips),
     )
-    rest = {name: found[name] for name in ("times", "pressure", "pressure_share")}
-    return Recording(valve, np.array(frames), **rest)
+    return Recording(valve, points[:, vertices], times, abs(pressure), share)
 
 
-def deck_sets(path: Path) -> list[str]:
-    """Names of the element and node sets of a deck; called in the child."""
-    sets = Deck(path).sets
-    return [*sets["ELSET"], *sets["NSET"]]
+def _frame(file: Path, nodes: FloatArray) -> FloatArray:
+    """Recorded positions of the nodes of the deck."""
+    points = read_mesh(file).vertices
+    if points.shape != nodes.shape:
+        raise InputError(f"{file}: {len(points)} points, the deck has {len(nodes)} nodes")
+    return points
 
 
-def recorded(
-    path: Path,
-    leaflets: Sequence[str],
-    annulus: str,
-    free_edge: str,
-    count: int,
-) -> dict[str, Any]:
-    """What a deck says of a recording of so many frames; called in the child.
-
-    Returns
-    -------
-    dict
-        Parts of the valve, whose ``vertices`` are numbers of ``nodes``, and of its pressure. The
-        nodes ``held`` take the path ``held_path`` ``(f, h, 3)``.
-    """
-    deck = Deck(path)
-    nodes, times = np.array(deck.nodes), np.linspace(0.0, deck.period, count)
-    groups = _shells(deck, leaflets)
-    pressure, share = _pressure(deck, np.concatenate(groups), times)
-    surface, vertices, rims = _leaflets(deck, groups, annulus, free_edge, turned=pressure < 0)
-    at_rest = nodes[vertices]
-    extent = float(np.ptp(at_rest, axis=0).max())
-    if not EXTENT_MM[0] <= extent <= EXTENT_MM[1]:
-        raise InputError(
-            f"the leaflets span {extent:g}, expected {EXTENT_MM[0]:g} to {EXTENT_MM[1]:g}: lengths "
-            "must be mm"
-        )
-    fibre = surface_coordinates(at_rest, surface["triangles"], *rims).circumferential
+def _chordae(deck: Deck, nodes: FloatArray, leaflets: IntArray) -> tuple[IntArray, Chordae]:
+    """The anchors of the chordae, and these with the number of the anchor as that of their tip."""
     trusses = deck.trusses
     edges, section = np.array([deck.cells[k] for k in trusses]), deck.section[trusses]
     if not trusses.size or section.min() < 0:
-        raise InputError("no chordae: expected elements of type T3D2 or CONN3D2, each in a section")
-    anchors = np.intersect1d(np.setdiff1d(edges, vertices), deck.held())
+        raise InputError("no chordae: expected elements of type T3D2, each in a section")
+    anchors = np.intersect1d(np.setdiff1d(edges, leaflets), deck.held)
     if not anchors.size:
         raise InputError("no node of the chordae is held, so no papillary muscle is known")
-    held = np.concatenate([vertices[rims[0]], anchors])
-    held_path = nodes[held] + deck.moved(held, times)
-    tips, tip = _group_anchors(held_path[:, len(rims[0]) :])
-    anchor, insertion, length, stiffness_share = trace_cables(nodes, edges, anchors, vertices)
+    anchor, insertion, length, share = trace_cables(nodes, edges, anchors, leaflets)
     # The family of a cable is the section of the first truss in the deck at its insertion.
     ends, first = np.unique(edges, return_index=True)
     used, of_truss = np.unique(section, return_inverse=True)
     family = of_truss[first // 2][np.searchsorted(ends, insertion)]
-    materials = [deck.sections[k][1:] for k in used]
-    stiffness = [truss_stiffness(name, area, deck.laws.get(name, {})) for name, area in materials]
-    t = times / times[-1]
-    return {
-        "nodes": nodes,
-        "vertices": vertices,
-        "held": held,
-        "held_path": held_path,
-        "times": times,
-        "surface": {"vertices": at_rest, "fibre": fibre, **surface},
-        "annulus": rims[0],
-        "free_edge": rims[1],
-        "chordae": {
-            "tip": tip[np.searchsorted(anchors, anchor)],
-            "insertion": nodes[insertion],
-            "family": family,
-            "rest_length": length,
-            "axial_stiffness": np.array(stiffness)[family] * stiffness_share,
-        },
-        "family_names": [material.lower() for material, _ in materials],
-        "motion": {
-            "phase": t**3 * (10 - 15 * t + 6 * t**2),  # as a closure is paced
-            "annulus": held_path[:, : len(rims[0])],
-            "papillary_tips": tips,
-        },
-        "pressure": abs(pressure),
-        "pressure_share": share,
-    }
-
-
-def _shells(deck: Deck, leaflets: Sequence[str]) -> list[IntArray]:
-    """Numbers of the elements of each leaflet."""
-    groups = [lookup(deck.sets["ELSET"], name, "element set") for name in leaflets]
-    together = np.concatenate(groups)
-    if not all(map(len, groups)) or np.isin(together, deck.trusses).any():
-        raise InputError(f"element sets {some(leaflets)}: expected shells, one or more in each")
-    if len(np.unique(together)) != len(together):
-        raise InputError("leaflets share elements")
-    return groups
+    stiffness, materials = [], [deck.sections[k][1] for k in used]
+    for k, material in zip(used, materials, strict=True):
+        with named(f"trusses of {one_line(material, 40)}"):
+            if material not in deck.ogden:
+                raise InputError("expected *HYPERELASTIC, OGDEN")
+            stiffness.append(truss_stiffness(deck.sections[k][2], deck.ogden[material]))
+    return anchors, Chordae(
+        tip=np.searchsorted(anchors, anchor),
+        insertion=nodes[insertion],
+        family=family,
+        rest_length=length,
+        axial_stiffness=np.array(stiffness)[family] * share,
+        family_names=tuple(material.lower() for material in materials),
+        toe_strain=TOE_STRAIN,
+    )
 
 
 def _pressure(deck: Deck, leaflets: IntArray, times: FloatArray) -> tuple[float, FloatArray]:
@@ -299,16 +247,24 @@ def _leaflets(
         Vertices of annulus and free edge in loop order.
     """
     elements = np.concatenate(groups)
+    if not all(map(len, groups)) or np.isin(elements, deck.trusses).any():
+        raise InputError("element sets of leaflets: expected shells, one or more in each")
+    if len(np.unique(elements)) != len(elements):
+        raise InputError("leaflets share elements")
     region = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-    cells = np.array([[*deck.cells[k], -1][:4] for k in elements])
+    cells = np.array([deck.cells[k] for k in elements])
     vertices, corners = np.unique(cells, return_inverse=True)
     corners = corners.reshape(cells.shape)
-    if vertices[0] < 0:  # the fourth corner of a triangle
-        vertices, corners = vertices[1:], corners - 1
+    extent = float(np.ptp(np.array(deck.nodes)[vertices], axis=0).max())
+    if not EXTENT_MM[0] <= extent <= EXTENT_MM[1]:
+        raise InputError(
+            f"the leaflets span {extent:g}, expected {EXTENT_MM[0]:g} to {EXTENT_MM[1]:g}: lengths "
+            "must be mm"
+        )
     on_rim = np.zeros(len(vertices), dtype=np.int64)
     wanted = []
     for number, name in enumerate((annulus, free_edge), 1):
-        nodes = lookup(deck.sets["NSET"], name, "node set")
+        nodes = deck.members("NSET", name)
         if np.setdiff1d(nodes, vertices).size:
             raise InputError(f"node set {one_line(name, 60)!r}: a node is on no leaflet")
         wanted.append(np.searchsorted(vertices, nodes))
@@ -323,24 +279,22 @@ def _leaflets(
             f"sets {one_line(annulus, 60)} and {one_line(free_edge, 60)}: expected the two "
             f"boundary loops of the leaflets, which have {len(loops)}"
         )
-    sizes = np.array([*(size for _, _, size in deck.sections), np.nan])[deck.section[elements]]
-    if np.isnan(sizes).any():
+    sizes = np.array([*(size for _, _, size in deck.sections), 0.0])[deck.section[elements]]
+    if not sizes.all():
         raise InputError("shells without a section that states a thickness")
-    # Where leaflets meet, the thicker one counts; the last place is that of the corner -1.
-    thickness = np.zeros(len(vertices) + 1)
+    # Where leaflets meet, the thicker one counts.
+    thickness = np.zeros(len(vertices))
     np.maximum.at(thickness, corners.ravel(), np.repeat(sizes, 4))
-    surface = {"triangles": triangles, "region": region[element], "thickness": thickness[:-1]}
+    surface = {"triangles": triangles, "region": region[element], "thickness": thickness}
     return surface, vertices, rims
 
 
-def _split(vertices: FloatArray, corners: IntArray, on_rim: IntArray) -> tuple[IntArray, IntArray]:
+def _split(vertices: FloatArray, quads: IntArray, on_rim: IntArray) -> tuple[IntArray, IntArray]:
     """Two triangles per quad along the shorter diagonal, and the element of each triangle.
 
     A quad with two sides on one rim is cut from their common corner, so that no triangle has all
-    three corners on that rim. Triangles come last, as they are.
+    three corners on that rim.
     """
-    whole, rest = (np.flatnonzero(quad) for quad in (corners[:, 3] >= 0, corners[:, 3] < 0))
-    quads = corners[whole]
     first, second = (
         np.linalg.norm(vertices[quads[:, i + 2]] - vertices[quads[:, i]], axis=1) for i in (0, 1)
     )
@@ -349,8 +303,9 @@ def _split(vertices: FloatArray, corners: IntArray, on_rim: IntArray) -> tuple[I
     by_02 = np.where(ear.any(axis=1), ear[:, 0] | ear[:, 2], first <= second)[:, None]
     one = np.where(by_02, quads[:, [0, 1, 2]], quads[:, [0, 1, 3]])
     two = np.where(by_02, quads[:, [0, 2, 3]], quads[:, [1, 2, 3]])
-    triangles = np.vstack([one, two, corners[rest, :3]])
-    return triangles, np.concatenate([whole, whole, rest])
+    triangles = np.vstack([one, two])
+    proper = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return triangles[proper], np.tile(np.arange(len(quads)), 2)[proper]
 
 
 def _group_anchors(path: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -1,9 +1,8 @@
-"""A case, or what was estimated of it, as input of FEBio (file format 4)."""
+"""A case as input of FEBio (file format 4)."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,16 +13,13 @@ from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, require_numbers
 from mvest.exchange.febio.document import FebDocument
-from mvest.exchange.febio.mesh import LAWS, NAMES, febio_law, febio_mesh, opposite_faces
+from mvest.exchange.febio.mesh import LAWS, febio_law, febio_mesh, opposite_faces
 from mvest.mechanics.forces.cables import cable_force
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading, build_system
-from mvest.problem.registration import REGISTRATION
-from mvest.reading.documents import read_mapping
 from mvest.typing import FloatArray
 from mvest.valve.mesh.given import GivenValve, tetrahedral_leaflets
-from mvest.valve.mesh.solid_mesh import SolidMesh
 
 GENERIC = {
     "E_f": {"anterior": 6.23, "posterior": 2.09},
@@ -32,9 +28,7 @@ GENERIC = {
 """E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
 CONTACT_COLUMNS, CONTACT_ROWS = 144, 32
 """Points at which the valve is sampled for patches of chordae and the annulus."""
-MAX_RECORD = 1 << 28
-"""Bytes of a run's record that are read."""
-CONTACTS = ("potential", "sliding", "none")
+CONTACTS = ("potential", "none")
 SAMPLES, TOE_POINTS = 61, 41
 """Points of pressure and motion over the ramp, and of a chord's force over its toe."""
 STEPS = 30
@@ -49,13 +43,11 @@ class FebioOptions:
 
     Attributes
     ----------
-    case : str, optional
-        Folder of the case of a run; by default where the run says that it was.
     E_f, ratio : tuple of float, optional
-        MPa and E_f over E_perp of each leaflet, in the order of the case's regions; by default
-        what the run estimated, or the generic ones of an anterior and a posterior leaflet.
+        MPa and E_f over E_perp of each leaflet, in the order of the case's regions, as a run of
+        `own-valve` estimated them; by default those of a generic anterior and posterior leaflet.
     nu, reading : float, str
-        Poisson ratio and how it is read (A or C), where no run says so.
+        Poisson ratio and how it is read (A or C).
     pressure_mmHg : float, optional
         By default that of the closed frame.
     mesh : str
@@ -68,13 +60,12 @@ class FebioOptions:
         Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
         keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.exchange.febio.mesh`).
     contact : str
-        ``potential``: FEBio's contact potential between the atrial faces; ``sliding``: its
-        ``sliding-elastic`` between the leaflets; ``none``.
+        ``potential`` (FEBio's contact potential between the atrial faces) or ``none``.
     contact_gap_mm : float
         Between the atrial faces of two flat leaflets that press on each other with the reference
-        pressure of the contact (potential), or that touch (sliding).
+        pressure of the contact.
     contact_reach_mm : float
-        Gap at which contact begins (potential), or within which it is looked for (sliding).
+        Gap (mm) at which contact begins.
     dynamic : bool
         With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
         of its ramp.
@@ -83,7 +74,6 @@ class FebioOptions:
         rest where lighter ones do.
     """
 
-    case: str | None = None
     E_f: tuple[float, ...] | None = None
     ratio: tuple[float, ...] | None = None
     nu: float = 0.488
@@ -105,22 +95,19 @@ class FebioOptions:
         for name, known in choices.items():
             if (given := getattr(self, name)) not in known:
                 raise InputError(f"{name} {given!r}, expected one of {', '.join(known)}")
-        if not 0 <= self.contact_gap_mm < self.contact_reach_mm:
+        if not 0 < self.contact_gap_mm < self.contact_reach_mm:
             raise InputError(
                 f"contact_gap_mm = {self.contact_gap_mm}, contact_reach_mm = "
-                f"{self.contact_reach_mm}; expected 0 <= gap < reach"
+                f"{self.contact_reach_mm}; expected 0 < gap < reach"
             )
-        if self.contact == "potential" and self.contact_gap_mm == 0:
-            raise InputError("contact_gap_mm = 0; expected a gap, which a potential keeps")
         require_numbers(self, "FEBio", "density_factor")
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
-    """Write the closure of a case folder, or of the folder of a run of one, for FEBio.
+    """Write the closure of a case folder for FEBio.
 
     Run it with ``febio4 -i TARGET``. The positions of all nodes at every step are then in
-    ``TARGET_positions.csv``, and all else in FEBio's own plot file. What is not the same in FEBio
-    stands at the head of the file.
+    ``TARGET_positions.csv``, and all else in FEBio's own plot file.
 
     Raises
     ------
@@ -129,103 +116,27 @@ def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:
     """
     if target.suffix.lower() != ".feb":
         raise InputError(f"{target}: expected a name that ends in .feb")
-    values: dict[str, float] = {}
-    tissue: dict[str, TissueSettings] = {}
-    if (source / "result.json").is_file():
-        folder, values, tissue = read_run(source)
-        place = Path(options.case or folder)
-        if not place.is_dir():
-            raise InputError(f"{source}: its case is not at {str(place)!r}; give case=FOLDER")
-        source = place
-    case = read_case(source)
-    model = model_of_case(case, options, values, tissue)
+    model = model_of_case(read_case(source), options)
     document = valve_document(model, np.zeros(0), options)
-    head = f"{case.name}: closure under {model.settings.protocol.pressure_mmHg:g} mmHg."
-    return document.write(target, [head, *differences(model, options)])
+    pressure, law = model.settings.protocol.pressure_mmHg, LAWS[options.law]
+    head = f"Closure under {pressure:g} mmHg. The law here is {law} in place of one"
+    return document.write(target, f"{head} linear in the Biot strain; contact: {options.contact}.")
 
 
-def read_run(folder: Path) -> tuple[str, dict[str, float], dict[str, TissueSettings]]:
-    """What the run of a case left: the folder of the case, its parameters and its tissue.
-
-    Returns
-    -------
-    case : str
-    values : dict
-        Parameter -> estimate, or what it was held at.
-    tissue : dict
-        Region -> its tissue.
-
-    Raises
-    ------
-    InputError
-        If it is no such run.
-    """
-    record = folder / "result.json"
-    try:
-        found = read_mapping(record, MAX_RECORD)["findings"]["case"]
-        values = {
-            str(row["name"]): float(
-                row["prior_mean"] if row["estimate"] is None else row["estimate"]
-            )
-            for row in found["unknowns"]
-            if row["name"] not in REGISTRATION
-        }
-        tissue = {
-            str(name): TissueSettings(float(own["ratio"]), float(own["nu"]), str(own["reading"]))
-            for name, own in found["settings"]["mechanics"]["tissue"].items()
-        }
-        case = read_mapping(folder / "config.json", MAX_RECORD)["case"]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{record}: no run that estimated a case") from error
-    return str(case), values, tissue
-
-
-def model_of_case(
-    case: ValveCase,
-    options: FebioOptions,
-    values: Mapping[str, float],
-    tissue: Mapping[str, TissueSettings],
-) -> ClosureModel:
-    """The closure of a case with everything at its value: nothing in it is a parameter.
-
-    Parameters
-    ----------
-    case : ValveCase
-    options : FebioOptions
-        What they state goes before ``values`` and ``tissue``.
-    values : mapping
-        Parameter -> value.
-    tissue : mapping
-        Region -> its tissue.
-    """
+def model_of_case(case: ValveCase, options: FebioOptions) -> ClosureModel:
+    """The closure of a case with everything at its value: nothing in it is a parameter."""
     names = case.surface.region_names
-    unlike = [name for name in values if name.startswith(("stiffening.", "prestretch."))]
-    if unlike:
-        raise InputError(
-            f"{', '.join(unlike)}: the file has no law for such tissue; export a run without it"
-        )
-    # What has another part is an error of a frame's pressure.
-    kinds = ("E_f", "chord_stiffness", "chord_rest_length")
-    fixed = {name: values[name] for name in values if name.partition(".")[0] in kinds
-             or "." not in name}  # fmt: skip
-    estimated = {
-        "E_f": {name.removeprefix("E_f."): fixed[name] for name in fixed},
-        "ratio": {name: own.ratio for name, own in tissue.items()},
-    }
-    chosen: dict[str, dict[str, float]] = {}
+    chosen: dict[str, list[float]] = {}
     for what, given in (("E_f", options.E_f), ("ratio", options.ratio)):
-        if given is not None and len(given) != len(names):
+        values = given or [GENERIC[what][name] for name in names if name in GENERIC[what]]
+        if len(values) != len(names):
             raise InputError(
-                f"{what}: {len(given)} values, expected one of each of {', '.join(names)}"
+                f"{what}: {len(values)} values, expected one of each of {', '.join(names)}"
             )
-        stated = {} if given is None else dict(zip(names, given, strict=True))
-        chosen[what] = GENERIC[what] | estimated[what] | stated
-        if missing := [name for name in names if name not in chosen[what]]:
-            raise InputError(f"no {what} of leaflet {missing[0]!r}; give {what}=[...]")
-    fixed |= {f"E_f.{name}": chosen["E_f"][name] for name in names}
-    usual = TissueSettings(1.0, options.nu, options.reading)
+        chosen[what] = list(map(float, values))
     settings = {
-        name: replace(tissue.get(name, usual), ratio=chosen["ratio"][name]) for name in names
+        name: TissueSettings(ratio, options.nu, options.reading)
+        for name, ratio in zip(names, chosen["ratio"], strict=True)
     }
     pressure = options.pressure_mmHg
     if pressure is None:
@@ -239,6 +150,7 @@ def model_of_case(
         mesh = tetrahedral_leaflets(case.surface, options.edge_length)
     contact = valve.valve(CONTACT_COLUMNS, CONTACT_ROWS)
     mechanics = MechanicsSettings(settings, ClosureProtocol(pressure_mmHg=pressure))
+    fixed = {f"E_f.{name}": value for name, value in zip(names, chosen["E_f"], strict=True)}
     return ClosureModel(case.valve, contact, mesh, mechanics, (), fixed)
 
 
@@ -287,7 +199,12 @@ def valve_document(model: ClosureModel, m: FloatArray, options: FebioOptions) ->
     if options.dynamic and mechanics.damping.alpha:
         document.damp(mechanics.damping.alpha)
     if options.contact != "none" and mechanics.contact.active:
-        _add_contact(document, mesh, mechanics.contact.reference_pressure, options)
+        gap, reach = options.contact_gap_mm, options.contact_reach_mm
+        inner = 0.5 * (gap + reach)
+        # Each pair of elements of one surface is counted twice.
+        kc = 0.5 * mechanics.contact.reference_pressure
+        kc /= _pressure_of_sheets(gap, EXPONENT, inner, reach)
+        document.touch(opposite_faces(mesh), kc=kc, p=EXPONENT, R_in=inner, R_out=reach)
     pairs = np.stack([tip_nodes[cables.tip], end_nodes], axis=1)
     document.pull(pairs, _chord_forces(system, document.nodes[pairs]))
     document.support(hinge_nodes, hinge.points, hinge.stiffness)
@@ -308,26 +225,6 @@ def _chord_forces(system: System, ends: FloatArray) -> list[FloatArray]:
     return list(np.stack([elongation, force], axis=2))
 
 
-def _add_contact(
-    document: FebDocument, mesh: SolidMesh, pressure: float, options: FebioOptions
-) -> None:
-    faces, gap, reach = opposite_faces(mesh), options.contact_gap_mm, options.contact_reach_mm
-    if options.contact == "potential":
-        inner = 0.5 * (gap + reach)
-        # Each pair of elements of one surface is counted twice.
-        kc = 0.5 * pressure / _pressure_of_sheets(gap, EXPONENT, inner, reach)
-        own = {"kc": kc, "p": EXPONENT, "R_in": inner, "R_out": reach}
-        document.touch("contact potential", {"atrial": faces}, **own)
-    elif len(mesh.region_names) > 1:
-        # A face is of the region of the first element that has all its nodes.
-        hosts = [np.isin(mesh.elements, face).sum(axis=1).argmax() for face in faces]
-        region = mesh.region[hosts]
-        surfaces = {f"{n}_atrial": faces[region == k] for k, n in enumerate(mesh.region_names)}
-        own = {"laugon": 0, "penalty": 1.0, "auto_penalty": 1, "two_pass": 1,
-               "search_radius": reach, "offset": gap}  # fmt: skip
-        document.touch("sliding-elastic", surfaces, **own)
-
-
 def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> float:
     r"""Pressure (MPa) between two flat sheets that are ``gap`` mm apart, for kc = 1.
 
@@ -342,33 +239,3 @@ def _pressure_of_sheets(gap: float, p: float, inner: float, outer: float) -> flo
         return 2 * np.pi * gap * parabola
     power = (gap ** (1 - p) - inner ** (1 - p)) / (p - 1) - c2 * (inner - gap)
     return 2 * np.pi * gap * (power + parabola)
-
-
-def differences(model: ClosureModel, options: FebioOptions) -> list[str]:
-    """What is not the same in FEBio, a line each."""
-    mesh, mechanics = model.mesh, model.settings
-    contact, damping = mechanics.contact, mechanics.damping
-    law = f"linear in the Biot strain; in this file {LAWS[options.law]} with the same moduli"
-    gap, reach = options.contact_gap_mm, options.contact_reach_mm
-    theirs = {
-        "potential": f"a contact potential, atrial faces {gap:g} mm apart under this pressure and "
-        f"contact from {reach:g} mm on; nothing keeps leaflets from passing through each other",
-        "sliding": f"sliding-elastic between the atrial faces of different leaflets, {gap:g} mm "
-        "apart; none of a leaflet with itself",
-        "none": "none",
-    }[options.contact if contact.active else "none"]
-    time = "a static equilibrium at each time"
-    if options.dynamic:
-        time = f"the generalised alpha rule with {options.density_factor:g} times the density"
-    return [
-        f"element: here {mesh.element_type}; in this file "
-        f"{NAMES[febio_mesh(mesh).element_type][0]} without enhanced or assumed strains.",
-        f"law: here {law}.",
-        "direction of the fibre: here at every node; in this file at the centre of each element.",
-        f"contact: here a potential, midsurfaces {contact.reference_distance:g} thicknesses apart "
-        f"under {1e3 * contact.reference_pressure:g} kPa; in this file {theirs}.",
-        f"time: here implicit Euler with damping {damping.alpha:g} 1/s of mass and "
-        f"{damping.beta:g} s of stiffness; in this file {time} and damping by mass alone.",
-        "chordae: here cables with a toe of the fourth power; in this file springs whose force is "
-        f"linear between {TOE_POINTS} points of that toe.",
-    ]

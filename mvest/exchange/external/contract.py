@@ -1,16 +1,16 @@
-"""How a program is started and asked for a prediction, and how it answers.
+"""The command of an external program, and the files of its requests and responses.
 
 Text only: JSON and comma-separated numbers. One folder is one run::
 
-    request.json      what is asked: parameters with values and units, settings
+    request.json      the request: parameters with values and units, settings
     points.csv        x,y,z mm: reference positions of the points to be observed, where given
     response.json     status, and the reason if there is no prediction; written last
     observation.csv   x,y,z mm of every observed point
     jacobian.csv      optional: one row for each coordinate (x, y, z of the first point, then of the
                       next), one column for each parameter, headed by its name
-    stdout.txt, stderr.txt  what the program says
+    stdout.txt, stderr.txt  the program's output
 
-Reading is strict: what is not exactly that is refused with the file and the row.
+Reading is strict: any other content is refused with the file and the row.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -51,11 +52,11 @@ CODE = (".jl", ".m", ".py", ".r", ".sh")
 
 
 def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -> dict[str, Path]:
-    """What a command names of the files that are there: these decide what it answers.
+    """Files that a command names and that exist; they decide what it answers.
 
     They are the program itself, arguments that are files, what follows a ``=`` in an argument, and
-    beside a script all others of its kind, which it may import. What only the program knows of
-    (its libraries, files named within files, modules by ``python -m``) is not among them.
+    beside a script all others of its kind, which it may import. Files that only the program knows
+    of (its libraries, files named within files, modules by ``python -m``) are not among them.
 
     Parameters
     ----------
@@ -64,26 +65,19 @@ def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -
     """
     path = {**os.environ, **environment}.get("PATH")
     files = {}
-    for k, text in enumerate(arguments):
-        for name in (text, text.partition("=")[2]):
-            place = Path(name.replace("{here}", str(Path.cwd())))
-            if k == 0:
-                place = Path(shutil.which(place, path=path) or place).absolute()
-            with contextlib.suppress(OSError, ValueError):  # a text that is no name
-                # A run's own files are named by {request} and {folder}, or relative to its folder.
-                if place.is_absolute() and place.is_file():
-                    files[name] = place
+    for program in arguments[:1]:
+        if found := shutil.which(program.replace("{here}", str(Path.cwd())), path=path):
+            files[program] = Path(found).absolute()
+    for name in (name for text in arguments for name in (text, text.partition("=")[2])):
+        place = Path(name.replace("{here}", str(Path.cwd())))
+        with contextlib.suppress(OSError, ValueError):  # a text that is no name
+            # A run's own files are named by {request} and {folder}, or relative to its folder.
+            if place.is_absolute() and place.is_file():
+                files[name] = place
     for script in [file for file in files.values() if file.suffix.lower() in CODE]:
-        files |= {str(other): other for other in script.parent.glob(f"*{script.suffix}")}
-    return {name: file for name, file in files.items() if file.is_file()}
-
-
-def _of_users() -> dict[str, str]:
-    """The environment of a user's program, which may import what lies beside it.
-
-    `mvest.processes.side_by_side` forbids that to the processes of its own.
-    """
-    return {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+        beside = filter(Path.is_file, script.parent.glob(f"*{script.suffix}"))
+        files |= {str(other): other for other in beside}
+    return files
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,37 +119,51 @@ class Command:
         if shutil.which(program) is None:
             raise ConfigurationError(f"program {program!r} is not found or not executable")
 
-    def run(self, folder: Path, started: Callable[[Program], object] | None = None) -> str:
-        """Run the program in ``folder``; why it failed, empty where it did not.
+    def run(self, folder: Path) -> str:
+        """Run the program in ``folder``; returns why it failed, empty where it did not."""
+        with self.started(folder) as ended:
+            return ended()
 
-        All that it has started is stopped with it: at the time limit, when it ends, and when this
-        process does. Whoever gets it as it has ``started`` may end it before.
+    @contextlib.contextmanager
+    def started(self, folder: Path) -> Iterator[Callable[[], str]]:
+        """Start the program in ``folder``; yields the function that waits for its end.
+
+        That function returns why the program failed, empty where it did not. All that the program
+        has started is stopped with it: at the time limit, when it ends, on leaving, and when this
+        process ends.
         """
-        try:
-            with (
-                (folder / OUTPUT).open("wb") as output,
-                (folder / ERRORS).open("wb") as errors,
-                Program(
+        limit = time.monotonic() + self.time_limit_s
+        # A user's program may import what lies beside it; `mvest.processes.side_by_side` forbids
+        # that to the processes of its own.
+        inherited = {k: value for k, value in os.environ.items() if k != "PYTHONSAFEPATH"}
+        with contextlib.ExitStack() as stack:
+            try:
+                streams = [stack.enter_context((folder / k).open("wb")) for k in (OUTPUT, ERRORS)]
+                program = Program(
                     [self._filled(text, folder.resolve()) for text in self.arguments],
                     cwd=folder,
-                    env={**_of_users(), **self.environment},
+                    env={**inherited, **self.environment},
                     stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=errors,
-                ) as program,
-            ):
-                if started is not None:
-                    started(program)
-                code = program.process.wait(self.time_limit_s)
+                    stdout=streams[0],
+                    stderr=streams[1],
+                )
+                stack.enter_context(program)
+            except (OSError, ValueError) as error:  # the latter of arguments with a NUL
+                reason = f"the program could not be started: {message_of(error)}"
+                yield lambda: reason
+            else:
+                yield lambda: self._ended(program, limit, folder / ERRORS)
+
+    def _ended(self, program: Program, limit: float, errors: Path) -> str:
+        try:
+            code = program.process.wait(limit - time.monotonic())
+            reason = ending(code) if code else ""
         except subprocess.TimeoutExpired:
             reason = f"stopped at the time limit of {self.time_limit_s:g} s"
-        except (OSError, ValueError) as error:  # the latter of arguments with a NUL
-            return f"the program could not be started: {message_of(error)}"
-        else:
-            if not code:
-                return ""
-            reason = ending(code)
-        with (folder / ERRORS).open("rb") as stream:
+        program.close()
+        if not reason:
+            return ""
+        with errors.open("rb") as stream:
             stream.seek(max(0, stream.seek(0, os.SEEK_END) - 4096))
             said = stream.read().decode(errors="replace").splitlines()
         words = [line[:200] for line in map(one_line, said) if line]
@@ -177,7 +185,7 @@ class RequestParameter(BaseModel):
 
 
 class RunRequest(BaseModel):
-    """What one run is asked for, as it stands in ``request.json``.
+    """The request of one run, as ``request.json`` holds it.
 
     Attributes
     ----------
@@ -231,7 +239,7 @@ def write_request(folder: Path, request: RunRequest, points: FloatArray | None =
 
 
 def read_request(file: Path) -> RunRequest:
-    """What ``request.json`` asks for: the program's side.
+    """Read ``request.json``: the program's side.
 
     Raises
     ------
@@ -261,12 +269,12 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
 
 
 def read_answer(folder: Path, request: RunRequest) -> Prediction:
-    """What a run has answered in its folder; undifferentiated without ``jacobian.csv``.
+    """Read the answer of a run from its folder; undifferentiated without ``jacobian.csv``.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged, or its shape or its numbers are not what was asked for.
+        If a file is missing or damaged, or its shape or its numbers differ from the request's.
     """
     data = read_mapping(folder / RESPONSE, MAX_JSON_SIZE, RESPONSE)
     answer = validated(_Response, data, RESPONSE)

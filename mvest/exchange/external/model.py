@@ -5,16 +5,18 @@ Where the program gives no derivatives, they are differences of its predictions.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvest.cache import Entry
+from mvest.cache import Counts, Entry, get_or_make
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import Prediction
 from mvest.exchange.external.contract import (
@@ -26,7 +28,6 @@ from mvest.exchange.external.contract import (
     write_request,
 )
 from mvest.files import require_writable, sha256_of
-from mvest.processes import Program
 from mvest.provenance import config_hash
 from mvest.reading.documents import validated
 from mvest.typing import FloatArray
@@ -40,7 +41,7 @@ class Differences:
 
     Central ones cost two runs for each parameter and err by the square of the step, forward ones
     cost one and err by the step itself. A program that solves to a tolerance puts that tolerance,
-    divided by the step, on top: the step is not to be small beside it.
+    divided by the step, on top: choose the step much larger than the tolerance.
 
     Attributes
     ----------
@@ -60,18 +61,16 @@ class Differences:
     processes: int = 1
 
     def __post_init__(self) -> None:
-        if self.scheme not in SCHEMES:
-            raise ConfigurationError(
-                f"differences scheme = {self.scheme!r}, expected one of {', '.join(SCHEMES)}"
-            )
-        if not 0 < self.relative_step < 1:
-            raise ConfigurationError(
-                f"relative_step = {self.relative_step}, expected between 0 and 1"
-            )
-        if not (np.isfinite(self.floor) and self.floor >= 0):
-            raise ConfigurationError(f"floor = {self.floor}, expected at least 0")
-        if self.processes < 1:
-            raise ConfigurationError(f"processes = {self.processes}, expected at least 1")
+        for name, holds, expected in (
+            ("scheme", self.scheme in SCHEMES, f"one of {', '.join(SCHEMES)}"),
+            ("relative_step", 0 < self.relative_step < 1, "between 0 and 1"),
+            ("floor", 0 <= self.floor < np.inf, "at least 0"),
+            ("processes", self.processes >= 1, "at least 1"),
+        ):
+            if not holds:
+                raise ConfigurationError(
+                    f"differences {name} = {getattr(self, name)!r}, expected {expected}"
+                )
 
     def neighbours(self, m: FloatArray) -> FloatArray:
         """Parameters ``(k, p)`` at which the model is to be run: upper ones, then lower ones.
@@ -135,8 +134,8 @@ class ProcessModel:
 
     Attributes
     ----------
-    runs, reused : int
-        How often a program was started, and how often a finished run served instead.
+    counts : Counts
+        How often a program was started (misses), and a finished run served instead (hits).
     own_jacobian : bool
         Whether the last prediction's derivatives are the program's own.
 
@@ -157,8 +156,7 @@ class ProcessModel:
     differences: Differences | None = Differences()
     reuse: bool = True
     inputs: Sequence[Path] = ()
-    runs: int = field(default=0, init=False)
-    reused: int = field(default=0, init=False)
+    counts: Counts = field(default_factory=Counts, init=False)
     own_jacobian: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -181,7 +179,7 @@ class ProcessModel:
             raise InputError(f"{m.size} parameters, expected {', '.join(self.names)}")
         if not np.all(np.isfinite(m)):
             return Prediction.failed(f"the parameters {m} are not finite")
-        (first,) = self._all([m], jacobian=True)
+        (first,) = self._all(m[None], jacobian=True)
         self.own_jacobian = first.differentiated
         if not first.converged or first.differentiated:
             return first
@@ -216,67 +214,53 @@ class ProcessModel:
         return self.differences.jacobian(m, y, [answer.y for answer in answers])
 
     def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
-        units = [""] * len(self.names) if self.units is None else self.units
+        units = self.units or [""] * len(self.names)
         rows = zip(self.names, m.tolist(), units, strict=True)
-        asked = {
-            "parameters": [dict(zip(("name", "value", "unit"), row, strict=True)) for row in rows],
+        request = {
+            "parameters": [{"name": n, "value": value, "unit": unit} for n, value, unit in rows],
             "points": self.count,
             "jacobian": jacobian,
             "settings": self.settings or {},
         }
-        return validated(RunRequest, asked, "request")
+        return validated(RunRequest, request, "request")
 
-    def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Prediction]:
-        """Answers at all points, several at a time; none goes on where one is interrupted."""
+    def _all(self, points: FloatArray, jacobian: bool) -> list[Prediction]:
+        """Answers at all points, several at a time; leaving early ends the programs."""
         requests = [self._request(m, jacobian) for m in points]
-        programs: list[Program] = []
-        stopped = threading.Event()
+        folders = [self._place(request) for request in requests]
+        entries = [
+            Entry(folder / "answer", partial(read_answer, request=request), counts=self.counts)
+            for folder, request in zip(folders, requests, strict=True)
+        ]
+        if not self.reuse:
+            for entry in entries:
+                shutil.rmtree(entry.path, ignore_errors=True)
 
-        def started(program: Program) -> None:
-            programs.append(program)
-            if stopped.is_set():
-                program.end()
+        def answers(missing: list[int]) -> Iterator[Prediction]:
+            size = 1 if self.differences is None else self.differences.processes
+            for first in range(0, len(missing), size):
+                with ExitStack() as stack:
+                    ended = {
+                        k: self._started(folders[k], requests[k], stack)
+                        for k in missing[first : first + size]
+                    }
+                    yield from [self._read(folders[k], requests[k], ended[k]()) for k in ended]
 
-        processes = 1 if self.differences is None else self.differences.processes
-        with ThreadPoolExecutor(processes) as pool:
-            try:
-                runs = list(pool.map(lambda request: self._run(request, started), requests))
-            except BaseException:
-                stopped.set()
-                pool.shutdown(wait=False, cancel_futures=True)
-                for program in [*programs]:
-                    program.end()
-                raise
-        answers, how = zip(*runs, strict=True)
-        self.runs += how.count("run")
-        self.reused += how.count("reused")
-        return list(answers)
-
-    def _run(
-        self, request: RunRequest, started: Callable[[Program], object]
-    ) -> tuple[Prediction, str]:
-        """An answer, and whether it was ``run`` for, ``reused``, or neither."""
-        folder, how = self._place(request), ""
-        answer = Entry(folder / "answer", lambda path: read_answer(path, request))
         try:
-            with answer.alone():
-                found = answer.found() if self.reuse else None
-                if found is not None:
-                    return found, "reused"
-                for name in ANSWERS:
-                    # An old answer is not to be taken for that of a program that writes none.
-                    (folder / name).unlink(missing_ok=True)
-                write_request(folder, request, self.points)
-                reason, how = self.command.run(folder, started), "run"
-                reason = self._refused(folder, request, reason)
-                if not reason:
-                    return answer.keep(folder, _move_answer), how
+            return get_or_make(entries, answers, _move_answer, keep=attrgetter("converged"))
         except (OSError, InputError) as error:
-            reason = str(error)
-        return Prediction.failed(f"{folder.name}: {reason}"), how
+            return [Prediction.failed(str(error))] * len(points)
 
-    def _refused(self, folder: Path, request: RunRequest, reason: str) -> str:
-        """Why the answer of a run is not taken, whose program failed for a reason; or empty."""
+    def _started(self, folder: Path, request: RunRequest, stack: ExitStack) -> Callable[[], str]:
+        """Start a run; returns the function that waits for its end (`Command.started`)."""
+        for name in ANSWERS:
+            # An old answer is not to be taken for that of a program that writes none.
+            (folder / name).unlink(missing_ok=True)
+        write_request(folder, request, self.points)
+        return stack.enter_context(self.command.started(folder))
+
+    def _read(self, folder: Path, request: RunRequest, reason: str) -> Prediction:
+        """The answer of a run whose program failed for a reason, which may be empty."""
         try:
             answer = read_answer(folder, request)
         except InputError as error:
@@ -285,7 +269,7 @@ class ProcessModel:
             reason = "; ".join(filter(None, [reason, answer.reason]))
         if not reason and self._place(request) != folder:
             reason = "a file that it depends on was changed while it ran"
-        return reason
+        return Prediction.failed(f"{folder.name}: {reason}") if reason else answer
 
     def _place(self, request: RunRequest) -> Path:
         """The folder of a run, named by the SHA-256 of all that its answer depends on."""
@@ -303,7 +287,8 @@ class ProcessModel:
         return self.folder / f"run-{named[:24]}"
 
 
-def _move_answer(target: Path, folder: Path) -> None:
+def _move_answer(target: Path, _: Prediction) -> None:
+    """Move the files of an answer from the folder of their run to a folder there."""
     target.mkdir()
-    for file in filter(Path.is_file, (folder / name for name in ANSWERS)):
+    for file in filter(Path.is_file, (target.parent / name for name in ANSWERS)):
         file.rename(target / file.name)

@@ -1,4 +1,4 @@
-"""FEBio's input file, and the positions of nodes that FEBio logs beside it.
+"""FEBio's input file.
 
 Written by this project after the reader of FEBio 4.11 (``FEBioXML``): every tag and attribute is
 one that it asks for. Numbers are written so that they are read back the same.
@@ -7,18 +7,15 @@ one that it asks for. Numbers are written so that they are read back the same.
 from __future__ import annotations
 
 import itertools
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from mvest.errors import InputError
 from mvest.exchange.febio.mesh import NAMES, QUADRILATERAL, FebLaw
 from mvest.files import write_atomically
-from mvest.reading.text import read_text
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh
 
@@ -28,8 +25,6 @@ SECTIONS = ("Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", 
 """In the order in which FEBio can resolve names."""
 UPDATES = 10
 """By BFGS; FEBio's tangent of its neo-Hookean law is not exact."""
-MAX_LOG = 1 << 28
-"""Bytes of a log that are read."""
 
 
 class FebDocument:
@@ -191,29 +186,17 @@ class FebDocument:
             _fill(function, interpolate="linear", extend="extrapolate")
             _points(function, force)
 
-    def touch(self, kind: str, surfaces: Mapping[str, IntArray], **parameters: float) -> None:
-        """Contact of the first surface with each other one, or of a single one with itself.
+    def touch(self, faces: IntArray, **parameters: float) -> None:
+        """Contact potential of faces of the mesh with themselves; parameters are FEBio's."""
+        self._surface("atrial", faces)
+        pair = _add(self._at["Mesh"], "SurfacePair", name="atrial_pair")
+        _fill(pair, primary="atrial", secondary="atrial")
+        contact = _add(self._at["Contact"], "contact", type="contact potential")
+        contact.set("surface_pair", "atrial_pair")
+        _fill(contact, **parameters)
 
-        Parameters
-        ----------
-        kind : str
-            FEBio's name of it.
-        surfaces : mapping
-            Name -> faces ``(f, k)``.
-        **parameters : float
-            FEBio's.
-        """
-        for name, faces in surfaces.items():
-            self._surface(name, faces)
-        first, *others = surfaces
-        for other in others or [first]:
-            name = f"{first}_{other}"
-            pair = _add(self._at["Mesh"], "SurfacePair", name=name)
-            _fill(pair, primary=first, secondary=other)
-            _fill(_add(self._at["Contact"], "contact", type=kind, surface_pair=name), **parameters)
-
-    def write(self, path: Path, remarks: Sequence[str] = ()) -> Path:
-        """Write the file, with remarks at its head; FEBio logs positions into `positions_file`.
+    def write(self, path: Path, remark: str = "") -> Path:
+        """Write the file, with a remark at its head; FEBio logs positions into `positions_file`.
 
         Raises
         ------
@@ -223,7 +206,7 @@ class FebDocument:
         self._log.set("file", positions_file(path).name)
         root = Xml.Element("febio_spec", version="4.0")
         # Two hyphens end a comment.
-        root.extend(Xml.Comment(f" {remark.replace('--', '- -')} ") for remark in remarks)
+        root.append(Xml.Comment(f" {remark.replace('--', '- -')} "))
         root.extend(section for section in self._at.values() if len(section) or section.attrib)
         Xml.indent(root, " ")
         text = Xml.tostring(root, encoding="unicode")
@@ -268,35 +251,6 @@ class FebDocument:
 def positions_file(path: Path) -> Path:
     """Where FEBio logs the positions of the nodes of an input file."""
     return path.with_name(f"{path.stem}_positions.csv")
-
-
-def read_positions(path: Path, n: int) -> tuple[FloatArray, FloatArray]:
-    """Times ``(s,)`` and positions ``(s, n, 3)`` mm that FEBio has logged of n nodes.
-
-    A last step that was not written in full is left out.
-
-    Raises
-    ------
-    InputError
-        If the file is not such a log.
-    """
-    times: list[float] = []
-    frames: list[FloatArray] = []
-    parts = re.split(r"^\*Step.*$", read_text(path, MAX_LOG), flags=re.MULTILINE)
-    for part in parts[1:]:
-        found = re.search(r"^\*Time\s*=\s*(\S+)\s*$", part, re.MULTILINE)
-        rows = [line for line in part.splitlines() if line and not line.startswith("*")]
-        if found is None or len(rows) < n:
-            continue
-        try:
-            values = np.array([row.split(",") for row in rows], dtype=np.float64)
-            times.append(float(found.group(1)))
-        except ValueError as error:
-            raise InputError(f"{path}: rows that are no log of positions") from error
-        if values.shape != (n, 4) or not np.array_equal(values[:, 0], np.arange(1, n + 1)):
-            raise InputError(f"{path}: rows of shape {values.shape}, expected {n} nodes x,y,z")
-        frames.append(values[:, 1:])
-    return np.array(times), np.array(frames).reshape(len(frames), n, 3)
 
 
 def _sums(of: Embedding) -> list[list[tuple[int, float]]]:

@@ -21,7 +21,7 @@ from mvest.cases.tissue import LeafletBand
 from mvest.errors import GeometryError
 from mvest.exchange.surfaces import Surface, merged
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import band_grid
+from mvest.valve.anatomy.valve import BandGrid, band_grid
 from mvest.valve.geometry.moving_distance import closest_on_loop
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
@@ -146,31 +146,6 @@ def _largest_piece(vertices: FloatArray, triangles: IntArray) -> IntArray:
     return triangles[of_triangle == np.argmax(area)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Joining:
-    """How leaflets are joined and drawn.
-
-    Attributes
-    ----------
-    max_seam_mm : float
-        Distance up to which boundaries that leave a commissure side by side are joined.
-    edge_mm : float
-        Of the triangles, on average.
-    offset_mm : tuple of float
-        By which the anterior and the posterior leaflet are moved to the ventricle: half a thickness
-        turns an atrial surface into the midsurface.
-    seams : (2, 2) or None
-        Share of each leaflet's free edge (columns) that is joined at each commissure. That of
-        another frame where the valve is closed and the edges lie side by side all along; else it
-        is found.
-    """
-
-    max_seam_mm: float
-    edge_mm: float
-    offset_mm: tuple[float, float]
-    seams: FloatArray | None = None
-
-
 def commissures_on(contour: FloatArray, leaflets: Sequence[Leaflet]) -> FloatArray:
     """The two points ``(2, 3)`` of a contour where the nearer leaflet changes.
 
@@ -198,7 +173,11 @@ def joined(
     commissures: FloatArray,
     contour: FloatArray | None,
     down: FloatArray,
-    how: Joining,
+    *,
+    seam_mm: float,
+    edge_mm: float,
+    offset_mm: tuple[float, float],
+    seams: FloatArray | None = None,
 ) -> tuple[Surface, FloatArray, float]:
     """Join the anterior and the posterior leaflet to a band that faces the ventricle.
 
@@ -211,14 +190,23 @@ def joined(
         ``(k, 3)`` mm, closed curve along the annulus, or None.
     down
         ``(3,)`` from the annulus to the ventricle.
-    how
+    seam_mm
+        Distance up to which boundaries that leave a commissure side by side are joined.
+    edge_mm
+        Of the triangles, on average.
+    offset_mm
+        By which the anterior and the posterior leaflet are moved to the ventricle: half a thickness
+        turns an atrial surface into the midsurface.
+    seams : (2, 2) or None
+        Share of each leaflet's free edge (columns) that is joined at each commissure. That of
+        another frame where the valve is closed and the edges lie side by side all along; else it
+        is found.
 
     Returns
     -------
     surface : Surface
         Regions 0 (anterior) and 1 (posterior).
     seams : (2, 2)
-        As in `Joining`.
     gap : float
         mm, largest distance between the leaflets that a strip of triangles spans.
 
@@ -235,7 +223,7 @@ def joined(
                 f"the {name} leaflet ends {away:.1f} mm from a commissure, expected at most "
                 f"{MAX_GAP:g} mm: do leaflets and annulus have the same axes and phase?"
             )
-    place = (commissures, contour, down, how.max_seam_mm)
+    place = (commissures, contour, down, seam_mm)
     front, *arcs = _facing_ventricle(leaflets[0], leaflets[1], *place)
     back, *others = _facing_ventricle(leaflets[1], leaflets[0], *place)
     ends, begins = front.vertices[arcs[0][[-1, 0]]], back.vertices[others[0][[0, -1]]]
@@ -251,13 +239,13 @@ def joined(
     faces = [front.triangles, back.triangles + len(front.vertices)]
     region = [np.full(len(own), k) for k, own in enumerate(faces)]
     edges = (arcs[1], others[1] + len(front.vertices))
-    same, seams, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
+    same, shares, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
     # A free edge begins where the annulus of its leaflet ends, and there the other one ends.
     for k in range(2):
         a, b = edges[k], edges[1 - k][::-1]
-        given = None if how.seams is None else (how.seams[k, k], how.seams[k, 1 - k])
-        i, j = _seam(vertices[a], vertices[b], how.max_seam_mm, given)
-        seams[k, k], seams[k, 1 - k] = _shares(vertices[a])[i], _shares(vertices[b])[j]
+        given = None if seams is None else (seams[k, k], seams[k, 1 - k])
+        i, j = _seam(vertices[a], vertices[b], seam_mm, given)
+        shares[k, k], shares[k, 1 - k] = _shares(vertices[a])[i], _shares(vertices[b])[j]
         a, b = a[: i + 1], b[: j + 1]
         strip, sides, width = _strip(vertices, a, b)
         distance, nearest = _nearest(vertices[b], vertices[a])
@@ -274,7 +262,9 @@ def joined(
     band = LeafletBand.of(vertices[used], triangles, labels[proper], loops[0], loops[1], 0)
     around = 0.5 * sum(loop_length(vertices[used][loop]) for loop in loops)
     along = areas(vertices[used], triangles).sum() / around
-    return _drawn(band, around, along, how), seams, max(gaps)
+    columns = 4 * max(6, round(around / edge_mm / 4))
+    grid = band_grid(columns, 1 + max(4, round(along / edge_mm)))
+    return _drawn(band, grid, columns, offset_mm), shares, max(gaps)
 
 
 def _facing_ventricle(
@@ -381,18 +371,17 @@ def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
     return np.atleast_1d(distance), np.atleast_1d(number)
 
 
-def _drawn(band: LeafletBand, around: float, along: float, how: Joining) -> Surface:
-    """A band of a mean size (mm) on the lines of its coordinates, moved off its side."""
-    columns = 4 * max(6, round(around / how.edge_mm / 4))
-    grid = band_grid(columns, 1 + max(4, round(along / how.edge_mm)))
+def _drawn(
+    band: LeafletBand, grid: BandGrid, columns: int, offset_mm: tuple[float, float]
+) -> Surface:
+    """A band on the lines of its coordinates, moved off its side."""
     # The grid's angle runs against that of the chart; both have the anterior leaflet in 0 to 180.
     phi = np.mod(180.0 - grid.phi, 360.0)
     rows = band.position(phi, grid.s).reshape(-1, columns, 3)
-    rows = _smooth_rims(_flat_part(rows, np.where(phi[:columns] < 180, *how.offset_mm)))
+    rows = _smooth_rims(_flat_part(rows, np.where(phi[:columns] < 180, *offset_mm)))
     vertices: FloatArray = rows.reshape(-1, 3)
-    between = np.mod(grid.phi, 180.0) == 0
-    by = np.where(grid.phi < 180, *how.offset_mm)
-    by = np.where(between, sum(how.offset_mm) / 2, by)
+    by = np.where(grid.phi < 180, *offset_mm)
+    by = np.where(np.mod(grid.phi, 180.0) == 0, sum(offset_mm) / 2, by)
     vertices = vertices + by[:, None] * smooth_vertex_normals(vertices, grid.triangles)
     return Surface(vertices, grid.triangles, region=grid.region)
 

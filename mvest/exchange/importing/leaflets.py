@@ -21,7 +21,7 @@ from mvest.exchange.importing.leaflet_parts import (
     filled_frames,
     tissue_of,
 )
-from mvest.exchange.importing.written import FoundFrame, case_of_frames
+from mvest.exchange.importing.written import FoundFrame, case_of_frames, check_options
 from mvest.exchange.surfaces import SURFACE_SUFFIXES, read_surface
 from mvest.exchange.volumes import LabelMap, read_labels
 from mvest.reading.text import named
@@ -39,8 +39,8 @@ from mvest.valve.geometry.segmented import (
 )
 
 OBSERVER_MM, CORRELATED_MM = 1.0, 10.0
-"""Standard deviation of where a person or a network draws a leaflet's wall, and over which length
-along the leaflets such errors are alike; those which a case has without any statement."""
+"""Standard deviation of the wall that a person or a network draws, and the length along the
+leaflets over which such errors are correlated: the values of a case that states none."""
 CLOSED_AT = 0.35
 """s after the open frame, in a generic cardiac cycle."""
 
@@ -108,18 +108,10 @@ class LeafletsOptions:
     mirrored: bool = False
 
     def __post_init__(self) -> None:
-        six, pairs = ("tips", "tips_closed", "commissures"), ("muscles", "thickness_mm")
-        counts = dict.fromkeys(six, 6) | {"anterior_point": 3, "thickness_range_mm": 2}
-        for name, count in (counts | dict.fromkeys((*pairs, "seam_mm"), 2)).items():
-            given = getattr(self, name)
-            if given is not None and (
-                len(given) != count or (name != "muscles" and not np.isfinite(given).all())
-            ):
-                raise InputError(f"{name}={list(given)}, expected {count} of them")
+        counts = dict.fromkeys(("tips", "tips_closed", "commissures"), 6) | {"anterior_point": 3}
+        pairs = ("muscles", "thickness_mm", "thickness_range_mm", "seam_mm")
         limits = {"edge_mm": (0.3, 5), "blur_voxels": (0, 2), "smoothing_mm": (0, 10)}
-        for name, (low, high) in (limits | {"observer_mm": (0, 5)}).items():
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name}={getattr(self, name)}, expected {low} to {high}")
+        check_options(self, counts | dict.fromkeys(pairs, 2), limits | {"observer_mm": (0, 5)})
 
     def words(self, name: str) -> tuple[str, ...]:
         """Names, numbers or files of an option that is one or a list of them."""
@@ -205,7 +197,7 @@ def import_leaflets(source: Path, options: LeafletsOptions) -> ValveCase:
     correlated = CORRELATED_MM if options.observer_mm > 0 else 2 * BEND_MM
     derived.append(
         f"observation: {std:.3g} mm by voxels, smoothing and observer_mm={options.observer_mm:g}, "
-        f"alike over {correlated:g} mm"
+        f"correlated over {correlated:g} mm"
     )
     document = {
         "name": "segmented valve",  # names of files may be those of patients

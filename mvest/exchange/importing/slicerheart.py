@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -16,17 +16,10 @@ from mvest.cases.band import two_loops
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.tissue import FAMILIES, GENERIC_THICKNESS
 from mvest.errors import InputError
-from mvest.exchange.importing.joining import (
-    REGIONS,
-    Joining,
-    Leaflet,
-    commissures_on,
-    joined,
-)
+from mvest.exchange.importing.joining import REGIONS, Leaflet, commissures_on, joined
 from mvest.exchange.importing.slicerheart_folder import PHASES, SeenPhase, read_folder
-from mvest.exchange.importing.written import FoundFrame, case_of_frames
+from mvest.exchange.importing.written import FoundFrame, case_of_frames, check_options
 from mvest.exchange.markups import TO_LPS
-from mvest.exchange.surfaces import Surface
 from mvest.reading.text import named
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
@@ -38,7 +31,7 @@ TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}
 GENERIC_PRESSURE = 110.0
 """mmHg on the closed valve: ventricle less atrium from mid to end of systole."""
 CORRELATED_MM = 10.0
-"""Along the leaflets over which errors of a segmentation are alike."""
+"""Along the leaflets, over which errors of a segmentation are correlated."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
 MARGINAL_MM = 4.0
@@ -99,13 +92,8 @@ class SlicerheartOptions:
     mirrored: bool = False
 
     def __post_init__(self) -> None:
-        for name, count in (("tips", 6), ("tips_closed", 6), ("thickness_mm", 2)):
-            given = getattr(self, name)
-            if given is not None and (len(given) != count or not np.isfinite(given).all()):
-                raise InputError(f"{name}={list(given)}, expected {count} numbers")
-        for name, low, high in (("edge_mm", 0.3, 5.0), ("seam_mm", 0.0, 10.0)):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name}={getattr(self, name)}, expected {low:g} to {high:g} mm")
+        counts = {"tips": 6, "tips_closed": 6, "thickness_mm": 2}
+        check_options(self, counts, {"edge_mm": (0.3, 5.0), "seam_mm": (0.0, 10.0)})
 
     @property
     def thickness(self) -> tuple[float, ...]:
@@ -153,14 +141,15 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
 
 def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> list[_Seen]:
     """The phases that are taken, in the order of time."""
-    by_phase = {s.phase: s for s in read_folder(source, options.scene, options.only)}
+    by_phase = read_folder(source, options.scene, options.only)
     closed = options.closed
     if closed is not None and Path(closed).is_dir():
         others = read_folder(Path(closed), options.scene, options.only)
         if len(others) > 1:
             raise InputError(f"closed={closed}: {len(others)} phases, expected one")
-        closed = others[0].phase or "closed"
-        by_phase[closed] = others[0]
+        ((name, seen),) = others.items()
+        closed = name or "closed"
+        by_phase[closed] = seen
     listed = ", ".join(by_phase) or "one without a name"
     for name, phase in (("open", options.open), ("closed", closed)):
         if phase is not None and phase not in by_phase:
@@ -169,13 +158,12 @@ def _chosen(source: Path, options: SlicerheartOptions, derived: list[str]) -> li
     if opened is None:
         raise InputError(f"no open phase ({', '.join(OPEN)}) among {listed}; give open=PHASE")
     closed = closed or next((p for p in CLOSED if p in by_phase and p != opened), None)
-    further = [p for p in CLOSED if p in by_phase and p not in (opened, closed)]
-    left = [p for p in by_phase if p not in (opened, closed, *further)]
-    if left:
-        derived.append(f"phases {', '.join(left)} not taken")
-    roles = {opened: Role.REFERENCE} | dict.fromkeys(further, Role.HELD_OUT)
+    roles = {opened: Role.REFERENCE}
+    roles |= {p: Role.HELD_OUT for p in CLOSED if p in by_phase and p != opened}
     if closed is not None:
         roles[closed] = Role.CLOSED
+    if left := [p for p in by_phase if p not in roles]:
+        derived.append(f"phases {', '.join(left)} not taken")
     order = sorted(roles, key=lambda p: (roles[p] is not Role.REFERENCE, TIMES.get(p, 0.6)))
     return [(by_phase[p], roles[p]) for p in order]
 
@@ -186,7 +174,7 @@ def _frames(
     """The frames with their leaflets made one, in the order of time."""
     frames: list[FoundFrame] = []
     pressure = GENERIC_PRESSURE if options.pressure_mmHg is None else options.pressure_mmHg
-    offset = (0.0, 0.0)
+    offset, seams = (0.0, 0.0), None
     if options.thickness_mm is None:
         derived.append(
             "thickness: {} mm (anterior), {} mm (posterior) assumed; thickness_mm=[...] states it"
@@ -198,15 +186,28 @@ def _frames(
             "midsurface: the atrial surfaces moved to the ventricle by half the thickness "
             f"({offset[0]:g} and {offset[1]:g} mm); edges that curl by over 30 degrees left out"
         )
-    how = Joining(options.seam_mm, options.edge_mm, offset)
     for seen, role in chosen:
         label = seen.phase or ("closed" if role is Role.CLOSED else "open")
         notes = list(seen.notes)
         with named(label):
-            tips = _tips_of((seen, role), options, frames, notes)
-            surface, seams = _join(seen, tips, options, how, notes)
-        # The closed edges lie side by side all along, and are joined as far as the open ones.
-        how = replace(how, seams=seams)
+            tips = _tips_of(seen, role, options, frames, notes)
+            leaflets, commissures, down = _placed(seen, tips, options.mirrored, notes)
+            # The closed edges lie side by side all along: joined as far as the open ones.
+            surface, seams, gap = joined(
+                leaflets,
+                commissures,
+                seen.contour,
+                down,
+                seam_mm=options.seam_mm,
+                edge_mm=options.edge_mm,
+                offset_mm=offset,
+                seams=seams,
+            )
+        shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
+        notes.append(
+            f"leaflets joined at the commissures over {shares} % of their free edges, across at "
+            f"most {gap:.1f} mm"
+        )
         derived += [f"{label}: {note}" for note in notes]
         at, load = 0.0, 0.0
         if role is not Role.REFERENCE:
@@ -227,9 +228,13 @@ def _frames(
 
 
 def _tips_of(
-    phase: _Seen, options: SlicerheartOptions, before: Sequence[FoundFrame], notes: list[str]
+    seen: SeenPhase,
+    role: Role,
+    options: SlicerheartOptions,
+    before: Sequence[FoundFrame],
+    notes: list[str],
 ) -> FloatArray:
-    seen, role = phase
+    """Papillary tips ``(t, 3)`` mm of a phase, in the order of those of the first frame."""
     given = {Role.REFERENCE: options.tips, Role.CLOSED: options.tips_closed}.get(role)
     if given is not None:
         return np.array(given, dtype=np.float64).reshape(2, 3)
@@ -246,13 +251,10 @@ def _tips_of(
     return seen.tips
 
 
-def _join(
-    seen: SeenPhase,
-    tips: FloatArray,
-    options: SlicerheartOptions,
-    how: Joining,
-    notes: list[str],
-) -> tuple[Surface, FloatArray]:
+def _placed(
+    seen: SeenPhase, tips: FloatArray, mirrored: bool, notes: list[str]
+) -> tuple[list[Leaflet], FloatArray, FloatArray]:
+    """Leaflets, commissures ``(2, 3)`` mm, and the direction ``(3,)`` to the ventricle."""
     leaflets = []
     for name, (vertices, triangles) in zip(REGIONS, seen.leaflets, strict=True):
         with named(f"{name} leaflet"):
@@ -261,24 +263,18 @@ def _join(
             notes.append(f"{name} leaflet: {leaflets[-1].holes} holes closed")
     edges = np.concatenate([leaflet.curve for leaflet in leaflets])
     down = tips.mean(axis=0) - edges.mean(axis=0)
-    _check_axes(seen, edges, down, options.mirrored)
+    _check_axes(seen, edges, down, mirrored)
     if {"ALC", "PMC"} <= set(seen.landmarks):
-        points = np.stack([seen.landmarks["ALC"], seen.landmarks["PMC"]])
+        commissures = np.stack([seen.landmarks["ALC"], seen.landmarks["PMC"]])
     elif seen.contour is not None:
-        points = commissures_on(seen.contour, leaflets)
+        commissures = commissures_on(seen.contour, leaflets)
         notes.append("commissures where the leaflet nearer to the annulus changes")
     else:
         raise InputError(
             "neither the landmarks ALC and PMC nor the annulus; export ValveLandmarkPoints.csv or "
             "AnnulusContourPoints.csv"
         )
-    surface, seams, gap = joined(leaflets, points, seen.contour, down, how)
-    shares = ", ".join(f"{100 * share:.0f}" for share in seams.ravel())
-    notes.append(
-        f"leaflets joined at the commissures over {shares} % of their free edges, across at most "
-        f"{gap:.1f} mm"
-    )
-    return surface, seams
+    return leaflets, commissures, down
 
 
 def _check_axes(seen: SeenPhase, edges: FloatArray, down: FloatArray, mirrored: bool) -> None:

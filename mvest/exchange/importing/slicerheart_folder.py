@@ -127,8 +127,10 @@ class SeenPhase:
     notes: tuple[str, ...]
 
 
-def read_folder(folder: Path, scene: str | None = None, only: str | None = None) -> list[SeenPhase]:
-    """Every phase of the mitral valve of one scene; of ValveFemExport the one that it wrote.
+def read_folder(
+    folder: Path, scene: str | None = None, only: str | None = None
+) -> dict[str, SeenPhase]:
+    """Every phase of the mitral valve of one scene by its name; ValveFemExport gives it none.
 
     Parameters
     ----------
@@ -166,13 +168,16 @@ def read_folder(folder: Path, scene: str | None = None, only: str | None = None)
         raise InputError(
             f"{folder}: {len(scenes)} scenes ({', '.join(scenes[:5])}); give scene=NAME"
         )
-    of_phase = {phase: [f for f in chosen if f.phase == phase] for phase in PHASES}
-    left = [f for f in chosen if not f.phase]
-    seen = [_read_phase(folder, mine, models, lists) for mine in of_phase.values() if mine]
-    if not seen:
-        return [_read_phase(folder, left, models, lists)]
-    notes = seen[0].notes + (("surfaces that name no phase not used",) if left else ())
-    return [replace(seen[0], notes=notes), *seen[1:]]
+    named = [phase for phase in PHASES if any(f.phase == phase for f in chosen)]
+    seen = {
+        phase: _read_phase(folder, [f for f in chosen if f.phase == phase], models, lists)
+        for phase in named or [""]
+    }
+    if named and not all(f.phase for f in chosen):
+        first = seen[named[0]]
+        notes = (*first.notes, "surfaces that name no phase not used")
+        seen[named[0]] = replace(first, notes=notes)
+    return seen
 
 
 def _read_phase(

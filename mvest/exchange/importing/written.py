@@ -15,11 +15,33 @@ from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CASE_FILE
 from mvest.cases.tissue import CHORD_COLUMNS, FAMILIES
-from mvest.errors import MvestError
+from mvest.errors import InputError, MvestError
 from mvest.exchange.surfaces import Surface, write_surface
 from mvest.reading.text import write_columns
 from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
+
+
+def check_options(
+    options: object, counts: Mapping[str, int], limits: Mapping[str, tuple[float, float]]
+) -> None:
+    """Check the options that are lists of so many entries, or numbers within limits.
+
+    Raises
+    ------
+    InputError
+        One has another length, a number that is not finite, or is beyond its limits.
+    """
+    for name, count in counts.items():
+        given = getattr(options, name)
+        if given is None:
+            continue
+        finite = all(isinstance(one, str) or np.isfinite(one) for one in given)
+        if len(given) != count or not finite:
+            raise InputError(f"{name}={list(given)}, expected {count} of them")
+    for name, (low, high) in limits.items():
+        if not low <= (value := getattr(options, name)) <= high:
+            raise InputError(f"{name}={value}, expected {low:g} to {high:g}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,5 @@
 """A case as input of FEBio: what is in the file, read by Python's XML reader alone."""
 
-import json
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -47,12 +46,12 @@ def test_sections_are_those_of_version_4(root):
     assert [child.tag for child in root] == SECTIONS
 
 
-def test_what_is_not_the_same_stands_at_the_head(folder):
+def test_the_head_names_the_pressure_and_the_law(folder):
     text = (folder / "valve.feb").read_text()
-    head = text[: text.index("<Module")]
-    assert "121.3 mmHg" in head
-    for part in ("element", "law", "contact", "time", "chordae"):
-        assert f"<!-- {part}: here " in head
+    assert (
+        "Closure under 121.3 mmHg. The law here is neo-Hookean transiso"
+        in text[: text.index("<Module")]
+    )
 
 
 def test_numbers_of_nodes_and_elements_are_whole(root):
@@ -165,63 +164,20 @@ def test_contact_presses_as_its_reference_pressure(root):
     assert pressure == pytest.approx(0.016, rel=2e-3)
 
 
-def test_sliding_contact_and_inertia(folder, tmp_path):
-    options = FebioOptions(columns=12, rows=2, contact="sliding", density_factor=10)
+def test_inertia_without_contact(folder, tmp_path):
+    options = FebioOptions(columns=12, rows=2, contact="none", density_factor=10)
     root = Xml.parse(export_febio(folder, tmp_path / "a.feb", options)).getroot()
-    assert root.find("Contact/contact").get("type") == "sliding-elastic"
-    pair = root.find("Mesh/SurfacePair")
-    assert [child.text for child in pair] == ["anterior_atrial", "posterior_atrial"]
+    assert root.find("Contact") is None
     assert root.find("Control/analysis").text == "DYNAMIC"
     assert float(root.find("Material/material/density").text) == pytest.approx(1.04e-8)
     assert float(root.find("Loads/body_load/C").text) == pytest.approx(0.1)
-
-
-def write_run(place, case, unknowns):
-    """What the run of a case leaves of its estimates."""
-    tissue = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
-    mechanics = {"tissue": {"anterior": tissue, "posterior": tissue}}
-    record = {"findings": {"case": {"unknowns": unknowns, "settings": {"mechanics": mechanics}}}}
-    (place / "result.json").write_text(json.dumps(record))
-    (place / "config.json").write_text(json.dumps({"case": str(case)}))
-
-
-def test_a_run_is_exported_with_its_estimates(folder, tmp_path):
-    unknown = {"prior_mean": 1.0, "estimate": None}
-    unknowns = [
-        unknown | {"name": "E_f.anterior", "estimate": 8.5},
-        unknown | {"name": "E_f.posterior", "prior_mean": 2.5},
-        unknown | {"name": "pressure_scale", "estimate": 0.5},
-        unknown | {"name": "shift.x", "estimate": 3.0},
-    ]
-    write_run(tmp_path, folder, unknowns)
-    options = FebioOptions(columns=12, rows=2, contact="none", law="orthotropic")
-    root = Xml.parse(export_febio(tmp_path, tmp_path / "a.feb", options)).getroot()
-    anterior, posterior = root.findall("Material/material")
-    assert float(anterior.find("E1").text) == 8.5
-    assert float(anterior.find("E2").text) == pytest.approx(4.25)
-    assert float(anterior.find("v12").text) == 0.4
-    assert float(posterior.find("E1").text) == 2.5
-    load = root.find("Loads/surface_load/pressure")
-    points = rows(root.findall(f"LoadData/load_controller[@id='{load.get('lc')}']/points/pt"))
-    assert points[-1, 1] == pytest.approx(0.5 * 121.3 * 133.322e-6, rel=1e-4)
-
-
-@pytest.mark.parametrize("unlike", ["stiffening.anterior", "prestretch.posterior"])
-def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, unlike):
-    unknowns = [
-        {"name": name, "prior_mean": 1.0, "estimate": 2.0}
-        for name in ("E_f.anterior", "E_f.posterior", unlike)
-    ]
-    write_run(tmp_path, folder, unknowns)
-    with pytest.raises(InputError, match=f"{unlike}: the file has no law for such tissue"):
-        export_febio(tmp_path, tmp_path / "a.feb", FebioOptions(columns=12, rows=2))
 
 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
         ({"E_f": (3.0,)}, "expected one of each of anterior, posterior"),
-        ({"contact": "glue"}, "potential, sliding, none"),
+        ({"contact": "glue"}, "potential, none"),
         ({"contact_gap_mm": 2.0}, "gap < reach"),
         ({"law": "mooney"}, "orthotropic, neo-hookean"),
         ({"mesh": "voxels"}, "structured, tetwild"),
@@ -232,17 +188,19 @@ def test_what_is_wrong_is_said(folder, tmp_path, given, words):
         export_febio(folder, tmp_path / "a.feb", FebioOptions(columns=12, rows=2, **given))
 
 
-def test_records_of_something_else_are_refused(tmp_path):
-    (tmp_path / "result.json").write_text("{}")
-    with pytest.raises(InputError, match="no run that estimated a case"):
-        export_febio(tmp_path, tmp_path / "a.feb", FebioOptions())
-
-
-def test_from_the_console(folder, tmp_path, capsys):
+def test_estimates_are_given_by_name(folder, tmp_path, capsys):
     words = ["febio", str(folder), str(tmp_path / "a.feb"), "columns=12", "rows=2", "E_f=[7,2]"]
+    words += ["ratio=[2,1]", "nu=0.4", "law=orthotropic", "pressure_mmHg=60", "contact=none"]
     assert cli.main(["export", *words]) == 0
     assert "a.feb" in capsys.readouterr().out
     root = Xml.parse(tmp_path / "a.feb").getroot()
-    assert [float(e.text) for e in root.findall("Material/material/Ez")] == [7.0, 2.0]
+    materials = root.findall("Material/material")
+    assert [[float(m.find(t).text) for t in ("E1", "E2", "v12")] for m in materials] == [
+        [7.0, pytest.approx(3.5), 0.4],
+        [2.0, pytest.approx(2.0), 0.4],
+    ]
+    load = root.find("Loads/surface_load/pressure")
+    points = rows(root.findall(f"LoadData/load_controller[@id='{load.get('lc')}']/points/pt"))
+    assert points[-1, 1] == pytest.approx(60 * 133.322e-6, rel=1e-4)
     assert cli.main(["export", "febio", str(folder), str(tmp_path / "a.txt")]) == 2
     assert ".feb" in capsys.readouterr().err

@@ -30,7 +30,9 @@ def test_its_own_derivatives_are_taken_as_they_are(tmp_path):
     assert prediction.converged, prediction.reason
     np.testing.assert_allclose(prediction.y, y, rtol=1e-15)
     np.testing.assert_allclose(prediction.jacobian, jacobian, rtol=1e-15)
-    assert (program.runs, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
+    assert (program.counts.misses, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
+    missing = model(tmp_path, differences=None)(M)
+    assert "jacobian.csv is missing" in missing.reason
 
 
 @pytest.mark.parametrize("processes", [1, 3])
@@ -48,8 +50,8 @@ def test_differences_are_of_their_order(tmp_path, processes):
         assert np.all(found[jacobian == 0] == 0)
         assert not program.own_jacobian
     # 1 + 4 runs, then upper neighbours of the forward scheme are finished already.
-    assert program.runs + program.reused == 3
-    assert (program.runs, ran(tmp_path)) == (0, 5)
+    assert program.counts.misses + program.counts.hits == 3
+    assert (program.counts.misses, ran(tmp_path)) == (0, 5)
 
 
 def test_programs_side_by_side_find_what_lies_beside_them(tmp_path, monkeypatch):
@@ -84,10 +86,6 @@ def test_an_interrupted_study_stops_its_programs(tmp_path):
             os.kill(int(path.name), 0)
 
 
-def test_without_derivatives_and_differences_there_is_no_prediction(tmp_path):
-    assert "jacobian.csv is missing" in model(tmp_path, differences=None)(M).reason
-
-
 def test_a_filter_finds_the_truth_through_files(tmp_path):
     y, _ = springs(*M)
     program = model(tmp_path, "exact", differences=None)
@@ -98,7 +96,7 @@ def test_a_filter_finds_the_truth_through_files(tmp_path):
     # In log k2 the prior's variance is 9 and its distance 0.9; noise of 1e-4 mm on 2/k2 = 0.8 mm
     # leaves a variance of 2 * 1e-8 / 0.8^2: the prior draws by 3e-9.
     np.testing.assert_allclose(found.mean, M, rtol=1e-7)
-    assert found.forward_solves == program.runs == ran(tmp_path)
+    assert found.forward_solves == program.counts.misses == ran(tmp_path)
 
 
 def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_path):
@@ -106,7 +104,7 @@ def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_p
     assert ran(tmp_path) == 5
     again = model(tmp_path)
     again(M)
-    assert (again.runs, again.reused, ran(tmp_path)) == (0, 5, 5)
+    assert (again.counts.misses, again.counts.hits, ran(tmp_path)) == (0, 5, 5)
     # A value in its last digit, a setting, a variable, an argument: other runs.
     model(tmp_path, differences=Differences("forward"))(np.nextafter(M, 9))
     assert ran(tmp_path) == 8
@@ -115,18 +113,15 @@ def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_p
     assert ran(tmp_path) == 13
     fresh = model(tmp_path, reuse=False)
     fresh(M)
-    assert (fresh.runs, fresh.reused) == (5, 0)
+    assert (fresh.counts.misses, fresh.counts.hits) == (5, 0)
 
 
 def test_a_changed_input_makes_finished_runs_worthless(tmp_path):
     mesh = tmp_path / "mesh.txt"
-    mesh.write_text("coarse")
-    model(tmp_path, inputs=[mesh])(M)
-    model(tmp_path, inputs=[mesh])(M)
-    assert ran(tmp_path) == 5
-    mesh.write_text("finer!")
-    model(tmp_path, inputs=[mesh])(M)
-    assert ran(tmp_path) == 10
+    for content, runs in (("coarse", 5), ("coarse", 5), ("finer!", 10)):
+        mesh.write_text(content)
+        model(tmp_path, inputs=[mesh])(M)
+        assert ran(tmp_path) == runs
     with pytest.raises(InputError, match="cannot read"):
         model(tmp_path, inputs=[tmp_path / "absent"])
 
@@ -138,7 +133,7 @@ def test_a_finished_run_that_was_damaged_is_done_again(tmp_path):
     table.write_text(table.read_text().replace("2.5", "2.6"))
     again = model(tmp_path, "exact")
     np.testing.assert_array_equal(again(M).y, first.y)
-    assert (again.runs, again.reused) == (1, 0)
+    assert (again.counts.misses, again.counts.hits) == (1, 0)
 
 
 def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
@@ -152,7 +147,7 @@ def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
     silent = model(tmp_path, "exact", source=off + SPRINGS)
     for _ in range(2):
         assert silent(M).reason == f"{folder.name}: response.json is missing"
-    assert (silent.runs, silent.reused) == (2, 0)
+    assert (silent.counts.misses, silent.counts.hits) == (2, 0)
 
 
 @pytest.mark.parametrize(
@@ -171,22 +166,19 @@ def test_whatever_goes_wrong_is_the_reason_of_a_failed_prediction(tmp_path, body
     assert not prediction.converged
     assert message in prediction.reason
     assert prediction.reason.startswith("run-")
-    assert (program.runs, ran(tmp_path)) == (1, 1)
+    assert (program.counts.misses, ran(tmp_path)) == (1, 1)
 
 
 def test_what_the_program_says_of_its_failure_is_told(tmp_path):
     program = model(tmp_path)
     assert program(np.array([-1.0, 2.0])).reason.endswith("k1 = -1.0: expected > 0")
+    prior = Gaussian(np.array([-1.0, 2.0]), np.eye(2))
+    found = IteratedFilter()(program, prior, springs(*M)[0], 1e-4)
+    assert found.reason is Reason.MODEL_FAILED
+    assert "expected > 0" in found.detail
     # The model stands; the lower neighbour does not.
     near_zero = model(tmp_path, differences=Differences(floor=1.0))(np.array([1e-4, 2.0]))
     assert near_zero.reason.startswith("run for a difference at k1 = -0.0009, k2 = 2: run-")
-
-
-def test_a_filter_ends_with_the_reason_of_a_program_that_fails_at_the_start(tmp_path):
-    prior = Gaussian(np.array([-1.0, 2.0]), np.eye(2))
-    found = IteratedFilter()(model(tmp_path), prior, springs(*M)[0], 1e-4)
-    assert found.reason is Reason.MODEL_FAILED
-    assert "expected > 0" in found.detail
 
 
 def test_parameters_without_a_size_need_a_floor(tmp_path):
@@ -232,7 +224,7 @@ def test_a_run_without_a_place_is_a_reason_and_no_run(tmp_path):
     (tmp_path / "runs").rmdir()
     (tmp_path / "runs").touch()
     assert "Not a directory" in program(M).reason
-    assert (program.runs, program.reused) == (0, 0)
+    assert (program.counts.misses, program.counts.hits) == (0, 0)
 
 
 def counted(monkeypatch, tmp_path, *arguments: str) -> int:
@@ -241,7 +233,7 @@ def counted(monkeypatch, tmp_path, *arguments: str) -> int:
     command = Command((*arguments, "{request}", "{folder}"))
     program = ProcessModel(command, tmp_path / "runs", NAMES, 2, units=("N/mm", "N/mm"))
     assert program(M).converged
-    return program.runs
+    return program.counts.misses
 
 
 def test_after_a_change_of_a_file_in_the_command_nothing_finished_serves(tmp_path, monkeypatch):
@@ -278,4 +270,4 @@ def test_an_answer_is_not_kept_whose_program_was_changed_while_it_ran(tmp_path):
     assert "a file that it depends on was changed while it ran" in prediction.reason
     again = model(tmp_path, "exact", differences=None)
     assert again(M).converged
-    assert again.runs == 1
+    assert again.counts.misses == 1

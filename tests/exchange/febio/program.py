@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import ConfigurationError
-from mvest.exchange.febio.document import FebDocument, positions_file, read_positions
+from mvest.exchange.febio.document import FebDocument, positions_file
 from mvest.exchange.febio.mesh import febio_mesh
 from mvest.processes import run
 from mvest.typing import FloatArray
@@ -144,23 +144,31 @@ def run_febio(
     if logged.is_file():
         times, frames = read_positions(logged, len(rest))
     frames = np.concatenate([rest[None], frames])
+    counts = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", said)
+    version = re.search(r"version\s+(\d[\d.]*)", said)
     return FebRun(
         converged,
         reason,
         np.concatenate([[0.0], times]),
         restored(mesh, frames),
         len(times),
-        _iterations(said),
+        int(counts[-1]) if counts else 0,
         seconds,
-        _version(said),
+        version.group(1) if version else "",
     )
 
 
-def _iterations(said: str) -> int:
-    counts = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", said)
-    return int(counts[-1]) if counts else 0
+def read_positions(path: Path, n: int) -> tuple[FloatArray, FloatArray]:
+    """Times ``(s,)`` and positions ``(s, n, 3)`` mm that FEBio has logged of n nodes.
 
-
-def _version(said: str) -> str:
-    found = re.search(r"version\s+(\d[\d.]*)", said)
-    return found.group(1) if found else ""
+    A last step that was not written in full is left out.
+    """
+    times, frames = [], []
+    for part in re.split(r"^\*Step.*$", path.read_text(), flags=re.MULTILINE)[1:]:
+        rows = [line.split(",") for line in part.splitlines() if line and line[0] != "*"]
+        if len(rows) == n:
+            values = np.array(rows, dtype=np.float64)
+            assert np.array_equal(values[:, 0], np.arange(1, n + 1))
+            times.append(float(re.findall(r"^\*Time\s*=\s*(\S+)", part, re.MULTILINE)[0]))
+            frames.append(values[:, 1:])
+    return np.array(times), np.array(frames).reshape(len(frames), n, 3)

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 
-vtk = pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
-from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy  # noqa: E402
+pyvista = pytest.importorskip("pyvista", reason="needs PyVista, which comes with the extra viz")
+import vtk  # noqa: E402
 
 ANGLE = 0.4
 POSE = np.array(
@@ -32,16 +32,7 @@ def in_lps(points):
 
 
 def polydata(points, triangles):
-    result = vtk.vtkPolyData()
-    places = vtk.vtkPoints()
-    places.SetDataTypeToDouble()
-    places.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=1))
-    result.SetPoints(places)
-    cells = vtk.vtkCellArray()
-    packed = np.column_stack([np.full(len(triangles), 3), triangles]).ravel()
-    cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(packed.astype(np.int64), deep=1))
-    result.SetPolys(cells)
-    return result
+    return pyvista.PolyData.from_regular_faces(points, triangles)
 
 
 def run(source, *steps):
@@ -54,19 +45,14 @@ def run(source, *steps):
 
 def atrial_leaflet(frame, label, thickness):
     """One leaflet of a frame: its atrial side, with triangles of its own."""
-    normals = vtk.vtkPolyDataNormals()
-    normals.SplittingOff()
-    normals.ConsistencyOff()
-    whole = run(polydata(frame.vertices, frame.triangles), normals)
-    outward = vtk_to_numpy(whole.GetPointData().GetNormals())
-    points = frame.vertices - 0.5 * thickness * outward
-    finer = vtk.vtkLinearSubdivisionFilter()
-    finer.SetNumberOfSubdivisions(1)
-    fewer = vtk.vtkDecimatePro()
-    fewer.SetTargetReduction(0.4)
-    fewer.PreserveTopologyOn()
-    leaflet = polydata(in_lps(points), frame.triangles[frame.region == label])
-    return run(leaflet, vtk.vtkCleanPolyData(), finer, fewer)
+    whole = polydata(frame.vertices, frame.triangles).compute_normals(
+        cell_normals=False, split_vertices=False, consistent_normals=False
+    )
+    points = frame.vertices - 0.5 * thickness * whole.point_data["Normals"]
+    leaflet = polydata(in_lps(points), frame.triangles[frame.region == label]).clean()
+    finer = leaflet.subdivide(1, subfilter="linear").decimate_pro(0.4, preserve_topology=True)
+    finer.clear_data()
+    return finer
 
 
 def write_model(path, model, *, binary=True, version=42, space="LPS"):
@@ -80,20 +66,10 @@ def write_model(path, model, *, binary=True, version=42, space="LPS"):
     assert writer.Write()
 
 
-def landmarks_of(case, frame):
-    """SlicerHeart's labels by position ``(3,)`` LPS; the antero-lateral side is at -x here."""
-    ring = frame.annulus
-    return {
-        label: in_lps(ring[np.argmax(ring[:, :2] @ towards)])
-        for label, towards in {
-            "A": (0, 1),
-            "P": (0, -1),
-            "AL": (-1, 0),
-            "PM": (1, 0),
-            "ALC": (-1, 0.25),
-            "PMC": (1, 0.25),
-        }.items()
-    }
+LANDMARKS = {
+    "A": (0, 1), "P": (0, -1), "AL": (-1, 0), "PM": (1, 0), "ALC": (-1, 0.25), "PMC": (1, 0.25)
+}  # fmt: skip
+"""Directions from the middle of the annulus; the antero-lateral side is at -x here."""
 
 
 def write_fcsv(path, points, axes="LPS"):
@@ -129,12 +105,8 @@ def segmented_leaflets(frame, voxel_mm):
         reach = cKDTree(dense).query(centres, distance_upper_bound=3)[0]
         depth.append(reach / (thickness / 2))
     labels = np.where(np.min(depth, axis=0) <= 1, 1 + np.argmin(depth, axis=0), 0)
-    image = vtk.vtkImageData()
-    image.SetDimensions(*map(int, size))
-    image.SetSpacing(voxel_mm, voxel_mm, voxel_mm)
-    image.SetOrigin(*low)
-    flat = np.ascontiguousarray(labels.reshape(size).ravel(order="F"), dtype=np.int16)
-    image.GetPointData().SetScalars(numpy_to_vtk(flat, deep=1))
+    image = pyvista.ImageData(dimensions=size, spacing=[voxel_mm] * 3, origin=low)
+    image["labels"] = labels.reshape(size).ravel(order="F").astype(np.int16)
     above = in_lps(frame.annulus).mean(axis=0)
     above = above + 30 * (above - in_lps(frame.papillary_tips).mean(axis=0)) / 25
     return [atrial_side(image, label, frame, points, above) for label in range(2)]
@@ -150,13 +122,11 @@ def atrial_side(image, label, frame, points, above):
     smooth.NormalizeCoordinatesOn()
     largest = vtk.vtkPolyDataConnectivityFilter()
     largest.SetExtractionModeToLargestRegion()
-    edges = vtk.vtkFeatureEdges()
-    edges.NonManifoldEdgesOff()
-    edges.FeatureEdgesOff()
-    rim = run(polydata(points, frame.triangles[frame.region == label]), edges, vtk.vtkStripper())
-    curve = vtk_to_numpy(rim.GetPoints().GetData())[
-        vtk_to_numpy(rim.GetLines().GetConnectivityArray())
-    ]
+    rim = polydata(points, frame.triangles[frame.region == label]).extract_feature_edges(
+        boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
+    )
+    rim = rim.strip()
+    curve = rim.points[rim.lines[1:]]
     length = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(curve, axis=0), axis=1)])
     at = np.linspace(0, length[-1], 30, endpoint=False)
     marks = vtk.vtkPoints()
@@ -172,14 +142,8 @@ def atrial_side(image, label, frame, points, above):
     clip.InsideOutOn()
     clip.GenerateClippedOutputOn()
     run(image, faces, smooth, largest, loop, clip)
-    sides = [
-        run(side, vtk.vtkCleanPolyData()) for side in (clip.GetOutput(), clip.GetClippedOutput())
-    ]
-    near = [
-        np.linalg.norm(vtk_to_numpy(side.GetPoints().GetData()) - above, axis=1).mean()
-        for side in sides
-    ]
-    return sides[int(np.argmin(near))]
+    sides = [pyvista.wrap(side).clean() for side in (clip.GetOutput(), clip.GetClippedOutput())]
+    return min(sides, key=lambda side: np.linalg.norm(side.points - above, axis=1).mean())
 
 
 def batch_export(folder: Path, case, scene="P001", *, voxel_mm=None, **how) -> Path:
@@ -204,7 +168,8 @@ def batch_export(folder: Path, case, scene="P001", *, voxel_mm=None, **how) -> P
             contour.append(
                 [scene, phase, index, "mitral", f"{-x:.2f}", f"{-y:.2f}", f"{z:.2f}", ""]
             )
-        for label, (x, y, z) in landmarks_of(case, frame).items():
+        for label, towards in LANDMARKS.items():
+            x, y, z = in_lps(frame.annulus[np.argmax(frame.annulus[:, :2] @ towards)])
             marks.append(
                 [scene, phase, "mitral", index, label, f"{-x:.2f}", f"{-y:.2f}", f"{z:.2f}"]
             )
@@ -235,12 +200,8 @@ def fem_export(folder: Path, frame, chordae=None) -> Path:
         file = folder / f"mitral_{name}_leaflet_SurfaceModel-fit.vtk"
         write_model(file, model, binary=False)
     ring = in_lps(np.vstack([frame.annulus, frame.annulus[:1]]))
-    tube = vtk.vtkTubeFilter()
-    tube.SetRadius(0.5)
-    tube.SetNumberOfSides(20)
-    tube.CappingOff()
-    path = run(polyline(ring), tube, vtk.vtkTriangleFilter())
-    write_model(folder / "AnnulusContourModel.vtk", path, binary=False)
+    tube = polyline(ring).tube(radius=0.5, n_sides=20, capping=False).triangulate()
+    write_model(folder / "AnnulusContourModel.vtk", tube, binary=False)
     for tip, bundle in enumerate(("primary", "secondary") if chordae else ()):
         lines, start = [], in_lps(frame.papillary_tips[tip])
         for k, end in enumerate(in_lps(chordae.insertion[chordae.tip == tip])):
@@ -252,21 +213,10 @@ def fem_export(folder: Path, frame, chordae=None) -> Path:
 
 def write_lines(file: Path, lines) -> None:
     """A model of lines, each with points of its own."""
-    whole = vtk.vtkAppendPolyData()
-    for line in lines:
-        whole.AddInputData(polyline(np.array(line)))
-    whole.Update()
-    write_model(file, whole.GetOutput(), binary=False)
+    first, *others = map(polyline, lines)
+    write_model(file, first.append_polydata(*others), binary=False)
 
 
 def polyline(points):
-    places, cells = vtk.vtkPoints(), vtk.vtkCellArray()
-    places.SetDataTypeToDouble()
-    places.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=1))
-    cells.InsertNextCell(len(points))
-    for k in range(len(points)):
-        cells.InsertCellPoint(k)
-    result = vtk.vtkPolyData()
-    result.SetPoints(places)
-    result.SetLines(cells)
-    return result
+    points = np.array(points)
+    return pyvista.PolyData(points, lines=[len(points), *range(len(points))])

@@ -60,6 +60,7 @@ def test_the_valve_that_was_thickened_comes_back(folder):
         case.surface.vertices - SHIFT, valve.surface.vertices, valve.surface.triangles
     )
     assert np.quantile(near.distance, 0.95) < 0.2
+    assert near.distance.mean() < 0.05
     thickness = near.interpolate(valve.surface.thickness, valve.surface.triangles)
     assert np.median(np.abs(case.surface.thickness - thickness)) < 0.1
     tips = case.frames[0].papillary_tips - SHIFT

@@ -1,80 +1,31 @@
-"""Binary glTF 2.0 written from its specification, for tests."""
+"""Binary glTF 2.0 by trimesh, and with another description of its scene."""
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-COMPONENT = {"<u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
-
-
-class Glb:
-    """A file in the making."""
-
-    def __init__(self):
-        self.binary = b""
-        self.document = {
-            "asset": {"version": "2.0"},
-            "scene": 0,
-            "scenes": [{"nodes": []}],
-            "nodes": [],
-            "meshes": [],
-            "accessors": [],
-            "bufferViews": [],
-            "buffers": [{}],
-        }
-
-    def array(self, values, dtype, stride=None):
-        """The number of an accessor."""
-        rows = np.ascontiguousarray(values, dtype=dtype)
-        size = rows[0].nbytes
-        data = b"".join(row.tobytes().ljust(stride or size, b"\xff") for row in rows)
-        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
-        if stride:
-            view["byteStride"] = stride
-        self.binary += data.ljust(-(-len(data) // 4) * 4, b"\0")
-        self.document["bufferViews"].append(view)
-        self.document["accessors"].append(
-            {
-                "bufferView": len(self.document["bufferViews"]) - 1,
-                "componentType": COMPONENT[dtype],
-                "count": len(rows),
-                "type": "SCALAR" if rows.ndim == 1 else "VEC3",
-            }
-        )
-        return len(self.document["accessors"]) - 1
-
-    def mesh(self, points, triangles=None, dtype="<u4", stride=None):
-        """The number of a mesh."""
-        primitive = {"attributes": {"POSITION": self.array(points, "<f4", stride)}}
-        if triangles is not None:
-            primitive["indices"] = self.array(np.ravel(triangles), dtype)
-        self.document["meshes"].append({"primitives": [primitive]})
-        return len(self.document["meshes"]) - 1
-
-    def node(self, name=None, top=True, **content):
-        """The number of a node, in the scene unless it is not at its top."""
-        self.document["nodes"].append(({"name": name} if name else {}) | content)
-        number = len(self.document["nodes"]) - 1
-        if top:
-            self.document["scenes"][0]["nodes"].append(number)
-        return number
-
-    def write(self, path: Path, version=2) -> Path:
-        """The path."""
-        self.document["buffers"][0]["byteLength"] = len(self.binary)
-        text = json.dumps(self.document).encode()
-        text = text.ljust(-(-len(text) // 4) * 4)
-        parts = struct.pack("<I4s", len(text), b"JSON") + text
-        parts += struct.pack("<I4s", len(self.binary), b"BIN\0") + self.binary
-        path.write_bytes(struct.pack("<4sII", b"glTF", version, 12 + len(parts)) + parts)
-        return path
+import trimesh
 
 
-def write_parts(path: Path, parts) -> Path:
+def write_parts(path: Path, parts: dict[str, Any]) -> Path:
     """Write named surfaces (points, triangles), each an object of its own."""
-    file = Glb()
+    scene = trimesh.Scene()
     for name, (points, triangles) in parts.items():
-        file.node(name, mesh=file.mesh(points, triangles))
-    return file.write(path)
+        mesh = trimesh.Trimesh(points, triangles, process=False)
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    scene.export(path)
+    return path
+
+
+def described(whole: bytes, change: Callable[[Any], object], version: int = 2) -> bytes:
+    """A file of glTF whose description was changed."""
+    end = 20 + int.from_bytes(whole[12:16], "little")
+    document = json.loads(whole[20:end])
+    change(document)
+    text = json.dumps(document).encode()
+    text = text.ljust(-(-len(text) // 4) * 4)
+    size = 20 + len(text) + len(whole) - end
+    head = struct.pack("<4sIII4s", b"glTF", version, size, len(text), b"JSON")
+    return head + text + whole[end:]

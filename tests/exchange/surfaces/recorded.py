@@ -101,7 +101,7 @@ def deck(data: dict) -> str:
             label += 1
         sections += [f"*Solid Section, elset={name}_Chordae, material={name}_Chordae"]
         sections += [f"{OGDEN[name][0]!r},"]
-    lines += ["*Nset, nset=Rim, generate", f"{data['rim'][0] + 1}, {data['rim'][-1] + 1}, 1"]
+    lines += ["*Nset, nset=Rim", *(f"{k + 1}," for k in data["rim"].tolist())]
     lines += ["*Nset, nset=free_edge", *(f"{k + 1}," for k in data["free_edge"].tolist())]
     lines += ["*Elset, elset=Both", "anterior_Quads, septal_Quads", *sections, "*End Part"]
     lines += ["*Assembly, name=Assembly", "*Instance, name=Valve, part=Leaflet", "*End Instance"]

@@ -12,7 +12,7 @@ from mvest.errors import InputError
 from mvest.exchange._images import Segment
 from mvest.exchange.volumes import LabelMap, read_labels, read_volume
 from mvest.imaging.volume import Modality
-from tests.exchange.volumes import test_metaimage, test_nifti, test_philips
+from tests.exchange.volume_variants import by_itk, nifti, philips
 from tests.exchange.volumes import volumes as v
 
 PLACE = {
@@ -84,7 +84,8 @@ def test_a_segment_that_cannot_be(tmp_path: Path, key: str, value: str) -> None:
 
 def test_frames_over_time_may_be_empty_and_without_a_unit(tmp_path: Path) -> None:
     path = tmp_path / "a.nii.gz"
-    made = test_nifti.image(labels())
+    image = nibabel.load(nifti(tmp_path / "b.nii", "NIfTI-1", "uint8"))
+    made = nibabel.Nifti1Image(np.moveaxis(labels(), 0, 3), image.affine, image.header)
     nibabel.save(made, path)
     found = read_labels(path)
     np.testing.assert_array_equal(found.frames, labels())
@@ -98,7 +99,7 @@ def test_frames_over_time_may_be_empty_and_without_a_unit(tmp_path: Path) -> Non
 
 
 def test_metaimage_without_a_unit_of_time(tmp_path: Path) -> None:
-    test_metaimage.write(tmp_path / "a.mha")
+    by_itk(tmp_path / "a.mha")
     np.testing.assert_array_equal(read_labels(tmp_path / "a.mha").frames, v.frames())
 
 
@@ -127,4 +128,4 @@ def test_what_is_no_label_map(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.nrrd: space directions: not stated"):
         read_labels(path)
     with pytest.raises(InputError, match=r"modality: ultrasound, expected a label map"):
-        read_labels(test_philips.save(tmp_path / "a.dcm", test_philips.dataset()))
+        read_labels(philips(tmp_path / "a.dcm"))

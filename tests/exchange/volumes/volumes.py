@@ -9,23 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import VolumeSequence
+from tests.exchange.volume_variants import DIRECTION as ROTATION
+from tests.exchange.volume_variants import MIRRORED, ORIGIN, SHAPE, SPACING, frames
 
-SHAPE = (3, 20, 24, 28)
-SPACING = np.array([1.5, 1.25, 1.0])
-ORIGIN = np.array([-12.5, 4.0, 30.25])
+__all__ = ["MIRRORED", "ORIGIN", "ROTATION", "SHAPE", "SPACING", "frames"]
+
 TIMES = np.array([0.0, 0.03, 0.08])
-ROTATION = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
-MIRRORED = ROTATION * [1.0, 1.0, -1.0]
-
-
-def frames(dtype: str = "uint8", shape: tuple[int, ...] = SHAPE) -> NDArray[np.generic]:
-    """Random numbers below 200, which are others wherever axes are swapped."""
-    return np.random.default_rng(7).integers(0, 200, shape).astype(dtype)
 
 
 def sequence(dtype: str = "uint8", direction: NDArray[np.float64] = ROTATION) -> VolumeSequence:
