@@ -222,7 +222,7 @@ def run(job: Job[Settings]) -> Result:
         record = record.model_copy(update={"unknowns": unknowns})
         whole: dict[str, Any] = {"data": source, "model": name}
         if isinstance(model, ProcessModel):
-            whole |= {"runs": model.counts.misses, "served again": model.counts.hits}
+            whole |= {"runs": model.runs, "served again": model.reused}
         rows += [{**whole, **{key: row.get(key) for key in COLUMNS}} for row in record.rows()]
         estimates.append(record)
     return Result(

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.cache import Counts, Entry, get_or_make
+from mvest.cache import Entry, get_or_make
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import Prediction
 from mvest.exchange.external.contract import (
@@ -134,8 +134,8 @@ class ProcessModel:
 
     Attributes
     ----------
-    counts : Counts
-        How often a program was started (misses), and a finished run served instead (hits).
+    runs, reused : int
+        How often a program was started, and how often a finished run served instead.
     own_jacobian : bool
         Whether the last prediction's derivatives are the program's own.
 
@@ -156,7 +156,8 @@ class ProcessModel:
     differences: Differences | None = Differences()
     reuse: bool = True
     inputs: Sequence[Path] = ()
-    counts: Counts = field(default_factory=Counts, init=False)
+    runs: int = field(default=0, init=False)
+    reused: int = field(default=0, init=False)
     own_jacobian: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -229,14 +230,17 @@ class ProcessModel:
         requests = [self._request(m, jacobian) for m in points]
         folders = [self._place(request) for request in requests]
         entries = [
-            Entry(folder / "answer", partial(read_answer, request=request), counts=self.counts)
+            Entry(folder / "answer", partial(read_answer, request=request))
             for folder, request in zip(folders, requests, strict=True)
         ]
         if not self.reuse:
             for entry in entries:
                 shutil.rmtree(entry.path, ignore_errors=True)
 
+        before = self.runs
+
         def answers(missing: list[int]) -> Iterator[Prediction]:
+            self.runs += len(missing)
             size = 1 if self.differences is None else self.differences.processes
             for first in range(0, len(missing), size):
                 with ExitStack() as stack:
@@ -247,9 +251,11 @@ class ProcessModel:
                     yield from [self._read(folders[k], requests[k], ended[k]()) for k in ended]
 
         try:
-            return get_or_make(entries, answers, _move_answer, keep=attrgetter("converged"))
+            found = get_or_make(entries, answers, _move_answer, keep=attrgetter("converged"))
         except (OSError, InputError) as error:
             return [Prediction.failed(str(error))] * len(points)
+        self.reused += len(points) - (self.runs - before)
+        return found
 
     def _started(self, folder: Path, request: RunRequest, stack: ExitStack) -> Callable[[], str]:
         """Start a run; returns the function that waits for its end (`Command.started`)."""

@@ -30,7 +30,7 @@ def test_its_own_derivatives_are_taken_as_they_are(tmp_path):
     assert prediction.converged, prediction.reason
     np.testing.assert_allclose(prediction.y, y, rtol=1e-15)
     np.testing.assert_allclose(prediction.jacobian, jacobian, rtol=1e-15)
-    assert (program.counts.misses, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
+    assert (program.runs, program.own_jacobian, ran(tmp_path)) == (1, True, 1)
     missing = model(tmp_path, differences=None)(M)
     assert "jacobian.csv is missing" in missing.reason
 
@@ -50,8 +50,8 @@ def test_differences_are_of_their_order(tmp_path, processes):
         assert np.all(found[jacobian == 0] == 0)
         assert not program.own_jacobian
     # 1 + 4 runs, then upper neighbours of the forward scheme are finished already.
-    assert program.counts.misses + program.counts.hits == 3
-    assert (program.counts.misses, ran(tmp_path)) == (0, 5)
+    assert program.runs + program.reused == 3
+    assert (program.runs, ran(tmp_path)) == (0, 5)
 
 
 def test_programs_side_by_side_find_what_lies_beside_them(tmp_path, monkeypatch):
@@ -96,7 +96,7 @@ def test_a_filter_finds_the_truth_through_files(tmp_path):
     # In log k2 the prior's variance is 9 and its distance 0.9; noise of 1e-4 mm on 2/k2 = 0.8 mm
     # leaves a variance of 2 * 1e-8 / 0.8^2: the prior draws by 3e-9.
     np.testing.assert_allclose(found.mean, M, rtol=1e-7)
-    assert found.forward_solves == program.counts.misses == ran(tmp_path)
+    assert found.forward_solves == program.runs == ran(tmp_path)
 
 
 def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_path):
@@ -104,7 +104,7 @@ def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_p
     assert ran(tmp_path) == 5
     again = model(tmp_path)
     again(M)
-    assert (again.counts.misses, again.counts.hits, ran(tmp_path)) == (0, 5, 5)
+    assert (again.runs, again.reused, ran(tmp_path)) == (0, 5, 5)
     # A value in its last digit, a setting, a variable, an argument: other runs.
     model(tmp_path, differences=Differences("forward"))(np.nextafter(M, 9))
     assert ran(tmp_path) == 8
@@ -113,7 +113,7 @@ def test_a_finished_run_serves_again_until_something_it_depends_on_changes(tmp_p
     assert ran(tmp_path) == 13
     fresh = model(tmp_path, reuse=False)
     fresh(M)
-    assert (fresh.counts.misses, fresh.counts.hits) == (5, 0)
+    assert (fresh.runs, fresh.reused) == (5, 0)
 
 
 def test_a_changed_input_makes_finished_runs_worthless(tmp_path):
@@ -133,7 +133,7 @@ def test_a_finished_run_that_was_damaged_is_done_again(tmp_path):
     table.write_text(table.read_text().replace("2.5", "2.6"))
     again = model(tmp_path, "exact")
     np.testing.assert_array_equal(again(M).y, first.y)
-    assert (again.counts.misses, again.counts.hits) == (1, 0)
+    assert (again.runs, again.reused) == (1, 0)
 
 
 def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
@@ -147,7 +147,7 @@ def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
     silent = model(tmp_path, "exact", source=off + SPRINGS)
     for _ in range(2):
         assert silent(M).reason == f"{folder.name}: response.json is missing"
-    assert (silent.counts.misses, silent.counts.hits) == (2, 0)
+    assert (silent.runs, silent.reused) == (2, 0)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_whatever_goes_wrong_is_the_reason_of_a_failed_prediction(tmp_path, body
     assert not prediction.converged
     assert message in prediction.reason
     assert prediction.reason.startswith("run-")
-    assert (program.counts.misses, ran(tmp_path)) == (1, 1)
+    assert (program.runs, ran(tmp_path)) == (1, 1)
 
 
 def test_what_the_program_says_of_its_failure_is_told(tmp_path):
@@ -224,7 +224,7 @@ def test_a_run_without_a_place_is_a_reason_and_no_run(tmp_path):
     (tmp_path / "runs").rmdir()
     (tmp_path / "runs").touch()
     assert "Not a directory" in program(M).reason
-    assert (program.counts.misses, program.counts.hits) == (0, 0)
+    assert (program.runs, program.reused) == (0, 0)
 
 
 def counted(monkeypatch, tmp_path, *arguments: str) -> int:
@@ -233,7 +233,7 @@ def counted(monkeypatch, tmp_path, *arguments: str) -> int:
     command = Command((*arguments, "{request}", "{folder}"))
     program = ProcessModel(command, tmp_path / "runs", NAMES, 2, units=("N/mm", "N/mm"))
     assert program(M).converged
-    return program.counts.misses
+    return program.runs
 
 
 def test_after_a_change_of_a_file_in_the_command_nothing_finished_serves(tmp_path, monkeypatch):
@@ -270,4 +270,4 @@ def test_an_answer_is_not_kept_whose_program_was_changed_while_it_ran(tmp_path):
     assert "a file that it depends on was changed while it ran" in prediction.reason
     again = model(tmp_path, "exact", differences=None)
     assert again(M).converged
-    assert again.counts.misses == 1
+    assert again.runs == 1
