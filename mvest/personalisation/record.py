@@ -32,7 +32,7 @@ image_step     with image_frames and pictures: `mvest.cases.from_images.detected
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ from mvest.cases.case import Role
 from mvest.cases.plausibility import doubts
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation.information.consistency import moran, zero_mean
-from mvest.personalisation.indications import indications_of
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import FrameDistance, Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.record import (
@@ -95,7 +95,7 @@ def record_of_case(
     details = {name: tuple(rows) for name, rows in _details(fit)} | dict(images)
     return _record(fit, result).model_copy(
         update={
-            "verdict": judge(replace(indications_of(fit, gate), unlike=unlike)),
+            "verdict": judge(diagnostics_of(fit, gate, unlike)),
             "correlation": _correlation(result),
             "frames": tuple(map(_frame_fit, fit.distances)),
             "alternatives": {

@@ -22,6 +22,7 @@ from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
 from mvest.personalisation import Treatment, estimation, personalise
 from mvest.personalisation.chain import predicted_frames
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.estimation import (
     SETTLED,
     CaseProblem,
@@ -37,7 +38,6 @@ from mvest.personalisation.geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.indications import indications_of
 from mvest.personalisation.model import CaseClosure
 from mvest.personalisation.sources import geometry_sources
 from mvest.problem.registration import REGISTRATION, RegisteredModel
@@ -523,7 +523,8 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
     assert torn.moved is None
     assert torn.unaccounted == (f"about the geometry that is expected: {why}",)
-    assert any("about the geometry" in doubt for doubt in indications_of(torn).unaccounted)
+    unaccounted = [words["what"] for _, words in diagnostics_of(torn)["unaccounted"]]
+    assert any("about the geometry" in doubt for doubt in unaccounted)
 
 
 def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(

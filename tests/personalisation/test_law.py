@@ -13,7 +13,7 @@ from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
 from mvest.personalisation import personalise
-from mvest.personalisation.indications import indications_of
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.sources import law_and_mesh_sources, law_change
 from mvest.problem.registration import RegisteredModel
 from mvest.problem.verdict import judge
@@ -123,5 +123,5 @@ def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
     )
     fit = personalise(case, settings(considered_law=STIFFENING))
     assert fit.unaccounted == ("it did not close",)
-    grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "errors left out"]
+    grounds = [g.text for g in judge(diagnostics_of(fit)).grounds if g.check == "errors left out"]
     assert any(text.endswith("is not in the intervals: it did not close") for text in grounds)
