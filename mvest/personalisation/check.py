@@ -15,16 +15,11 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.prediction import predict
 from mvest.estimation.transform import to_filter
 from mvest.personalisation.estimation import CaseProblem, linearised, sampled
-from mvest.personalisation.known import (
-    REACH,
-    LinearModel,
-    narrower,
-    variance_shares,
-)
+from mvest.personalisation.known import LinearModel, narrower, variance_shares
 from mvest.personalisation.model import build_coarse
-from mvest.personalisation.result import Expected, ExpectedUnknown
+from mvest.personalisation.result import Expected
 from mvest.personalisation.settings import PersonaliseSettings
-from mvest.problem.registration import unit_of
+from mvest.problem.estimate import expected_intervals
 
 
 def expect_case(
@@ -51,26 +46,8 @@ def expect_case(
         place.errors.observation().of(lambda _: place.prediction), place.m, derivatives=True
     )
     transform, prior = problem.transform, to_filter(problem.transform, problem.prior)
-    z = transform.forward(place.m)
-    H = seen.jacobian * transform.derivative(z)
+    H = seen.jacobian * transform.derivative(transform.forward(place.m))
     linear = LinearModel(problem.names, prior.covariance, H, place.errors)
-    std = np.sqrt(linear.variances())
-    ends = [
-        transform.inverse(z + sign * REACH * width)
-        for width in (prior.std, std)
-        for sign in (-1, 1)
-    ]
-    unknowns = tuple(
-        ExpectedUnknown(
-            name,
-            unit_of(name),
-            float(place.m[k]),
-            float(ends[0][k]),
-            float(ends[1][k]),
-            float(ends[2][k]),
-            float(ends[3][k]),
-            float(std[k] / prior.std[k]),
-        )
-        for k, name in enumerate(problem.names)
-    )
+    after = np.sqrt(linear.variances())
+    unknowns = expected_intervals(problem.names, transform, place.m, prior.std, after)
     return Expected(unknowns, variance_shares(linear), narrower(problem, linear))

@@ -40,7 +40,6 @@ from scipy import sparse
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import doubts
-from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import FrameDistance, Personalised
@@ -55,22 +54,13 @@ from mvest.problem.record import (
     finite,
     record_of,
 )
-from mvest.problem.registration import unit_of
+from mvest.problem.registration import label_of, unit_of
 from mvest.problem.verdict import judge
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.clinical import clinical_measurements
 
 Rows = tuple[Row, ...]
-
-LABELS = {
-    "pressure_scale": "pressure (factor)",
-    OFFSET: "offset of pressures",
-    "chord_stiffness": "chordal stiffness (factor)",
-    "chord_rest_length": "chordal rest length (factor)",
-    "stiffening": "stiffening",
-    "prestretch": "stretch when seen open (factor)",
-}
 
 
 def record_of_case(
@@ -104,18 +94,6 @@ def record_of_case(
             "details": {name: rows for name, rows in details.items() if rows},
         }
     )
-
-
-def label_of(name: str) -> str:
-    """What a reader calls an unknown: ``E_f anterior`` for ``E_f.anterior``."""
-    kind, _, part = name.partition(".")
-    if kind in ("E_f", "E_perp", "G"):
-        return f"{kind} {part}"
-    if kind == ERROR:
-        return f"pressure in frame {part}"
-    if kind in ("shift", "turn"):
-        return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
-    return LABELS.get(name, name)
 
 
 def _record(fit: Personalised, result: StudyResult) -> EstimateRecord:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from mvest.personalisation import PaperSettings, personalise
-from mvest.personalisation.record import arrays_of_case, label_of, record_of_case
+from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.problem.fields import case_fields
 from mvest.problem.record import EstimateRecord
+from mvest.problem.registration import label_of
 from mvest.problem.verdict import ONE_STATE
 from tests.made_up_closure import TISSUE, made_up_case, settings, use
 
