@@ -71,8 +71,8 @@ def diagnostics_of(
         low, high = (end / own.size for end in own.nis_band)
         nis = own.nis / own.size
         # Errors smaller than assumed leave intervals wider than they need to be.
-        words = zip(("root", "low", "high"), np.sqrt([nis, low, high]), strict=True)
-        seen["innovation"] = [(nis / high, dict(words))]
+        roots = dict(zip(("root", "low", "high"), np.sqrt([nis, low, high]), strict=True))
+        seen["innovation"] = [(nis / high, roots)]
     if filtered.standardised is not None and result.observation is not None:
         alike = _alike(result.observation, filtered.standardised)
         if alike is not None:

@@ -276,7 +276,7 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
     frames = [d.frame for d in fit.distances]
     by_name = {frame.name: frame for frame in case.frames}
     seen = [by_name[name] for name in frames]
-    shapes = {"generic": fit.generic, "registered": fit.registered, "fitted": fit.fitted}
+    shapes = {"generic": fit.generic, "fitted": fit.fitted}
     reference = case.frame(Role.REFERENCE)
     whole = {
         "triangles": surface.triangles,

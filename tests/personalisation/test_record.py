@@ -136,7 +136,6 @@ def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     fields = case_fields(tmp_path / "fields.npz")
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
-    assert fields.truth is None
     if corresponds:
         distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
         np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)

@@ -94,8 +94,9 @@ def test_views_look_where_they_say() -> None:
         ("seen", np.array([True]), "seen"),
         ("fitted", np.zeros((2, 5, 3)), "fitted has the shape"),
         ("distance_fitted", np.zeros(4), "distance_fitted has the shape"),
-        ("annulus", np.array([0, 9999]), "annulus names vertices"),
-        ("chord_tip", np.array([0, 1]), "chord_tip and chord_insertion"),
+        ("annulus", np.array([0, 9999]), "annulus has indices outside"),
+        ("chord_tip", np.array([0, 1]), "chord_insertion has the shape"),
+        ("frames", np.array([], dtype=str), "without frames"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(case, tmp_path, name, value, message) -> None:

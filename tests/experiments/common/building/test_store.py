@@ -14,7 +14,7 @@ from experiments.common.building.twin import MADE_BY
 from mvest.cache import Sources
 from mvest.cases.folder import write_case
 from mvest.estimation import Prediction
-from mvest.problem.stored import Store, StoredModel, key_of
+from mvest.problem.stored import StoredModel, key_of
 
 
 class Model:
@@ -95,7 +95,7 @@ def truth(tmp_path, monkeypatch):
         model = Model()
         with monkeypatch.context() as patched:
             patched.setattr(mvest.cache, "SOURCES", Sources(**roots))
-            Store(tmp_path / "outputs").model("truth", model, VALUES, MADE_BY)(AT)
+            StoredModel(model, tmp_path / "outputs", key_of(VALUES, MADE_BY))(AT)
         return model.calls == 1
 
     is_simulated.code = tmp_path / "code"
