@@ -125,7 +125,7 @@ def test_a_failed_estimation_has_a_record_too():
     assert all(row.estimate is row.low is None for row in record.unknowns)
     assert record.unknowns[0].prior_mean == 6.23
     assert not record.alternatives["moduli_only"].converged
-    assert not {"narrower", "errors", "whiteness"} & set(record.details)
+    assert not {"narrower", "errors", "known"} & set(record.details)
     assert arrays_of_case(fit) == {}
 
 

@@ -17,8 +17,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import json_normalize
 
-from mvest.cases.from_images.detected import DetectedValve
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected, Personalised
@@ -26,10 +25,9 @@ from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord, Spread
 from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure
 from mvest.reporting.case.tables import expected_tables, report_tables, unknown_table
-from mvest.reporting.case.view import CAMERAS, case_view
+from mvest.reporting.case.view import case_view
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
-from mvest.reporting.images import write_image_step
 from mvest.reporting.markup import ended, number
 from mvest.reporting.pictures import TEMPLATES, embedded, rendered
 
@@ -45,7 +43,6 @@ def report(
     folder: Path | str,
     *,
     arrays: Mapping[str, Any] | Path | None = None,
-    images: DetectedValve | None = None,
     line: str = "",
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
@@ -59,8 +56,6 @@ def report(
     arrays : mapping or Path, optional
         Of a record: those of `mvest.personalisation.record.arrays_of_case`, or the ``.npz`` file
         that holds them. Without them there is no page.
-    images : DetectedValve, optional
-        The valve in a volume that the case was made of; its measures and files are written, too.
     line : str
         Where the record came from, for the foot of each picture.
     provenance : mapping, optional
@@ -81,9 +76,8 @@ def report(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    step = None if images is None else write_image_step(images, folder)
     if isinstance(result, Personalised):
-        record, arrays = record_of_case(result, images=step), arrays or arrays_of_case(result)
+        record, arrays = record_of_case(result), arrays or arrays_of_case(result)
     else:
         record = result
     written = [write_atomically(folder / UNKNOWNS, unknown_table(record.unknowns).csv())]
@@ -171,7 +165,6 @@ def _write_page(
         missing=missing,
         scene=scene,
         buttons=buttons,
-        cameras=CAMERAS,
         files=[path.name for path in written],
         record=record,
         about=about,

@@ -77,7 +77,6 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
         "unknowns": unknown_table(free),
         "moduli_only": unknown_table(() if alone is None else alone.moduli),
         "frames": frame_table(record.frames),
-        "steps": _steps(record, free),
         "measurements": _measurements(rows("measurements")),
         "narrower": _narrower(rows("narrower")),
         "errors": table(
@@ -95,7 +94,6 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             unit="",
             stretch="::largest [SD]",
         ),
-        "whiteness": table(rows("whiteness"), name="::test", statistic="", p_value=":.2g"),
         "known": table(
             rows("known"),
             name="::quantity",
@@ -166,22 +164,6 @@ def _shares(rows: Sequence[Row]) -> Table:
     shown = [{"source": name, **own} for name, own in ordered if max(own.values()) >= 1.0]
     columns = dict.fromkeys((label for own in sources.values() for label in own), "%:.0f")
     return table(shown, source="::share of the variance", **columns)
-
-
-def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:
-    """A row for each unknown and the objective, a column for each step of the filter."""
-    own = [one for one in free if one.treatment == "estimated"]
-    if not record.iterates or not own or len(own) != len(record.iterates[0]):
-        return table(())
-    numbers = ["start", *map(str, range(1, len(record.iterates)))]
-    rows: list[dict[str, Any]] = [
-        {"unknown": one.label or one.name, "unit": one.unit}
-        | dict(zip(numbers, values, strict=True))
-        for one, values in zip(own, zip(*record.iterates, strict=True), strict=True)
-    ]
-    objective = dict(zip(numbers, record.objective, strict=False))
-    rows.append({"unknown": "misfit plus departure from the prior", "unit": ""} | objective)
-    return table(rows)
 
 
 def _measurements(rows: Sequence[Row]) -> Table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
@@ -27,11 +27,7 @@ GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
 PERSONALISED = "closed, personalised"
 """The state that is shown first, if there is an estimate."""
 
-CAMERAS: Mapping[str, Any] = {
-    "obliquely": {"eye": {"x": 0.48, "y": -1.04, "z": 1.25}, "up": {"x": 0, "y": 0, "z": 1}},
-    "from the atrium": {"eye": {"x": 0.0, "y": -0.01, "z": 1.75}, "up": {"x": 0, "y": 1, "z": 0}},
-    "from the side": {"eye": {"x": 0.85, "y": -1.50, "z": 0.38}, "up": {"x": 0, "y": 0, "z": 1}},
-}
+CAMERA = {"eye": {"x": 0.48, "y": -1.04, "z": 1.25}, "up": {"x": 0, "y": 0, "z": 1}}
 """In perspective: plotly lights no surface from the front in an orthographic scene."""
 
 
@@ -62,8 +58,7 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> tuple[Markup, list[di
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         paper_bgcolor="white",
         showlegend=False,
-        scene={"aspectmode": "data", "camera": CAMERAS["obliquely"]}
-        | {f"{name}axis": axis for name in "xyz"},
+        scene={"aspectmode": "data", "camera": CAMERA} | {f"{name}axis": axis for name in "xyz"},
     )
     markup = scene.to_html(
         full_html=False,
@@ -82,26 +77,24 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> tuple[Markup, list[di
 def states_of(fields: CaseFields, names: Sequence[str]) -> dict[str, list[Any]]:
     """Traces of the scene by the label of the state that they belong to."""
     k, frame = fields.closed, fields.closed + 1
-    states = {"open": _anatomy(fields, fields.rest, 0, names)}
-    seen = []
+    states, seen = {"open": _anatomy(fields, fields.rest, 0, names)}, []
     if (cloud := fields.observed_points.get(fields.frames[k])) is not None:
         seen = states["closed, observed"] = [_dots(cloud, GHOST, 2.2, hoverinfo="skip")]
+    models = {
+        "observed": (fields.observed, None),
+        "generic": (fields.generic, fields.distance_generic),
+        "personalised": (fields.fitted, fields.distance_fitted),
+    }
+    drawn = {label: (x[k], off) for label, (x, off) in models.items() if x is not None}
+    for label, (points, _) in drawn.items():
+        states[f"closed, {label}"] = _anatomy(fields, points, frame, names)
+    compared = {label: (x, off[k]) for label, (x, off) in drawn.items() if off is not None}
+    for label, (points, off) in compared.items():
+        top = distance_top(*(each for _, each in compared.values()))
+        states[f"distance, {label}"] = _coloured(fields, points, frame, off, top)
     if fields.observed is not None:
         ghost = _mesh(fields.observed[k], fields.triangles, color=GHOST, hoverinfo="skip")
         seen = [ghost.update(opacity=0.45)]
-        states["closed, observed"] = _anatomy(fields, fields.observed[k], frame, names)
-    models = (
-        ("generic", fields.generic, fields.distance_generic),
-        ("personalised", fields.fitted, fields.distance_fitted),
-    )
-    for label, shape, _ in models:
-        if shape is not None:
-            states[f"closed, {label}"] = _anatomy(fields, shape[k], frame, names)
-    known = [off[k] for _, shape, off in models if shape is not None and off is not None]
-    for label, shape, off in models:
-        if shape is not None and off is not None:
-            top = distance_top(*known)
-            states[f"distance, {label}"] = _coloured(fields, shape[k], frame, off[k], top)
     if fields.fitted is not None and seen:
         model = _anatomy(fields, fields.fitted[k], frame, names)
         states["observed (grey) over personalised"] = [*model, *seen]
@@ -112,11 +105,10 @@ def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence
     """One mesh for each leaflet, lines, chordae and papillary tips."""
     parts = []
     for r, name in enumerate(names):
-        triangles = fields.triangles[fields.region == r]
         colour = to_hex(LEAFLET_COLOURS[r % len(LEAFLET_COLOURS)])
         # plotly reads tags in its texts.
-        text = escape(shown_text(str(name)))
-        parts.append(_mesh(points, triangles, color=colour, name=text, hoverinfo="name"))
+        about = {"color": colour, "name": escape(shown_text(str(name))), "hoverinfo": "name"}
+        parts.append(_mesh(points, fields.triangles[fields.region == r], **about))
     parts += [*_leak(fields, points, frame), *_rings(fields, points)]
     if len(fields.chord_tip):
         ends = fields.chords(points, frame)
@@ -133,21 +125,17 @@ def _coloured(
 ) -> list[Any]:
     """A mesh coloured by distance, and grey where that is not known."""
     known = np.isfinite(distance[fields.triangles]).all(axis=1)
-    mesh = _mesh(
-        points,
-        fields.triangles[known],
-        distance,
-        colorscale="Viridis",
-        cmin=0.0,
-        cmax=top,
-        colorbar={"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
-        hovertemplate="%{intensity:.2f} mm<extra></extra>",
-    )
-    parts = [mesh, *_leak(fields, points, frame), *_rings(fields, points)]
-    if not known.all():
-        unseen = fields.triangles[~known]
-        parts.append(_mesh(points, unseen, color=UNOBSERVED, hoverinfo="skip"))
-    return parts
+    coloured = {
+        "colorscale": "Viridis", "cmin": 0.0, "cmax": top,
+        "colorbar": {"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
+        "hovertemplate": "%{intensity:.2f} mm<extra></extra>",
+    }  # fmt: skip
+    return [
+        _mesh(points, fields.triangles[known], distance, **coloured),
+        *_leak(fields, points, frame),
+        *_rings(fields, points),
+        _mesh(points, fields.triangles[~known], color=UNOBSERVED, hoverinfo="skip"),
+    ]
 
 
 def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
