@@ -17,7 +17,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import json_normalize
 
-from mvest.errors import InputError
+from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected, Personalised
