@@ -252,7 +252,7 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
 
     monkeypatch.setattr("mvest.personalisation.estimation.build_model", build)
     monkeypatch.setattr("mvest.personalisation.design.build_model", build)
-    monkeypatch.setattr("mvest.personalisation.check.build_coarse", build)
+    monkeypatch.setattr("mvest.personalisation.design.build_coarse", build)
     monkeypatch.setattr("mvest.personalisation.errors.geometry_modes", lambda *_: ())
     monkeypatch.setattr("mvest.personalisation.errors.law_and_mesh_sources", lambda *_: ())
     return built

@@ -1,7 +1,7 @@
 from .chain import personalise as personalise
-from .check import expect_case as expect_case
 from .design import FrameDesigns as FrameDesigns
 from .design import design_case as design_case
+from .design import expect_case as expect_case
 from .model import build_model as build_model
 from .model import gate_case as gate_case
 from .record import record_of_case as record_of_case

@@ -1,8 +1,12 @@
-"""What the frames of a case will tell, and how many more it takes, before anything is estimated.
+"""What frames of a case will tell, found out before anything is estimated.
 
-From derivatives at the generic moduli alone: information adds up over frames whose errors are
-independent; what is not known of pressures, chordae, displacement and geometry is common to them.
-Each design is a few small matrices; all of them need one set of closures.
+The information of an observation needs a model, where it is believed to be, and how well what is
+seen; it needs no observed value. `expect_case` closes the generic valve once on the coarse mesh of
+the guide and says which intervals to expect, what they rest on and what would narrow them
+(`mvest.personalisation.known`). `design_case` says how many more frames it takes: information adds
+up over frames whose errors are independent; what is not known of pressures, chordae, displacement
+and geometry is common to them. Each design is a few small matrices, and all need one set of
+closures.
 """
 
 from __future__ import annotations
@@ -20,10 +24,46 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.information.design import Design, together
 from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.prediction import predict
+from mvest.estimation.transform import to_filter
 from mvest.personalisation.errors import FrameErrors, linearise
-from mvest.personalisation.estimation import CaseProblem
-from mvest.personalisation.model import build_model
+from mvest.personalisation.estimation import CaseProblem, linearised, sampled
+from mvest.personalisation.known import LinearModel, narrower, variance_shares
+from mvest.personalisation.model import build_coarse, build_model
+from mvest.personalisation.result import Expected
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors, Treatment
+from mvest.problem.estimate import expected_intervals
+
+
+def expect_case(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
+) -> Expected:
+    """What an estimate of a case could tell, to first order about the generic valve.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+    model : ClosureModel, optional
+        The closure of the case; by default on the mesh of the guide.
+    """
+    model = build_coarse(case, settings) if model is None else model
+    problem = CaseProblem.of(case, settings, model=model)
+    place = problem.generic()
+    if not place.prediction.converged:
+        return Expected(reason=place.prediction.reason)
+    place = linearised(place, problem)
+    if case.error_samples is not None:
+        place = sampled(place)
+    seen = predict(
+        place.errors.observation().of(lambda _: place.prediction), place.m, derivatives=True
+    )
+    transform, prior = problem.transform, to_filter(problem.transform, problem.prior)
+    H = seen.jacobian * transform.derivative(transform.forward(place.m))
+    linear = LinearModel(problem.names, prior.covariance, H, place.errors)
+    after = np.sqrt(linear.variances())
+    unknowns = expected_intervals(problem.names, transform, place.m, prior.std, after)
+    return Expected(unknowns, variance_shares(linear), narrower(problem, linear))
+
 
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
 """Of the closed frame's pressure, under which the frames of designs are: 120 to 60 mmHg."""
@@ -168,7 +208,7 @@ def design_case(
 
     The frames are held and seen as the closed one, under shares of its pressure (`SHARES`): one
     closure, and an equilibrium with its derivatives for each. Errors of which samples tell are left
-    out. Parameters are those of `mvest.personalisation.check.expect_case`.
+    out. Parameters are those of `expect_case`.
     """
     model = build_model(case, settings) if model is None else model
     closed = case.frame(Role.CLOSED)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.personalisation.estimation import CaseEstimate, CaseProblem, joint, slopes
@@ -185,10 +184,6 @@ class Personalised:
     case : ValveCase
     settings : PersonaliseSettings
     mesh : SolidMesh
-    names : tuple of str, (p,)
-        Unknowns that are estimated.
-    prior : Gaussian
-        Of these.
     result : StudyResult
     moduli_only : StudyResult or None
         With all nuisances fixed.
@@ -216,8 +211,6 @@ class Personalised:
     case: ValveCase
     settings: PersonaliseSettings
     mesh: SolidMesh
-    names: tuple[str, ...]
-    prior: Gaussian
     result: StudyResult
     moduli_only: StudyResult | None
     paper: StudyResult | None

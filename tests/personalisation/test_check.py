@@ -23,7 +23,7 @@ def test_intervals_are_those_of_an_estimate_of_the_generic_valve(monkeypatch, er
     fit = personalise(case, settings())  # errors as they are stated
     std = fit.result.filtered.transformed.std
     for k, unknown in enumerate(expected.unknowns):
-        assert unknown["name"] == fit.names[k]
+        assert unknown["name"] == fit.result.parameters[k]
         high, low, generic = unknown["high"], unknown["low"], unknown["generic"]
         positive = generic > 0.0
         found = np.log(high / low) if positive else high - low

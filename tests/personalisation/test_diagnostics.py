@@ -51,10 +51,10 @@ def test_a_case_whose_errors_are_as_stated_is_trusted(fit):
     assert {words["what"] for _, words in seen["data_alone"]} == {"E_f.anterior", "E_f.posterior"}
     # Of a factor, estimated by its logarithm: a prior of 1.00 and 10 %.
     stretch = {words["what"]: value for value, words in seen["stretch"]}
-    k = found.names.index("pressure_scale")
+    k = found.result.parameters.index("pressure_scale")
     moved = np.log(found.result.estimate[k]) / np.sqrt(np.log(1.01))
     assert stretch["pressure_scale"] == pytest.approx(abs(moved), abs=0.06)
-    shift = found.result.estimate[found.names.index("shift.x")] / PRIORS["shift.x"][1]
+    shift = found.result.estimate[found.result.parameters.index("shift.x")] / PRIORS["shift.x"][1]
     assert stretch["shift.x"] == pytest.approx(abs(shift))
     assert judge(seen | PLAUSIBLE).trust == TRUSTWORTHY
 

@@ -255,7 +255,7 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
         doubtful = personalise(
             case, settings(errors=errors, considered_geometry=ConsideredGeometry())
         )
-        anterior = doubtful.names.index("E_f.anterior")
+        anterior = doubtful.result.parameters.index("E_f.anterior")
         assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
         shares = {row.source: row.share for row in doubtful.known.shares[::2]}
         assert shares["open shape"] > 0.3

@@ -106,7 +106,7 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
     )
     known = personalise(case, settings(moduli_only=True))
     doubtful = personalise(case, settings(moduli_only=True, considered_law=STIFFENING))
-    anterior = doubtful.names.index("E_f.anterior")
+    anterior = doubtful.result.parameters.index("E_f.anterior")
     assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
     shares = {row.source: row.share for row in doubtful.known.shares[::2]}
     assert shares["law"] > 0.3

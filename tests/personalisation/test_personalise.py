@@ -48,7 +48,7 @@ NUISANCES = tuple(name for name in PRIORS if name not in MODULI)
 
 
 def true_of(found):
-    return np.array([TRUE[name] for name in found.names])
+    return np.array([TRUE[name] for name in found.result.parameters])
 
 
 def right_nuisances():
@@ -58,14 +58,14 @@ def right_nuisances():
 
 
 def std_of(found, name):
-    return float(found.result.std[found.names.index(name)])
+    return float(found.result.std[found.result.parameters.index(name)])
 
 
 def test_a_twin_without_noise_gives_back_the_moduli_and_what_was_hidden(monkeypatch):
     use(monkeypatch)
     found = personalise(made_up_case(std_mm=1e-4), settings(tolerance=1e-6))
     assert found.result.converged
-    assert found.names == tuple(PRIORS)
+    assert found.result.parameters == tuple(PRIORS)
     np.testing.assert_allclose(found.result.estimate, true_of(found), rtol=1e-4, atol=1e-4)
     assert [(d.frame, d.seen) for d in found.distances] == [("closed", True), ("late", False)]
     for distance in found.distances:
@@ -124,8 +124,8 @@ def test_unknowns_may_come_in_any_order(monkeypatch):
     one = personalise(case, settings())
     order = [*unknowns()[::-1]]
     other = personalise(case, settings(*order))
-    assert set(other.names[-6:]) == set(REGISTRATION)
-    at = [other.names.index(name) for name in one.names]
+    assert set(other.result.parameters[-6:]) == set(REGISTRATION)
+    at = [other.result.parameters.index(name) for name in one.result.parameters]
     np.testing.assert_allclose(other.result.estimate[at], one.result.estimate, rtol=1e-6, atol=1e-9)
 
 
@@ -591,7 +591,7 @@ def test_errors_rougher_than_stated_are_learned(monkeypatch, correspondence):
     z = (learned.mean - true_of(found)) / learned.std
     assert np.sqrt(np.mean(z**2)) < 1.6
     # What would be known if more were known starts from what is.
-    moduli = [found.names.index(name) for name in MODULI]
+    moduli = [found.result.parameters.index(name) for name in MODULI]
     now = [row.std_now for row in found.known.narrower[:2]]
     np.testing.assert_allclose(now, learned.transformed.std[moduli], rtol=1e-6)
 

@@ -36,13 +36,13 @@ def test_it_is_plain_data_and_knows_no_truth(fit, record):
     assert EstimateRecord.model_validate_json(text) == record
     assert (record.case, record.simulated, record.status) == ("made_up", True, "converged")
     free = [row for row in record.unknowns if row.kind != "derived"]
-    assert tuple(row.name for row in free) == fit.names
+    assert tuple(row.name for row in free) == fit.result.parameters
     assert [row.estimate for row in free] == fit.result.estimate.tolist()
     assert [(row.prior_mean, row.prior_std) for row in free[:2]] == [(6.23, 3.1), (2.09, 1.05)]
     for one in (record, *record.alternatives.values()):
         assert all(row.truth is None for row in one.unknowns)
     assert all(frame.personalised_to_truth is None for frame in record.frames)
-    assert np.diag(record.correlation) == pytest.approx(np.ones(len(fit.names)))
+    assert np.diag(record.correlation) == pytest.approx(np.ones(len(fit.result.parameters)))
     shown = {row["setting"]: row["value"] for row in record.details["settings"]}
     assert shown["mesh.columns"] == fit.settings.mesh.columns
     assert shown["mechanics.tissue.anterior.nu"] == TISSUE["anterior"].nu
@@ -68,7 +68,7 @@ def test_derived_moduli_follow_by_their_ratios(record):
 
 
 def test_intervals_of_what_is_positive_are_those_of_its_logarithm(fit, record):
-    for k, name in enumerate(fit.names):
+    for k, name in enumerate(fit.result.parameters):
         row, std = record.unknown(name), fit.result.filtered.transformed.std[k]
         if name.startswith(("shift", "turn")):
             assert row.high - row.estimate == pytest.approx(1.959964 * std)
@@ -121,7 +121,7 @@ def test_a_failed_estimation_has_a_record_too():
     fit = personalised(fails_above=4.0, moduli_only=True)
     record = record_of_case(fit)
     assert (record.status, record.frames, record.correlation) == ("failed", (), ())
-    assert [row.name for row in record.unknowns] == list(fit.names)
+    assert [row.name for row in record.unknowns] == list(fit.result.parameters)
     assert all(row.estimate is row.low is None for row in record.unknowns)
     assert record.unknowns[0].prior_mean == 6.23
     assert not record.alternatives["moduli_only"].converged

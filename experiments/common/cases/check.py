@@ -11,7 +11,7 @@ from experiments.common.progress import SolveBar
 from experiments.common.schema import Values, build
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
-from mvest.personalisation.check import expect_case
+from mvest.personalisation.design import expect_case
 from mvest.personalisation.model import build_coarse, gate_case, gate_lines
 from mvest.personalisation.result import Expected
 

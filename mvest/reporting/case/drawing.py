@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
@@ -42,6 +43,7 @@ LARGEST_EDGE_MM = 1.2
 MAX_SPLITS = 2
 LINE_PIECES = 6
 SCALE_MM = 10.0
+HIGH_QUANTILE = 0.99
 
 Part: TypeAlias = tuple[FloatArray, FloatArray, float]
 """Corners of triangles ``(k, 3, 3)`` mm, their colours ``(k, 3)`` and their width of line."""
@@ -50,6 +52,26 @@ Part: TypeAlias = tuple[FloatArray, FloatArray, float]
 def leaflet_colours(region: IntArray) -> FloatArray:
     """Colours ``(m, 3, 3)`` of the corners of triangles by their leaflet."""
     return np.repeat(LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)][:, None], 3, axis=1)
+
+
+def distance_top(*distances: FloatArray) -> float:
+    """Upper end in mm of a scale for several fields: a round number at or above nearly all."""
+    top = max(float(np.nanquantile(values, HIGH_QUANTILE)) for values in distances)
+    if top <= 0:
+        return 1e-3
+    step = 10.0 ** np.floor(np.log10(top)) / 2
+    return float(step * np.ceil(top / step - 1e-9))
+
+
+def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
+    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
+
+    A triangle is grey where one of its corners has no value.
+    """
+    known = np.isfinite(values)
+    colours: FloatArray = scale.to_rgba(np.where(known, values, 0.0))[:, :3]
+    whole = np.asarray(known[triangles].all(axis=1))
+    return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
 def draw_valve(

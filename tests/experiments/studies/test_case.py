@@ -16,7 +16,7 @@ from experiments.studies.case import STUDY, Settings
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.personalisation import Treatment, check, default_settings
+from mvest.personalisation import Treatment, default_settings, design
 from mvest.problem.verdict import ONE_STATE
 from tests.experiments.configured import composed, plain
 from tests.made_up_closure import made_up_case, use
@@ -152,7 +152,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
 
 def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
     built = use(monkeypatch)
-    monkeypatch.setattr("experiments.common.cases.check.build_coarse", check.build_coarse)
+    monkeypatch.setattr("experiments.common.cases.check.build_coarse", design.build_coarse)
     monkeypatch.setattr(
         "mvest.personalisation.estimation.estimate",
         lambda *a, **k: pytest.fail("something was estimated"),
