@@ -33,12 +33,14 @@ from dataclasses import asdict, fields, is_dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import doubts
 from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import FrameDistance, Personalised
 from mvest.problem.estimate import StudyResult
+from mvest.problem.fields import as_stored
 from mvest.problem.record import (
     EstimateRecord,
     FrameFit,
@@ -210,42 +212,29 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
     if not fit.distances:
         return {}
     case, surface = fit.case, fit.case.surface
-    frames = [d.frame for d in fit.distances]
     by_name = {frame.name: frame for frame in case.frames}
-    seen = [by_name[name] for name in frames]
-    shapes = {"generic": fit.generic, "fitted": fit.fitted}
-    reference = case.frame(Role.REFERENCE)
-    whole = {
+    frames = [by_name[distance.frame] for distance in fit.distances]
+    edge_thickness = surface.thickness[case.free_edge].mean()
+    arrays: dict[str, Any] = {
         "triangles": surface.triangles,
+        "region": surface.region,
+        "rest": surface.vertices,
         "annulus": case.annulus,
         "free_edge": case.free_edge,
+        "frames": [frame.name for frame in frames],
+        "seen": [distance.seen for distance in fit.distances],
+        "tips": [case.frame(Role.REFERENCE).papillary_tips, *(f.papillary_tips for f in frames)],
         "chord_tip": case.chordae.tip,
-        "chord_insertion": [
-            np.argmin(np.linalg.norm(surface.vertices - point, axis=1))
-            for point in case.chordae.insertion
-        ],
+        "chord_insertion": cKDTree(surface.vertices).query(case.chordae.insertion)[1],
+        "generic": [fit.generic[frame.name] for frame in frames],
+        "fitted": [fit.fitted[frame.name] for frame in frames],
+        "reach_mm": fit.settings.mechanics.contact.activation_distance * edge_thickness,
     }
-    reals: dict[str, Any] = {
-        "rest": surface.vertices,
-        "tips": np.stack([reference.papillary_tips, *(frame.papillary_tips for frame in seen)]),
-        **{name: np.stack([of[frame] for frame in frames]) for name, of in shapes.items()},
-    }
-    arrays: dict[str, Any] = {
-        "region": surface.region.astype(np.int8),
-        "frames": np.array(frames),
-        "seen": np.array([d.seen for d in fit.distances]),
-        "reach_mm": fit.settings.mechanics.contact.activation_distance
-        * surface.thickness[case.free_edge].mean(),
-    }
-    if all(frame.corresponds for frame in seen):
-        reals["observed"] = np.stack([frame.vertices for frame in seen])
-        if fit.settings.correspondence:
-            arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
-            arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
-    else:
-        reals |= {f"observed_points_{frame.name}": frame.vertices for frame in seen}
-    return (
-        arrays
-        | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}
-        | {name: values.astype(np.float32) for name, values in reals.items()}
-    )
+    if not all(frame.corresponds for frame in frames):
+        arrays |= {f"observed_points_{frame.name}": frame.vertices for frame in frames}
+        return as_stored(arrays)
+    arrays["observed"] = [frame.vertices for frame in frames]
+    if fit.settings.correspondence:
+        arrays["distance_generic"] = [distance.generic for distance in fit.distances]
+        arrays["distance_fitted"] = [distance.personalised for distance in fit.distances]
+    return as_stored(arrays)

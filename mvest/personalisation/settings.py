@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -23,9 +23,11 @@ from mvest.quantities import (
     CellsAround,
     Count,
     EdgeLength,
+    Logarithm,
     PointsAlong,
     PointsAround,
     PressureError,
+    Tolerance,
     Value,
 )
 
@@ -176,16 +178,12 @@ class PaperSettings:
     max_iterations: Count = 12
 
 
-@dataclass(frozen=True, slots=True)
-class PersonaliseSettings:
-    """How a case is personalised.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaseChoices:
+    """How a case is personalised, but for its unknowns and its mechanics.
 
     Attributes
     ----------
-    unknowns : tuple of Prior
-        The means of the moduli are the generic ones.
-    mechanics : MechanicsSettings
-        The pressure of its protocol is replaced by that of the closed frame.
     mesh : CaseMesh
     tolerance : float
         Of the filter, relative.
@@ -207,7 +205,7 @@ class PersonaliseSettings:
     considered_geometry : ConsideredGeometry or None
         How well the geometry is known that the model is built from: what is not counts as an error
         of the observation. None takes it as it was seen.
-    considered_law : mapping of str to ExponentialTissue
+    considered_law : dict of str to ExponentialTissue
         Leaflet -> another law that its tissue may follow: what it would do to the prediction counts
         as an error of the observation. Empty: the linear law is taken to be right.
     pressures : PressureErrors or None
@@ -215,20 +213,34 @@ class PersonaliseSettings:
         them but for the common factor, if that is an unknown.
     """
 
-    unknowns: tuple[Prior, ...]
-    mechanics: MechanicsSettings
     mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: float = 2e-3
-    max_iterations: int = 15
-    largest_change: float = 0.2
+    tolerance: Tolerance = 2e-3
+    max_iterations: Count = 15
+    largest_change: Logarithm = 0.2
     paper: PaperSettings | None = None
     moduli_only: bool = False
     confirm: bool = False
     correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
     considered_geometry: ConsideredGeometry | None = None
-    considered_law: Mapping[str, ExponentialTissue] = field(default_factory=dict)
+    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)
     pressures: PressureErrors | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PersonaliseSettings(CaseChoices):
+    """How a case is personalised.
+
+    Attributes
+    ----------
+    unknowns : tuple of Prior
+        The means of the moduli are the generic ones.
+    mechanics : MechanicsSettings
+        The pressure of its protocol is replaced by that of the closed frame.
+    """
+
+    unknowns: tuple[Prior, ...]
+    mechanics: MechanicsSettings
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none

@@ -119,19 +119,32 @@ class CaseFields:
         return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
 
 
+def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Arrays as a run stores them: indices as int32, positions in single precision."""
+    stored = {name: np.asarray(values) for name, values in arrays.items()}
+    for name, values in stored.items():
+        if values.dtype.kind == "i":
+            stored[name] = values.astype(np.int32)
+        elif values.dtype.kind == "f" and values.shape[-1:] == (3,):
+            stored[name] = values.astype(np.float32)
+    return stored
+
+
 def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Arrays of a valve for `case_fields`, to which shapes in frames that were seen are added."""
     surface = valve.surface
-    return {
-        "triangles": surface.triangles.astype(np.int32),
-        "region": surface.region.astype(np.int8),
-        "rest": surface.vertices.astype(np.float32),
-        "annulus": valve.annulus.astype(np.int32),
-        "free_edge": valve.free_edge.astype(np.int32),
-        "frames": np.array(frames),
-        "seen": np.ones(len(frames), dtype=bool),
-        "tips": np.stack([valve.papillary_tips] * (1 + len(frames))).astype(np.float32),
-    }
+    return as_stored(
+        {
+            "triangles": surface.triangles,
+            "region": surface.region,
+            "rest": surface.vertices,
+            "annulus": valve.annulus,
+            "free_edge": valve.free_edge,
+            "frames": list(frames),
+            "seen": [True] * len(frames),
+            "tips": [valve.papillary_tips] * (1 + len(frames)),
+        }
+    )
 
 
 def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> CaseFields:

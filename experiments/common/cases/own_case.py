@@ -35,6 +35,7 @@ from mvest.personalisation.chain import personalise
 from mvest.personalisation.model import with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.settings import (
+    CaseChoices,
     PersonaliseSettings,
     Prior,
     Treatment,
@@ -60,10 +61,8 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         Prior(name, about.mean, about.std, Treatment(about.treatment))
         for name, about in personal.unknowns.items()
     )
-    # All other settings have the names of the library's.
-    others = {f.name: getattr(personal, f.name) for f in fields(personal) if f.name != "unknowns"}
-    others |= {"unknowns": unknowns, "mechanics": mechanics_of(values)}
-    return with_stiffening(PersonaliseSettings(**others))
+    choices = {f.name: getattr(personal, f.name) for f in fields(CaseChoices)}
+    return with_stiffening(PersonaliseSettings(unknowns, mechanics_of(values), **choices))
 
 
 def read_configured(place: str | None) -> ValveCase:

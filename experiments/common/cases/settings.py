@@ -9,11 +9,9 @@ from typing import Annotated, Any, Literal
 
 from experiments.common.schema import InputFile, Reads, contents
 from mvest.cases.from_images.settings import ImagedSettings
-from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalisation.geometry import ConsideredGeometry
-from mvest.personalisation.settings import CaseMesh, PaperSettings, PressureErrors
-from mvest.quantities import Count, Logarithm, Tolerance, Value
+from mvest.personalisation.settings import CaseChoices
+from mvest.quantities import Value
 
 
 def _case(value: str, _beside: Mapping[str, Any]) -> Any:
@@ -46,22 +44,11 @@ class UnknownSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PersonalSettings:
-    """How a case is personalised (see mvest.personalisation.PersonaliseSettings)."""
+class PersonalSettings(CaseChoices):
+    """How a case is personalised; errors are learned where a configuration says how well known."""
 
     unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
-    mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: Tolerance = 2e-3
-    max_iterations: Count = 15
-    largest_change: Logarithm = 0.2  # of a parameter's logarithm from one equilibrium to the next
-    paper: PaperSettings | None = None
-    moduli_only: bool = False  # estimate also with all nuisances fixed
-    confirm: bool = False  # close the fitted valve anew from the open one
-    correspondence: bool = True  # use corresponding vertices as such, where there are any
-    errors: ErrorBeliefs | None = None  # learn the errors that the case states
-    considered_geometry: ConsideredGeometry | None = None  # how well it is known; null: exactly
-    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)  # it may follow
-    pressures: PressureErrors | None = None  # of several closed frames, beside a common factor
+    errors: ErrorBeliefs | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -118,22 +119,21 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
         ring = cKDTree(annulus)
         loops = boundary_loops(frame.triangles)
         loops.sort(key=lambda loop: float(np.mean(ring.query(vertices[loop])[0])))
-        arrays: dict[str, Any] = {
-            "triangles": frame.triangles,
-            "region": frame.region,
-            "rest": vertices,
-            "annulus": loops[0],
-            "free_edge": loops[-1],
-            "frames": [frame.name],
-            "seen": [True],
-            "tips": np.stack([(frame.papillary_tips - middle) @ axes] * 2),
-        }
+        fields = CaseFields(
+            triangles=frame.triangles,
+            region=frame.region,
+            rest=vertices,
+            annulus=loops[0],
+            free_edge=loops[-1],
+            frames=(frame.name,),
+            seen=np.array([True]),
+            tips=np.stack([(frame.papillary_tips - middle) @ axes] * 2),
+            observed_points={},
+            reach_mm=reach_mm if shut else None,
+        )
         if at_rest:
-            arrays["chord_tip"] = chordae.tip
-            arrays["chord_insertion"] = cKDTree(vertices).query(insertion)[1]
-        if shut:
-            arrays["reach_mm"] = reach_mm
-        fields = case_fields(arrays, turned=False)
+            ends = cKDTree(vertices).query(insertion)[1]
+            fields = replace(fields, chord_tip=chordae.tip, chord_insertion=ends)
         title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         # Of a closed one the gap is drawn, as of a frame that is not the reference.
         shapes.append(_Shape(title, fields, vertices, int(shut)))
