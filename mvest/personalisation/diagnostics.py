@@ -17,11 +17,17 @@ from mvest.observation.vertices import Observation
 from mvest.personalisation.errors import WeighedObservation
 from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import Observed
-from mvest.problem.verdict import APPROXIMATION, WORSE, Found, texts
+from mvest.problem.verdict import Found, texts
 from mvest.typing import FloatArray
 
 NEIGHBOURS = 6
 """Of a point that was seen, as on a surface of triangles."""
+APPROXIMATION = 2.0
+"""Times the limit of a check of the filter (`mvest.estimation.check`) beyond which it is doubtful.
+The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
+failed by less."""
+WORSE = 1.05
+"""Distance of a held-out frame, fitted over generic, that counts as farther."""
 SAME_MM = 0.5
 """Largest distance at which a valve that was closed anew is the same, as of the gate."""
 

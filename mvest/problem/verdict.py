@@ -19,8 +19,10 @@ interval missed), and how much the data narrow the prior (28, none).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 Trust: TypeAlias = Literal["trustworthy", "doubtful", "none"]
@@ -80,43 +82,8 @@ class Verdict:
         return f"{self.trust}: " + "; ".join(ground.text for ground in self.grounds)
 
 
-APPROXIMATION = 2.0
-"""Times the limit of a check of the filter (`mvest.estimation.check`) beyond which it is doubtful.
-The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
-failed by less."""
-MOVED = 0.5
-"""Standard deviations of a modulus by which an estimate may be away from where the geometry was
-linearised last: twice what is taken for the end of such steps."""
-LAW = (0.2, 0.3)
-"""Share of the way to an exponential law beyond which moduli of the linear one are doubtful, and
-beyond which there are none: moduli make up for much of a law that is not theirs."""
-FAR = 2.0
-"""Standard deviations of the prior beyond which the data alone contradict it."""
-STRETCH = (2.5, 3.5)
-"""Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
-ones are), beyond the second it is contradicted (1 in 2000)."""
-NIS_FACTOR = 1.5
-"""Beyond its band by this factor the normalised innovation contradicts what is believed of errors:
-after they were learned, nothing but a model that cannot do what was seen takes it there."""
-ALIKE = 0.25
-"""Correlation of whitened residuals at neighbouring points above which there is structure."""
-LEAK = (10.0, 30.0)
-"""mm² by which the fitted valve may be more open than the observed one: about the error of such an
-area from a jagged edge, and what no closed valve has."""
-WORSE = 1.05
-"""Distance of a held-out frame, fitted over generic, that counts as farther."""
-
-
-ONE_STATE = "one closed state"
-"""The check of the gate. It is not asked of a valve that is met for the first time, since it costs
-minutes; that it was not is no ground against an estimate, and is said."""
-
 Found: TypeAlias = Iterable[tuple[float, Mapping[str, object]]]
 """Values that a check compares with its limits, each with words for its text."""
-ALWAYS: tuple[float, float] = (0.0, math.inf)
-"""Limits of a check of which every finding is doubtful."""
-GRAVE: tuple[float, float] = (0.0, 0.0)
-"""Limits of a check of which every finding leaves no estimate."""
 
 
 def texts(*found: str) -> Found:
@@ -132,14 +99,14 @@ class Check:
     ----------
     name : str
         Rows of one name are one check.
-    limits : (float, float)
+    limits : two numbers
         Beyond the first a value is doubtful, beyond the second it leaves no estimate.
     text, advice : str
         Of a `Ground`. ``{value}`` and ``{limit}`` (the first) stand in it beside the words.
     """
 
     name: str
-    limits: tuple[float, float]
+    limits: Sequence[float]
     text: str
     advice: str
 
@@ -185,138 +152,14 @@ def judge(seen: Mapping[str, Found]) -> Verdict:
 
 
 CHECKS: Mapping[str, Check] = {
-    "failed": Check(
-        "iterations",
-        GRAVE,
-        "there is no estimate: {what}",
-        "close the valve with the generic moduli first (check=true); if that fails, look at "
-        "chordae and annulus; if only a trial fails, narrow the priors",
-    ),
-    "unfinished": Check(
-        "iterations",
-        GRAVE,
-        "the iterations did not come to their end: {what}",
-        "let it iterate longer (personal.max_iterations), or start nearer",
-    ),
-    "approximation": Check(
-        "approximation",
-        ALWAYS,
-        "the interval is not that of the posterior: {what}",
-        "sample the posterior",
-    ),
-    "moved": Check(
-        "geometry",
-        (MOVED, math.inf),
-        "a modulus is {value:.2f} of its standard deviations from where the geometry was "
-        "linearised last, expected at most {limit:g}",
-        "allow more such steps (personal.considered_geometry.renewals), or see the open shape, "
-        "annulus and tips better",
-    ),
-    "law": Check(
-        "law",
-        LAW,
-        "what was seen puts the tissue at {value:.2f} of the way from the linear law to an "
-        "exponential one, expected at most {limit:g}: it probably stiffens",
-        "estimate how far each leaflet stiffens (personal=stiffening); moduli of the linear law "
-        "are those of its stretch alone",
-    ),
-    "mistakes": Check("case", GRAVE, "{what}", "mend the case and run it again"),
-    "unlike": Check(
-        "case",
-        GRAVE,
-        "{what}",
-        "record another volume, or segment it by other means",
-    ),
-    "doubts": Check("case", ALWAYS, "{what}", "look at this part of the case"),
-    "unaccounted": Check(
-        "errors left out",
-        ALWAYS,
-        "what is not known of geometry or law is not in the intervals: {what}",
-        "close the valve with a finer mesh, or state these errors smaller",
-    ),
-    "innovation": Check(
-        "size of what is left over",
-        (1.0, NIS_FACTOR),
-        "what the fit leaves over is {root:.2f} times what its errors explain, expected {low:.2f} "
-        "to {high:.2f}",
-        "state larger errors, or look where the model cannot follow (map of the innovation)",
-    ),
-    "alike": Check(
-        "pattern of what is left over",
-        (ALIKE, math.inf),
-        "what the fit leaves over is alike at neighbouring points (correlation {alike:.2f}, "
-        "expected below {limit:g})",
-        "errors are smoother than believed, or the model has another shape: see their map",
-    ),
-    "stretch": Check(
-        "what was known beforehand",
-        STRETCH,
-        "{what} was moved by {value:.1f} of its standard deviations, expected at most {limit:g}",
-        "check what the case says of it; if it is right, {what} makes up for something else that "
-        "is wrong",
-    ),
-    "data_alone": Check(
-        "data against prior",
-        (FAR, math.inf),
-        "the data alone have {what} {value:.1f} of its prior's standard deviations from the "
-        "prior's mean, expected at most {limit:g}: the estimate lies between the two",
-        "see the estimate by the data alone; widen the prior if such a modulus may be",
-    ),
-    "held_out": Check(
-        "frames held out",
-        ALWAYS,
-        "frame {frame}, which was not fitted, is {fitted:.2f} mm from the fitted valve and "
-        "{generic:.2f} mm from the generic one",
-        "the moduli do not predict; check that frame's pressure and annulus",
-    ),
-    "closure": Check(
-        "closure",
-        LEAK,
-        "the fitted valve leaves {fitted:.0f} mm² free, the observed one {observed:.0f} mm²",
-        "chordae too short, leaflets too small, or tips too far: check them",
-    ),
-    "again": Check(
-        "closed anew",
-        ALWAYS,
-        "the fitted valve, closed anew from the open one, ends in another closed state",
-        "ask the gate of this valve (check=true gate=true)",
-    ),
-    "gate": Check(
-        ONE_STATE,
-        ALWAYS,
-        "the valve did not pass the gate: its closed state is not the only one, or jumps while "
-        "moduli change",
-        "the gate says by what (experiment=gate, check=true gate=true); a finer mesh or denser "
-        "contact samples may mend it",
-    ),
+    key: Check(**row)
+    for key, row in tomllib.loads(
+        Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
+    ).items()
 }
-"""What is looked at, by key.
-
-failed, unfinished, approximation
-    Why there is no estimate, why the iterations did not end, what is wrong with the filter's
-    approximation of the posterior.
-moved
-    Standard deviations of a modulus by which the estimate is away from the last linearisation point
-    of the geometry.
-law
-    Share of the way from the linear law to an exponential one at which the tissue is expected.
-mistakes, doubts, unlike
-    Of the case (`mvest.cases.plausibility`); how its volume is unlike those of the detectors.
-unaccounted
-    Why some errors of geometry or law are not in the intervals.
-innovation
-    Normalised innovation squared over the upper end of its 95 % band.
-alike
-    Size of the correlation of whitened residuals at neighbouring points (Moran's I).
-stretch, data_alone
-    Standard deviations by which something known beforehand was moved, and by which the data alone
-    have a modulus away from its prior's mean.
-held_out, closure
-    mm by which a frame that was not fitted is farther from the fitted valve than it may be; mm² by
-    which the fitted valve is more open than the observed one.
-again, gate
-    1 where the fitted valve did not close to the same state again, or the gate was not passed.
-"""
+"""What is looked at, by key: ``checks.toml``."""
 
 NEEDED = ("innovation", "stretch")
 """Checks without which no estimate is trustworthy."""
+
+ONE_STATE = CHECKS["gate"].name

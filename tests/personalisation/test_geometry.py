@@ -41,7 +41,7 @@ from mvest.personalisation.geometry import (
 from mvest.personalisation.model import CaseClosure
 from mvest.personalisation.sources import geometry_sources
 from mvest.problem.registration import REGISTRATION, RegisteredModel
-from mvest.problem.verdict import MOVED
+from mvest.problem.verdict import CHECKS
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 from tests.made_up_closure import (
@@ -383,7 +383,7 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
         assert fit.moved < SETTLED
     else:
         # Twelve steps do not reach the end of such a valley, although the estimate is there.
-        assert fit.moved > MOVED
+        assert fit.moved > CHECKS["moved"].limits[0]
 
 
 def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
