@@ -18,7 +18,7 @@ from mvest.estimation import Prediction
 from mvest.estimation.noise import ErrorColumns
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.personalisation import CaseMesh, PersonaliseSettings, Prior, Treatment
+from mvest.personalisation import PersonaliseSettings, Prior, Treatment
 from mvest.personalisation.geometry import GeometryModes
 from mvest.personalisation.sources import LAW, ErrorSource
 from mvest.problem.registration import REGISTRATION, displace
@@ -72,9 +72,7 @@ def unknowns(treatment: Treatment = Treatment.ESTIMATED, **means: float) -> tupl
 
 def settings(*given: Prior, **changes: Any) -> PersonaliseSettings:
     """Settings with some unknowns, all of them estimated if none are given; errors as stated."""
-    return PersonaliseSettings(
-        given or unknowns(), MECHANICS, CaseMesh(), **{"errors": None} | changes
-    )
+    return PersonaliseSettings(given or unknowns(), MECHANICS, **{"errors": None} | changes)
 
 
 def _fields() -> dict[str, np.ndarray]:

@@ -104,10 +104,10 @@ def test_errors_of_pressures_widen_the_intervals(monkeypatch):
     calibrated = [replace(u, std=0.005) if u.name == "pressure_scale" else u for u in unknowns()]
     known = expect_case(case, settings(*calibrated))
     doubted = expect_case(case, settings(*calibrated, pressures=PressureErrors(0.0, 5.0)))
-    names = [{unknown.name for unknown in one.unknowns} for one in (known, doubted)]
+    names = [{unknown["name"] for unknown in one.unknowns} for one in (known, doubted)]
     assert names[1] - names[0] == {f"{ERROR}.early", f"{ERROR}.closed"}
     for before, after in zip(known.unknowns[:2], doubted.unknowns[:2], strict=True):
-        assert after.width > 1.02 * before.width
+        assert after["width"] > 1.02 * before["width"]
 
 
 def test_errors_of_each_frame_are_learned(monkeypatch):

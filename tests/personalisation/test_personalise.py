@@ -445,7 +445,9 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
         Prior("shift.z", 0.0, 1.0),
     ]
     protocol = ClosureProtocol(ramp=0.2, dt=0.04, growth=2.0, end=0.4)
-    wanted = PersonaliseSettings(tuple(given), replace(MECHANICS, protocol=protocol), TWIN, 1e-5)
+    wanted = PersonaliseSettings(
+        tuple(given), replace(MECHANICS, protocol=protocol), mesh=TWIN, tolerance=1e-5
+    )
     case = made_up_case(std_mm=1e-3)
     model = build_model(case, wanted)
     twin = RegisteredModel(model, names)

@@ -132,7 +132,7 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
             reach_mm=reach_mm if shut else None,
         )
         if at_rest:
-            ends = cKDTree(vertices).query(insertion)[1]
+            ends = np.asarray(cKDTree(vertices).query(insertion)[1], dtype=np.int64)
             fields = replace(fields, chord_tip=chordae.tip, chord_insertion=ends)
         title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         # Of a closed one the gap is drawn, as of a frame that is not the reference.
