@@ -15,7 +15,7 @@ from matplotlib.collections import PolyCollection
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, View
+from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, View, scale_bar
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.annulus import annulus_plane
@@ -42,7 +42,6 @@ LARGEST_EDGE_MM = 1.2
 """Triangles are drawn by the depth of their middles; below this, touching leaflets stay apart."""
 MAX_SPLITS = 2
 LINE_PIECES = 6
-SCALE_MM = 10.0
 HIGH_QUANTILE = 0.99
 
 Part: TypeAlias = tuple[FloatArray, FloatArray, float]
@@ -246,9 +245,4 @@ def same_scale(panels: Sequence[Any], shapes: Sequence[FloatArray], view: View) 
     for axes in panels:
         axes.set_xlim(low[0] - margin, high[0] + margin)
         axes.set_ylim(low[1] - 1.8 * margin, high[1] + margin)
-    # Below everything else, where no leaflet's name is written.
-    x, y = low[0] - 0.5 * margin, low[1] - 1.6 * margin
-    panels[0].plot([x, x + SCALE_MM], [y, y], color="black", linewidth=2, solid_capstyle="butt")
-    panels[0].text(
-        x + SCALE_MM / 2, y + 0.15 * margin, f"{SCALE_MM:.0f} mm", fontsize=8, ha="center"
-    )
+    scale_bar(panels[0], "black")
