@@ -12,5 +12,4 @@ from .settings import PaperSettings as PaperSettings
 from .settings import PersonaliseSettings as PersonaliseSettings
 from .settings import PressureErrors as PressureErrors
 from .settings import Prior as Prior
-from .settings import Treatment as Treatment
 from .settings import default_settings as default_settings

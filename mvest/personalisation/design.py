@@ -30,7 +30,7 @@ from mvest.personalisation.estimation import CaseProblem, linearised, sampled
 from mvest.personalisation.known import LinearModel, narrower, variance_shares
 from mvest.personalisation.model import build_coarse, build_model
 from mvest.personalisation.result import Expected
-from mvest.personalisation.settings import PersonaliseSettings, PressureErrors, Treatment
+from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
 from mvest.problem.estimate import expected_intervals
 
 
@@ -226,7 +226,7 @@ def design_case(
     case = replace(case, frames=(case.frame(Role.REFERENCE), *frames), error_samples=None)
     stated = settings.pressures or PressureErrors(0.0, 0.0)
     # As unknowns they are differentiated by; how large they are is for the designs to say.
-    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    free = [u.name for u in settings.unknowns if not u.fixed]
     differentiated = PressureErrors(1.0, 1.0) if SCALE in free else None
     problem = CaseProblem.of(case, replace(settings, pressures=differentiated), model=model)
     registered, start = problem.stated.registered, problem.start

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 
@@ -35,16 +34,9 @@ STIFFENS = "stiffening."
 """How the names of unknowns begin that say how far a leaflet's tissue stiffens."""
 
 
-class Treatment(Enum):
-    """What becomes of an unknown: estimated, or fixed at its mean."""
-
-    ESTIMATED = "estimated"
-    FIXED = "fixed"
-
-
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known beforehand of one unknown of a case, and what becomes of it.
+    """What is known beforehand of one unknown of a case.
 
     Attributes
     ----------
@@ -53,13 +45,14 @@ class Prior:
         ``pressure_scale`` (a factor) ..., or ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
     mean, std : float
         In the same unit.
-    treatment : Treatment
+    fixed : bool
+        Whether it is fixed at its mean instead of estimated.
     """
 
     name: str
     mean: float
     std: float
-    treatment: Treatment = Treatment.ESTIMATED
+    fixed: bool = False
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
@@ -248,12 +241,12 @@ class PersonaliseSettings(CaseChoices):
         if len(set(names)) != len(names):
             raise InputError(f"unknowns {', '.join(names)} are not all different")
         for u in self.unknowns:
-            if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
+            if u.name in REGISTRATION and u.fixed and u.mean != 0:
                 raise InputError(
                     f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
                     "estimated"
                 )
-        if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
+        if not any(u.is_modulus and not u.fixed for u in self.unknowns):
             raise InputError(
                 f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
                 "E_f.REGION that is estimated"
@@ -352,7 +345,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
     return replace(
         surfaces,
         unknowns=tuple(
-            replace(unknown, treatment=Treatment.FIXED) if unknown.name in REGISTRATION else unknown
+            replace(unknown, fixed=True) if unknown.name in REGISTRATION else unknown
             for unknown in UNKNOWNS
         ),
         errors=ErrorBeliefs(resolution_mm=0.3),

@@ -20,7 +20,7 @@ from mvest.estimation.transform import Log, to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import Treatment, estimation, personalise
+from mvest.personalisation import estimation, personalise
 from mvest.personalisation.chain import predicted_frames
 from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.estimation import (
@@ -336,7 +336,7 @@ def bent_case(monkeypatch, curve, std):
 def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(monkeypatch, curve):
     std = 0.5
     case, known = bent_case(monkeypatch, curve, std)
-    free = unknowns(Treatment.FIXED, **known)
+    free = unknowns(fixed=True, **known)
     seen = case.frame(Role.CLOSED).vertices.ravel()
 
     def objective(z):
@@ -400,7 +400,7 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
     fit = personalise(
         case,
         settings(
-            *unknowns(Treatment.FIXED, **known),
+            *unknowns(fixed=True, **known),
             considered_geometry=ConsideredGeometry(renewals=6),
             tolerance=1e-9,
         ),
@@ -419,7 +419,7 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
 
 def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
-    others = [u for u in unknowns(Treatment.FIXED, **known) if u.name != "pressure_scale"]
+    others = [u for u in unknowns(fixed=True, **known) if u.name != "pressure_scale"]
     given = settings(
         replace(unknowns()[2], std=0.3),
         *others,
@@ -487,7 +487,7 @@ def test_frames_that_are_not_fitted_are_held_as_the_closed_one_is(monkeypatch):
     later = replace(closed, name="later", time=1.0, role=Role.HELD_OUT)
     case = replace(case, frames=(*case.frames, later))
     parts = {"annulus": np.full(closed.annulus.shape, 0.3), "tips": np.full((1, 3), -0.4)}
-    problem = CaseProblem.of(case, settings(*unknowns(Treatment.FIXED, **known)))
+    problem = CaseProblem.of(case, settings(*unknowns(fixed=True, **known)))
     stated = problem.generic()
     off = replace(stated, closure=replace(stated.closure, displacement=parts))
     for place, by, tips in ((stated, 0.0, 0.0), (off, 0.3, -0.4)):
@@ -544,7 +544,7 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
         personalise(
             case,
             settings(
-                *unknowns(Treatment.FIXED, **known),
+                *unknowns(fixed=True, **known),
                 considered_geometry=ConsideredGeometry(renewals=renewals),
             ),
         )
@@ -562,7 +562,7 @@ def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
     fit = personalise(
         case,
         settings(
-            *unknowns(Treatment.FIXED, **known),
+            *unknowns(fixed=True, **known),
             considered_geometry=ConsideredGeometry(renewals=2),
             considered_law={"anterior": ExponentialTissue(0.06, 4.325, 1446.5)},
         ),

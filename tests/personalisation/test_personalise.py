@@ -17,7 +17,6 @@ from mvest.personalisation import (
     PaperSettings,
     PersonaliseSettings,
     Prior,
-    Treatment,
     build_model,
     personalise,
 )
@@ -53,7 +52,7 @@ def true_of(found):
 
 def right_nuisances():
     """The moduli unknown, what acts on the closure fixed where it truly is."""
-    given = unknowns(Treatment.FIXED)
+    given = unknowns(fixed=True)
     return (*given[:2], *(replace(u, mean=TRUE[u.name]) for u in given[2:5]))
 
 
@@ -102,7 +101,7 @@ def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch)
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     whole = personalise(case, settings(moduli_only=True))
-    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
+    fixed = personalise(case, settings(*unknowns(fixed=True)))
     assert fixed.names == MODULI
     assert whole.moduli_only.parameters == MODULI
     np.testing.assert_array_equal(fixed.result.estimate, whole.moduli_only.estimate)
@@ -326,7 +325,7 @@ def test_the_fitted_valve_is_closed_anew(monkeypatch):
 
 BAD = [
     ((), "at least one modulus"),
-    ((Prior("E_f.anterior", 6.0, 3.0, Treatment.FIXED),), "at least one modulus"),
+    ((Prior("E_f.anterior", 6.0, 3.0, fixed=True),), "at least one modulus"),
     ((Prior("E_f.anterior", 6.0, 3.0),) * 2, "not all different"),
 ]
 
@@ -372,7 +371,7 @@ def test_unknown_unknowns_are_refused_before_anything_is_closed(name):
 @pytest.mark.parametrize("name", ["shift.x", "turn.z"])
 def test_a_displacement_that_is_fixed_elsewhere_is_not_passed_over(name):
     with pytest.raises(InputError, match=f"{name} is fixed at 1.0"):
-        settings(*unknowns()[:2], Prior(name, 1.0, 0.5, Treatment.FIXED))
+        settings(*unknowns()[:2], Prior(name, 1.0, 0.5, fixed=True))
 
 
 def test_a_structured_mesh_is_of_two_leaflets():
@@ -399,7 +398,7 @@ SMALL = CaseMesh(
 
 def test_the_model_has_the_pressure_and_the_boundary_of_the_case():
     case = made_up_case()
-    given = (*unknowns()[:2], Prior("pressure_scale", 1.3, 0.1, Treatment.FIXED), *unknowns()[4:])
+    given = (*unknowns()[:2], Prior("pressure_scale", 1.3, 0.1, fixed=True), *unknowns()[4:])
     wanted = replace(settings(*given), mesh=SMALL)
     model = build_model(case, wanted)
     assert model.settings.protocol.pressure_mmHg == 100.0

@@ -38,7 +38,6 @@ from mvest.personalisation.settings import (
     CaseChoices,
     PersonaliseSettings,
     Prior,
-    Treatment,
     with_stiffening,
 )
 from mvest.problem.record import Row
@@ -58,7 +57,7 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         If a setting is inadmissible.
     """
     unknowns = tuple(
-        Prior(name, about.mean, about.std, Treatment(about.treatment))
+        Prior(name, about.mean, about.std, about.treatment == "fixed")
         for name, about in personal.unknowns.items()
     )
     choices = {f.name: getattr(personal, f.name) for f in fields(CaseChoices)}
@@ -89,7 +88,7 @@ def run_case(
         print(f"doubtful: {doubt}", file=sys.stderr)
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
-    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    free = [u.name for u in settings.unknowns if not u.fixed]
     # As they are estimated: those of the closure first.
     names = sorted(free, key=lambda name: name in REGISTRATION)
     with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
