@@ -227,6 +227,7 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
         "chord_tip": case.chordae.tip,
         "chord_insertion": cKDTree(surface.vertices).query(case.chordae.insertion)[1],
         "generic": [fit.generic[frame.name] for frame in frames],
+        "registered": [fit.registered[frame.name] for frame in frames],
         "fitted": [fit.fitted[frame.name] for frame in frames],
         "reach_mm": fit.settings.mechanics.contact.activation_distance * edge_thickness,
     }
