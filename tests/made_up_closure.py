@@ -18,7 +18,7 @@ from mvest.estimation import Prediction
 from mvest.estimation.noise import ErrorColumns
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.personalisation import CaseMesh, PersonaliseSettings, Prior, Treatment
+from mvest.personalisation import PersonaliseSettings, Prior
 from mvest.personalisation.geometry import GeometryModes
 from mvest.personalisation.sources import LAW, ErrorSource
 from mvest.problem.registration import REGISTRATION, displace
@@ -57,24 +57,17 @@ PRIORS = {
 }
 
 
-def unknowns(treatment: Treatment = Treatment.ESTIMATED, **means: float) -> tuple[Prior, ...]:
-    """The moduli estimated, everything else treated in one way."""
+def unknowns(fixed: bool = False, **means: float) -> tuple[Prior, ...]:
+    """The moduli estimated, everything else estimated or fixed."""
     return tuple(
-        Prior(
-            name,
-            means.get(name, mean),
-            std,
-            Treatment.ESTIMATED if name.startswith("E_f.") else treatment,
-        )
+        Prior(name, means.get(name, mean), std, fixed and not name.startswith("E_f."))
         for name, (mean, std) in PRIORS.items()
     )
 
 
 def settings(*given: Prior, **changes: Any) -> PersonaliseSettings:
     """Settings with some unknowns, all of them estimated if none are given; errors as stated."""
-    return PersonaliseSettings(
-        given or unknowns(), MECHANICS, CaseMesh(), **{"errors": None} | changes
-    )
+    return PersonaliseSettings(given or unknowns(), MECHANICS, **{"errors": None} | changes)
 
 
 def _fields() -> dict[str, np.ndarray]:
@@ -245,14 +238,14 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
     def build(case: ValveCase, wanted: PersonaliseSettings, store: Any = None) -> MadeUpClosure:
         other = (*REGISTRATION, OFFSET, ERROR)
         own = [u for u in wanted.unknowns if not u.name.startswith(other)]
-        free = tuple(u.name for u in own if u.treatment is not Treatment.FIXED)
-        fixed = {u.name: u.mean for u in own if u.treatment is Treatment.FIXED}
+        free = tuple(u.name for u in own if not u.fixed)
+        fixed = {u.name: u.mean for u in own if u.fixed}
         built.append(MadeUpClosure(free, fixed, **changes))
         return built[-1]
 
     monkeypatch.setattr("mvest.personalisation.estimation.build_model", build)
     monkeypatch.setattr("mvest.personalisation.design.build_model", build)
-    monkeypatch.setattr("mvest.personalisation.check.build_coarse", build)
+    monkeypatch.setattr("mvest.personalisation.design.build_coarse", build)
     monkeypatch.setattr("mvest.personalisation.errors.geometry_modes", lambda *_: ())
     monkeypatch.setattr("mvest.personalisation.errors.law_and_mesh_sources", lambda *_: ())
     return built

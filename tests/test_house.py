@@ -137,7 +137,6 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.estimation",
         "mvest.problem",
         "mvest.cases",
-        "mvest.personalisation.check",
         "mvest.personalisation.record",
         "mvest.personalisation.result",
     ),

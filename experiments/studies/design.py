@@ -29,7 +29,7 @@ from mvest.estimation.information.design import Design, together
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.design import FrameDesigns, StatedErrors, design_case
+from mvest.personalisation.design import FrameDesigns, design_case
 from mvest.personalisation.geometry import ConsideredGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
@@ -313,7 +313,11 @@ def _tried(
     patient = _patient(values, about, corner, further)
     fit = personalise(patient.case, replace(wanted, unknowns=unknowns, pressures=pressures))
     record = record_of(fit.result, seed=values["seed"], case=name, simulated=True)
-    stated = StatedErrors(corner.factor, corner.offset_mmHg, corner.each_mmHg)
+    stated = {
+        "factor": corner.factor,
+        "offset": corner.offset_mmHg,
+        "each": corner.each_mmHg,
+    }
     kept = record.without_details().with_truth(patient.values)
     return kept, designs.left(corner.frames, stated)
 

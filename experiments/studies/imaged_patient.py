@@ -46,7 +46,7 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.observation.errors import SpatialCorrelation
 from mvest.problem.record import EstimateRecord, Unknown
-from mvest.problem.stored import Store
+from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import skill_table, verdict_table
@@ -166,8 +166,8 @@ def make_imaged_patient(values: Values, patient: PatientSettings, echo: EchoSett
         "uncertainty": KNOWN_UNCERTAINTY,
         "seed": values["seed"],
     }
-    store = Store(values["paths"]["outputs"])
-    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+    folder = Path(values["paths"]["outputs"]) / "virtual"
+    entry = entry_of(folder, described, (_simulate, _write), _place, "{key}")
     return entry.get_or_make(
         lambda: _simulate(values, patient, echo),
         lambda root, made: _write(root, made, patient, described),

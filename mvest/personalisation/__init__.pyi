@@ -1,7 +1,7 @@
 from .chain import personalise as personalise
-from .check import expect_case as expect_case
 from .design import FrameDesigns as FrameDesigns
 from .design import design_case as design_case
+from .design import expect_case as expect_case
 from .model import build_model as build_model
 from .model import gate_case as gate_case
 from .record import record_of_case as record_of_case
@@ -12,5 +12,4 @@ from .settings import PaperSettings as PaperSettings
 from .settings import PersonaliseSettings as PersonaliseSettings
 from .settings import PressureErrors as PressureErrors
 from .settings import Prior as Prior
-from .settings import Treatment as Treatment
 from .settings import default_settings as default_settings

@@ -126,8 +126,6 @@ def personalise(
         case=case,
         settings=problem.settings,
         mesh=place.closure.model.mesh,
-        names=problem.names,
-        prior=problem.prior,
         result=result,
         moduli_only=moduli_only,
         paper=paper,

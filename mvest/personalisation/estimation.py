@@ -40,7 +40,7 @@ from mvest.personalisation.model import (
     frames_model,
     with_pressures,
 )
-from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Prior, Treatment
+from mvest.personalisation.settings import PaperSettings, PersonaliseSettings, Prior
 from mvest.problem.estimate import Observed, Problem, StudyResult, estimate
 from mvest.problem.registration import REGISTRATION
 from mvest.typing import FloatArray
@@ -160,7 +160,7 @@ class CaseProblem:
         if model is None:
             model = build_model(case, settings, store)
             model.on_step = on_step
-        free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+        free = [u for u in settings.unknowns if not u.fixed]
         own = [u for u in free if u.name not in REGISTRATION]
         unknowns = (*own, *(u for u in free if u.name in REGISTRATION))
         prior = Gaussian.from_variance(

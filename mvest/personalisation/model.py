@@ -16,7 +16,7 @@ from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
 from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.valve_system import HeldState, check_parameters
-from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior, Treatment
+from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
@@ -107,8 +107,8 @@ def build_coarse(
     """The same on the mesh of the guide alone, where there are two leaflets; see `build_model`."""
     _check_unknowns(case, settings)
     mechanical = _mechanical(settings)
-    free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
-    fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
+    free = tuple(u.name for u in mechanical if not u.fixed)
+    fixed = {u.name: u.mean for u in mechanical if u.fixed}
     protocol = settings.mechanics.protocol
     if case.closed is not None:
         protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)

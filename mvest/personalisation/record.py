@@ -7,16 +7,14 @@ whose rows were not computed is missing. Lengths are in mm, intervals hold 95 %.
 name           columns of a row
 ============== ==================================================================================
 about          (one row) description, source, licence, sha256, regions, derived, implausible,
-               std_mm and correlation_length_mm of an observed coordinate, confirmed_mm (largest
-               distance of the fitted closed valve from the one closed anew), law_share (how far
-               the tissue is expected to be on its way from the linear law to an exponential one),
-               error_samples (how many entered)
+               confirmed_mm (largest distance of the fitted closed valve from the one closed anew),
+               law_share (how far the tissue is expected to be on its way from the linear law to an
+               exponential one), error_samples (how many entered)
 settings       setting, value
 check          (one row) compared, value, limit: `mvest.estimation.check.ApproximationCheck`
 errors         name, unit (empty: a factor), believed, believed_low, believed_high, learned, low,
                high, stretch: what was learned of the errors of the closed frame
 geometry       name, unit, size, stretch: `mvest.personalisation.result.GeometryShift`
-whiteness      name, statistic, p_value: tests of the standardised innovation
 known          name, unit, estimate, low, high, generic: what follows from the estimate
                (`mvest.personalisation.known.Quantity`)
 data_alone     parameter, estimate, low, high, prior_stds: moduli without their priors
@@ -24,53 +22,40 @@ shares         source, parameter, share: where the variance of a modulus' logari
 narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
-seconds        part, seconds: wall-clock time
 image_step     with image_frames and pictures: `DetectedValve.details`
 ============== ==================================================================================
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, fields, is_dataclass
 from typing import Any
 
 import numpy as np
-from scipy import sparse
+from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import doubts
-from mvest.closure.frames import ERROR, OFFSET
-from mvest.estimation.information.consistency import moran, zero_mean
-from mvest.personalisation.indications import indications_of
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import FrameDistance, Personalised
 from mvest.problem.estimate import StudyResult
+from mvest.problem.fields import as_stored
 from mvest.problem.record import (
     EstimateRecord,
     FrameFit,
     Numbers,
     Row,
     Spread,
-    Unknown,
     finite,
     record_of,
 )
-from mvest.problem.registration import unit_of
+from mvest.problem.registration import label_of
 from mvest.problem.verdict import judge
-from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.typing import FloatArray
 from mvest.valve.measure.clinical import clinical_measurements
 
 Rows = tuple[Row, ...]
-
-LABELS = {
-    "pressure_scale": "pressure (factor)",
-    OFFSET: "offset of pressures",
-    "chord_stiffness": "chordal stiffness (factor)",
-    "chord_rest_length": "chordal rest length (factor)",
-    "stiffening": "stiffening",
-    "prestretch": "stretch when seen open (factor)",
-}
 
 
 def record_of_case(
@@ -92,10 +77,10 @@ def record_of_case(
     result, images = fit.result, images or {}
     others = {"moduli_only": fit.moduli_only, "paper": fit.paper}
     unlike = images["image_step"][0]["unlike"] if "image_step" in images else ""
-    details = {name: tuple(rows) for name, rows in _details(fit)} | dict(images)
+    details = {name: tuple(rows) for name, rows in _details(fit).items()} | dict(images)
     return _record(fit, result).model_copy(
         update={
-            "verdict": judge(replace(indications_of(fit, gate), unlike=unlike)),
+            "verdict": judge(diagnostics_of(fit, gate, unlike)),
             "correlation": _correlation(result),
             "frames": tuple(map(_frame_fit, fit.distances)),
             "alternatives": {
@@ -106,39 +91,14 @@ def record_of_case(
     )
 
 
-def label_of(name: str) -> str:
-    """What a reader calls an unknown: ``E_f anterior`` for ``E_f.anterior``."""
-    kind, _, part = name.partition(".")
-    if kind in ("E_f", "E_perp", "G"):
-        return f"{kind} {part}"
-    if kind == ERROR:
-        return f"pressure in frame {part}"
-    if kind in ("shift", "turn"):
-        return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
-    return LABELS.get(name, name)
-
-
 def _record(fit: Personalised, result: StudyResult) -> EstimateRecord:
-    """The record of one of a case's estimations, with what its settings say of each unknown."""
+    """The record of one of a case's estimations, with its priors as they were stated."""
     record = record_of(result, case=fit.case.name, simulated=fit.case.simulated)
-    own = record.unknowns or tuple(
-        Unknown(name=name, unit=unit_of(name)) for name in result.parameters
-    )
-    about = {unknown.name: unknown for unknown in fit.settings.unknowns}
-
-    def told(row: Unknown) -> Unknown:
-        more: dict[str, Any] = {"label": label_of(row.name)}
-        if row.name in about:
-            prior = about[row.name]
-            more |= {
-                "kind": "modulus" if prior.is_modulus else "nuisance",
-                "treatment": prior.treatment.value,
-                "prior_mean": prior.mean,
-                "prior_std": prior.std,
-            }
-        return row.model_copy(update=more)
-
-    return record.model_copy(update={"unknowns": tuple(map(told, own))})
+    stated = {
+        own.name: {"prior_mean": own.mean, "prior_std": own.std} for own in fit.settings.unknowns
+    }
+    unknowns = tuple(one.model_copy(update=stated.get(one.name, {})) for one in record.unknowns)
+    return record.model_copy(update={"unknowns": unknowns})
 
 
 def _correlation(result: StudyResult) -> tuple[Numbers, ...]:
@@ -151,48 +111,18 @@ def _correlation(result: StudyResult) -> tuple[Numbers, ...]:
 
 
 def _frame_fit(distance: FrameDistance) -> FrameFit:
-    return FrameFit(
-        frame=distance.frame,
-        seen=distance.seen,
-        generic=Spread.of(distance.generic),
-        registered=Spread.of(distance.registered),
-        personalised=Spread.of(distance.personalised),
-    )
-
-
-def _details(fit: Personalised) -> Iterator[tuple[str, Iterator[Row]]]:
-    """Name -> rows; see the head of this module."""
-    yield "about", iter([_about(fit)])
-    yield "settings", _settings("", fit.settings)
-    check = None if fit.result.filtered is None else fit.result.filtered.check
-    if check is not None:
-        row = {"compared": check.compared, "value": finite(check.value), "limit": check.limit}
-        yield "check", iter([row])
-    yield "errors", _errors(fit.result)
-    yield "whiteness", _whiteness(fit)
-    known = fit.known
-    rows: dict[str, Sequence[Any]] = {
-        "geometry": known.geometry,
-        "known": known.quantities,
-        "data_alone": known.data_alone,
+    models = {
+        name: Spread.of(getattr(distance, name))
+        for name in ("generic", "registered", "personalised")
     }
-    for name, own in rows.items():
-        yield name, map(_fields, own)
-    yield (
-        "narrower",
-        (
-            _fields(row) | {"what": f"{label_of(row.parameter)}, {row.what}"}
-            for row in known.narrower
-        ),
-    )
-    yield "shares", (_fields(row) | {"source": label_of(row.source)} for row in known.shares)
-    yield "measurements", _measurements(fit)
-    yield "seconds", ({"part": part, "seconds": s} for part, s in fit.seconds.items())
+    return FrameFit(frame=distance.frame, seen=distance.seen, **models)
 
 
-def _about(fit: Personalised) -> Row:
-    case = fit.case
-    return {
+def _details(fit: Personalised) -> dict[str, Iterable[Row]]:
+    """Name -> rows; see the head of this module."""
+    case, known, filtered = fit.case, fit.known, fit.result.filtered
+    check = None if filtered is None else filtered.check
+    about = {
         "description": case.description,
         "source": case.source,
         "licence": case.licence,
@@ -200,22 +130,36 @@ def _about(fit: Personalised) -> Row:
         "regions": list(case.surface.region_names),
         "derived": list(case.derived),
         "implausible": list(map(str, doubts(case))),
-        "std_mm": case.uncertainty.typical_mm,
-        "correlation_length_mm": case.uncertainty.correlation_length_mm,
         "confirmed_mm": fit.confirmed_mm,
-        "law_share": fit.known.law_share,
+        "law_share": known.law_share,
         "error_samples": fit.error_samples,
     }
-
-
-def _fields(row: Any) -> dict[str, Any]:
-    return {field.name: getattr(row, field.name) for field in fields(row)}
+    checked = check and {
+        "compared": check.compared,
+        "value": finite(check.value),
+        "limit": check.limit,
+    }
+    return {
+        "about": [about],
+        "settings": _settings("", fit.settings),
+        "check": [checked] if checked else [],
+        "errors": _errors(fit.result),
+        "geometry": map(asdict, known.geometry),
+        "known": map(asdict, known.quantities),
+        "data_alone": map(asdict, known.data_alone),
+        "narrower": (
+            asdict(row) | {"what": f"{label_of(row.parameter)}, {row.what}"}
+            for row in known.narrower
+        ),
+        "shares": (asdict(row) | {"source": label_of(row.source)} for row in known.shares),
+        "measurements": _measurements(fit),
+    }
 
 
 def _settings(name: str, value: Any) -> Iterator[Row]:
     """The settings below ``name``, a row each; unknowns are in the record itself."""
     if is_dataclass(value):
-        value = _fields(value)
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
         for key, item in value.items():
             if key != "unknowns":
@@ -243,33 +187,6 @@ def _errors(result: StudyResult) -> Iterator[Row]:
         }
 
 
-def _whiteness(fit: Personalised) -> Iterator[Row]:
-    """Tests of the standardised innovation of the closed frame."""
-    filtered, surface = fit.result.filtered, fit.case.surface
-    if filtered is None or filtered.standardised is None:
-        return
-    standardised = filtered.standardised
-    tests = {"mean zero": zero_mean(standardised)}
-    if standardised.size == surface.vertices.size * (1 + len(fit.case.fitted)):
-        adjacency = _adjacency(len(surface.vertices), surface.triangles)
-        by_axis = standardised[-surface.vertices.size :].reshape(-1, 3)
-        for k, axis in enumerate("xyz"):
-            tests[f"neighbours alike, {axis}"] = moran(by_axis[:, k], adjacency)
-    for name, test in tests.items():
-        yield {
-            "name": name,
-            "statistic": finite(test.statistic),
-            "p_value": finite(test.p_value),
-        }
-
-
-def _adjacency(n: int, triangles: IntArray) -> sparse.csr_array:
-    """Which of n vertices share an edge."""
-    a, b = surface_edges(triangles).T
-    rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
-    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-
-
 def _measurements(fit: Personalised) -> Iterator[Row]:
     case, surface = fit.case, fit.case.surface
     reach = fit.settings.mechanics.contact.activation_distance * float(surface.thickness.mean())
@@ -295,42 +212,30 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
     if not fit.distances:
         return {}
     case, surface = fit.case, fit.case.surface
-    frames = [d.frame for d in fit.distances]
     by_name = {frame.name: frame for frame in case.frames}
-    seen = [by_name[name] for name in frames]
-    shapes = {"generic": fit.generic, "registered": fit.registered, "fitted": fit.fitted}
-    reference = case.frame(Role.REFERENCE)
-    whole = {
+    frames = [by_name[distance.frame] for distance in fit.distances]
+    edge_thickness = surface.thickness[case.free_edge].mean()
+    arrays: dict[str, Any] = {
         "triangles": surface.triangles,
+        "region": surface.region,
+        "rest": surface.vertices,
         "annulus": case.annulus,
         "free_edge": case.free_edge,
+        "frames": [frame.name for frame in frames],
+        "seen": [distance.seen for distance in fit.distances],
+        "tips": [case.frame(Role.REFERENCE).papillary_tips, *(f.papillary_tips for f in frames)],
         "chord_tip": case.chordae.tip,
-        "chord_insertion": [
-            np.argmin(np.linalg.norm(surface.vertices - point, axis=1))
-            for point in case.chordae.insertion
-        ],
+        "chord_insertion": cKDTree(surface.vertices).query(case.chordae.insertion)[1],
+        "generic": [fit.generic[frame.name] for frame in frames],
+        "registered": [fit.registered[frame.name] for frame in frames],
+        "fitted": [fit.fitted[frame.name] for frame in frames],
+        "reach_mm": fit.settings.mechanics.contact.activation_distance * edge_thickness,
     }
-    reals: dict[str, Any] = {
-        "rest": surface.vertices,
-        "tips": np.stack([reference.papillary_tips, *(frame.papillary_tips for frame in seen)]),
-        **{name: np.stack([of[frame] for frame in frames]) for name, of in shapes.items()},
-    }
-    arrays: dict[str, Any] = {
-        "region": surface.region.astype(np.int8),
-        "frames": np.array(frames),
-        "seen": np.array([d.seen for d in fit.distances]),
-        "reach_mm": fit.settings.mechanics.contact.activation_distance
-        * surface.thickness[case.free_edge].mean(),
-    }
-    if all(frame.corresponds for frame in seen):
-        reals["observed"] = np.stack([frame.vertices for frame in seen])
-        if fit.settings.correspondence:
-            arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
-            arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
-    else:
-        reals |= {f"observed_points_{frame.name}": frame.vertices for frame in seen}
-    return (
-        arrays
-        | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}
-        | {name: values.astype(np.float32) for name, values in reals.items()}
-    )
+    if not all(frame.corresponds for frame in frames):
+        arrays |= {f"observed_points_{frame.name}": frame.vertices for frame in frames}
+        return as_stored(arrays)
+    arrays["observed"] = [frame.vertices for frame in frames]
+    if fit.settings.correspondence:
+        arrays["distance_generic"] = [distance.generic for distance in fit.distances]
+        arrays["distance_fitted"] = [distance.personalised for distance in fit.distances]
+    return as_stored(arrays)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.personalisation.estimation import CaseEstimate, CaseProblem, joint, slopes
@@ -135,34 +135,19 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True)
-class ExpectedUnknown:
-    """The interval of 95 % of one unknown beforehand and, about its prior mean, after an estimate.
+class Expected:
+    """What can be expected of an estimate; without unknowns the reason why that is not known.
 
     Attributes
     ----------
-    name, unit : str
-    generic : float
-        Where it is assumed to be.
-    low_before, high_before, low, high : float
-    width : float
-        Of the interval after over before, of the logarithm of what is positive.
+    unknowns : sequence of mapping
+        As `mvest.problem.estimate.expected_intervals` returns them.
+    shares, narrower
+        As in `Known`.
+    reason : str
     """
 
-    name: str
-    unit: str
-    generic: float
-    low_before: float
-    high_before: float
-    low: float
-    high: float
-    width: float
-
-
-@dataclass(frozen=True, slots=True)
-class Expected:
-    """What can be expected of an estimate; without unknowns the reason why that is not known."""
-
-    unknowns: tuple[ExpectedUnknown, ...] = ()
+    unknowns: Sequence[Mapping[str, Any]] = ()
     shares: tuple[VarianceShare, ...] = ()
     narrower: tuple[Narrower, ...] = ()
     reason: str = ""
@@ -199,10 +184,6 @@ class Personalised:
     case : ValveCase
     settings : PersonaliseSettings
     mesh : SolidMesh
-    names : tuple of str, (p,)
-        Unknowns that are estimated.
-    prior : Gaussian
-        Of these.
     result : StudyResult
     moduli_only : StudyResult or None
         With all nuisances fixed.
@@ -230,8 +211,6 @@ class Personalised:
     case: ValveCase
     settings: PersonaliseSettings
     mesh: SolidMesh
-    names: tuple[str, ...]
-    prior: Gaussian
     result: StudyResult
     moduli_only: StudyResult | None
     paper: StudyResult | None

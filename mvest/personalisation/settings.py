@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 
@@ -23,9 +22,11 @@ from mvest.quantities import (
     CellsAround,
     Count,
     EdgeLength,
+    Logarithm,
     PointsAlong,
     PointsAround,
     PressureError,
+    Tolerance,
     Value,
 )
 
@@ -33,16 +34,9 @@ STIFFENS = "stiffening."
 """How the names of unknowns begin that say how far a leaflet's tissue stiffens."""
 
 
-class Treatment(Enum):
-    """What becomes of an unknown: estimated, or fixed at its mean."""
-
-    ESTIMATED = "estimated"
-    FIXED = "fixed"
-
-
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known beforehand of one unknown of a case, and what becomes of it.
+    """What is known beforehand of one unknown of a case.
 
     Attributes
     ----------
@@ -51,13 +45,14 @@ class Prior:
         ``pressure_scale`` (a factor) ..., or ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
     mean, std : float
         In the same unit.
-    treatment : Treatment
+    fixed : bool
+        Whether it is fixed at its mean instead of estimated.
     """
 
     name: str
     mean: float
     std: float
-    treatment: Treatment = Treatment.ESTIMATED
+    fixed: bool = False
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
@@ -176,16 +171,12 @@ class PaperSettings:
     max_iterations: Count = 12
 
 
-@dataclass(frozen=True, slots=True)
-class PersonaliseSettings:
-    """How a case is personalised.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaseChoices:
+    """How a case is personalised, but for its unknowns and its mechanics.
 
     Attributes
     ----------
-    unknowns : tuple of Prior
-        The means of the moduli are the generic ones.
-    mechanics : MechanicsSettings
-        The pressure of its protocol is replaced by that of the closed frame.
     mesh : CaseMesh
     tolerance : float
         Of the filter, relative.
@@ -207,7 +198,7 @@ class PersonaliseSettings:
     considered_geometry : ConsideredGeometry or None
         How well the geometry is known that the model is built from: what is not counts as an error
         of the observation. None takes it as it was seen.
-    considered_law : mapping of str to ExponentialTissue
+    considered_law : dict of str to ExponentialTissue
         Leaflet -> another law that its tissue may follow: what it would do to the prediction counts
         as an error of the observation. Empty: the linear law is taken to be right.
     pressures : PressureErrors or None
@@ -215,20 +206,34 @@ class PersonaliseSettings:
         them but for the common factor, if that is an unknown.
     """
 
-    unknowns: tuple[Prior, ...]
-    mechanics: MechanicsSettings
     mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: float = 2e-3
-    max_iterations: int = 15
-    largest_change: float = 0.2
+    tolerance: Tolerance = 2e-3
+    max_iterations: Count = 15
+    largest_change: Logarithm = 0.2
     paper: PaperSettings | None = None
     moduli_only: bool = False
     confirm: bool = False
     correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
     considered_geometry: ConsideredGeometry | None = None
-    considered_law: Mapping[str, ExponentialTissue] = field(default_factory=dict)
+    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)
     pressures: PressureErrors | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PersonaliseSettings(CaseChoices):
+    """How a case is personalised.
+
+    Attributes
+    ----------
+    unknowns : tuple of Prior
+        The means of the moduli are the generic ones.
+    mechanics : MechanicsSettings
+        The pressure of its protocol is replaced by that of the closed frame.
+    """
+
+    unknowns: tuple[Prior, ...]
+    mechanics: MechanicsSettings
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none
@@ -236,12 +241,12 @@ class PersonaliseSettings:
         if len(set(names)) != len(names):
             raise InputError(f"unknowns {', '.join(names)} are not all different")
         for u in self.unknowns:
-            if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
+            if u.name in REGISTRATION and u.fixed and u.mean != 0:
                 raise InputError(
                     f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
                     "estimated"
                 )
-        if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
+        if not any(u.is_modulus and not u.fixed for u in self.unknowns):
             raise InputError(
                 f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
                 "E_f.REGION that is estimated"
@@ -340,7 +345,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
     return replace(
         surfaces,
         unknowns=tuple(
-            replace(unknown, treatment=Treatment.FIXED) if unknown.name in REGISTRATION else unknown
+            replace(unknown, fixed=True) if unknown.name in REGISTRATION else unknown
             for unknown in UNKNOWNS
         ),
         errors=ErrorBeliefs(resolution_mm=0.3),

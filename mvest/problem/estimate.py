@@ -7,11 +7,12 @@ The truth of a synthetic study is kept apart: ``estimate`` never sees it, and on
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from scipy.special import ndtri
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, OnIterate
@@ -184,6 +185,38 @@ class StudyResult:
         if self.fitted is None or self.truth is None:
             return None
         return np.linalg.norm(self.fitted[-1] - self.truth.positions[-1], axis=1)
+
+
+def expected_intervals(
+    names: Sequence[str],
+    transform: Transform,
+    generic: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+) -> list[dict[str, Any]]:
+    """The 95 % interval of each unknown about its generic value, before and after an estimation.
+
+    Parameters
+    ----------
+    names : sequence of str, (p,)
+    transform : Transform
+    generic : (p,)
+    before, after : (p,)
+        Standard deviations in filter coordinates.
+
+    Returns
+    -------
+    list of dict
+        ``name``, ``unit``, ``generic``, ``low_before``, ``high_before``, ``low``, ``high``, and
+        ``width``: that of the interval in filter coordinates, after over before.
+    """
+    z, reach = transform.forward(generic), float(ndtri(0.975))
+    columns = {"name": list(names), "unit": list(map(unit_of, names)), "generic": generic.tolist()}
+    for when, std in (("_before", before), ("", after)):
+        for end, sign in (("low", -1.0), ("high", 1.0)):
+            columns[end + when] = transform.inverse(z + sign * reach * std).tolist()
+    columns["width"] = np.divide(after, before, out=np.ones_like(after), where=before > 0).tolist()
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def estimate(

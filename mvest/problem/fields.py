@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,27 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve
 
 POINTS = "observed_points_"
-NEEDED = ("triangles", "region", "rest", "annulus", "frames", "seen")
+NEEDED = ("triangles", "region", "rest", "annulus", "seen")
 """Arrays that every case has."""
-INDICES = ("triangles", "region", "annulus", "free_edge", "chord_tip", "chord_insertion")
-SEEN = ("observed", "generic", "registered", "fitted", "truth")
-"""Shapes in all frames."""
 NO_INDEX: IntArray = np.empty(0, dtype=np.int64)
+SHAPES: Mapping[str, tuple[type, tuple[str | int, ...]]] = {
+    "seen": (bool, ("f",)),
+    "triangles": (np.int64, ("m", 3)),
+    "region": (np.int64, ("m",)),
+    "rest": (np.float64, ("n", 3)),
+    "annulus": (np.int64, ("a",)),
+    "free_edge": (np.int64, ("e",)),
+    "tips": (np.float64, ("f + 1", "t", 3)),
+    "chord_tip": (np.int64, ("c",)),
+    "chord_insertion": (np.int64, ("c",)),
+    **dict.fromkeys(("observed", "generic", "fitted"), (np.float64, ("f", "n", 3))),
+    **dict.fromkeys(("distance_generic", "distance_fitted"), (np.float64, ("f", "n"))),
+}
+"""Type and shape of each array; equal letters are equal lengths, and f is the number of frames."""
+INDEXED = {"triangles": "n", "annulus": "n", "free_edge": "n", "chord_insertion": "n",
+           "chord_tip": "t"}  # fmt: skip
+"""Arrays of indices, and below which length they are."""
+TURNED = ("rest", "tips", "observed", "generic", "fitted")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,23 +50,13 @@ class CaseFields:
 
     Attributes
     ----------
-    triangles : ndarray
-        ``(m, 3)``.
-    region : ndarray
-        ``(m,)`` leaflet of each triangle.
-    rest : ndarray
-        ``(n, 3)`` mm, the valve in the reference frame.
-    annulus, free_edge : ndarray
-        Vertices in loop order.
+    triangles, region, rest, annulus, free_edge, seen, tips, chord_tip, chord_insertion : ndarray
+        As in `SHAPES`: of the open valve in the reference frame (mm), loops in order, whether the
+        filter was shown a frame, papillary tips in the reference frame and then in the others (mm),
+        and the tip and the vertex at which each chord begins and ends.
     frames : tuple of str
         ``f`` names, the reference frame not among them.
-    seen : ndarray
-        ``(f,)`` whether the filter was shown the frame.
-    tips : ndarray
-        ``(f + 1, t, 3)`` mm, papillary tips in the reference frame and then in the others.
-    chord_tip, chord_insertion : ndarray
-        ``(c,)`` papillary tip and vertex at which each chord begins and ends.
-    observed, generic, registered, fitted, truth : ndarray or None
+    observed, generic, fitted : ndarray or None
         ``(f, n, 3)`` mm; NaN where a vertex was not seen.
     observed_points : mapping
         ``(q, 3)`` mm for a frame that does not correspond to the reference frame.
@@ -75,32 +79,28 @@ class CaseFields:
     chord_insertion: IntArray = field(default_factory=lambda: NO_INDEX)
     observed: FloatArray | None = None
     generic: FloatArray | None = None
-    registered: FloatArray | None = None
     fitted: FloatArray | None = None
-    truth: FloatArray | None = None
     distance_generic: FloatArray | None = None
     distance_fitted: FloatArray | None = None
     reach_mm: float | None = None
 
     def __post_init__(self) -> None:
-        f, n = len(self.frames), len(self.rest)
-        if not f or self.seen.shape != (f,):
-            raise InputError(f"{f} frames and seen {self.seen.shape}, expected ({f},) and f > 0")
-        if self.region.shape != (len(self.triangles),):
-            raise InputError(f"region {self.region.shape}, expected ({len(self.triangles)},)")
-        for name in SEEN:
-            _check(name, getattr(self, name), (f, n, 3))
-        for name in ("distance_generic", "distance_fitted"):
-            _check(name, getattr(self, name), (f, n))
-        _check("tips", self.tips, (f + 1, None, 3))
-        for name in ("triangles", "annulus", "free_edge", "chord_insertion"):
-            index = getattr(self, name)
-            if index.size and not 0 <= index.min() <= index.max() < n:
-                raise InputError(f"{name} names vertices outside 0 to {n - 1}")
-        if self.chord_tip.shape != self.chord_insertion.shape or np.any(
-            self.chord_tip >= self.tips.shape[1]
-        ):
-            raise InputError("chord_tip and chord_insertion do not fit each other or the tips")
+        f = len(self.frames)
+        if not f:
+            raise InputError("a case without frames, expected at least one")
+        lengths: dict[str | int, int] = {3: 3, "f": f, "f + 1": f + 1}
+        for name, (_, letters) in SHAPES.items():
+            if (array := getattr(self, name)) is None:
+                continue
+            # Letters that were not met before stand for what is here.
+            lengths = dict(zip(letters, array.shape, strict=False)) | lengths
+            expected = tuple(lengths.get(letter) for letter in letters)
+            if array.shape != expected:
+                raise InputError(f"{name} has the shape {array.shape}, expected {expected}")
+        for name, letter in INDEXED.items():
+            index, end = getattr(self, name), lengths[letter]
+            if index.size and not 0 <= index.min() <= index.max() < end:
+                raise InputError(f"{name} has indices outside 0 to {end - 1}")
 
     @property
     def closed(self) -> int:
@@ -119,19 +119,32 @@ class CaseFields:
         return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
 
 
+def as_stored(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Arrays as a run stores them: indices as int32, positions in single precision."""
+    stored = {name: np.asarray(values) for name, values in arrays.items()}
+    for name, values in stored.items():
+        if values.dtype.kind == "i":
+            stored[name] = values.astype(np.int32)
+        elif values.dtype.kind == "f" and values.shape[-1:] == (3,):
+            stored[name] = values.astype(np.float32)
+    return stored
+
+
 def valve_fields(valve: Valve, frames: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Arrays of a valve for `case_fields`, to which shapes in frames that were seen are added."""
     surface = valve.surface
-    return {
-        "triangles": surface.triangles.astype(np.int32),
-        "region": surface.region.astype(np.int8),
-        "rest": surface.vertices.astype(np.float32),
-        "annulus": valve.annulus.astype(np.int32),
-        "free_edge": valve.free_edge.astype(np.int32),
-        "frames": np.array(frames),
-        "seen": np.ones(len(frames), dtype=bool),
-        "tips": np.stack([valve.papillary_tips] * (1 + len(frames))).astype(np.float32),
-    }
+    return as_stored(
+        {
+            "triangles": surface.triangles,
+            "region": surface.region,
+            "rest": surface.vertices,
+            "annulus": valve.annulus,
+            "free_edge": valve.free_edge,
+            "frames": list(frames),
+            "seen": [True] * len(frames),
+            "tips": [valve.papillary_tips] * (1 + len(frames)),
+        }
+    )
 
 
 def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> CaseFields:
@@ -155,41 +168,23 @@ def case_fields(arrays: Mapping[str, Any] | Path, *, turned: bool = True) -> Cas
         if isinstance(arrays, Path):
             where = str(arrays)
             arrays = read_npz(arrays, where=arrays.name)
-        values = {
-            one.name: _value(one.name, arrays[one.name])
-            for one in dataclass_fields(CaseFields)
-            if one.name in arrays or one.name in NEEDED
+        values: dict[str, Any] = {
+            name: np.asarray(arrays[name], dtype=kind)
+            for name, (kind, _) in SHAPES.items()
+            if name in arrays or name in NEEDED
         }
-        values["observed_points"] = {
-            name.removeprefix(POINTS): np.asarray(points, dtype=np.float64)
-            for name, points in arrays.items()
+        frames = tuple(map(str, arrays["frames"]))
+        values.setdefault("tips", np.empty((len(frames) + 1, 0, 3)))
+        points = {
+            name.removeprefix(POINTS): np.asarray(array, dtype=np.float64)
+            for name, array in arrays.items()
             if name.startswith(POINTS)
         }
-        values.setdefault("tips", np.empty((len(values["frames"]) + 1, 0, 3)))
-        fields = CaseFields(**values)
+        reach = float(arrays["reach_mm"]) if "reach_mm" in arrays else None
+        fields = CaseFields(frames=frames, observed_points=points, reach_mm=reach, **values)
         return _turned(fields) if turned else fields
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise InputError(f"{where}: no fields of a case ({one_line(error, 200)})") from error
-
-
-def _value(name: str, array: Any) -> Any:
-    """An array in the type of its field."""
-    if name == "frames":
-        return tuple(map(str, array))
-    if name == "reach_mm":
-        return float(array)
-    kind = bool if name == "seen" else np.int64 if name in INDICES else np.float64
-    return np.asarray(array, dtype=kind)
-
-
-def _check(name: str, array: FloatArray | None, shape: tuple[int | None, ...]) -> None:
-    if array is None:
-        return
-    fits = array.ndim == len(shape) and all(
-        want is None or have == want for have, want in zip(array.shape, shape, strict=True)
-    )
-    if not fits:
-        raise InputError(f"{name} has the shape {array.shape}, expected {shape}")
 
 
 def turn_of(
@@ -219,7 +214,7 @@ def _turned(fields: CaseFields) -> CaseFields:
     )
     shapes: dict[str, Any] = {
         name: (array - middle) @ axes
-        for name in ("rest", "tips", *SEEN)
+        for name in TURNED
         if (array := getattr(fields, name)) is not None
     }
     points = {name: (array - middle) @ axes for name, array in fields.observed_points.items()}

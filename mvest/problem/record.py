@@ -20,7 +20,7 @@ from mvest.estimation.estimate import InnovationSummary
 from mvest.estimation.information.identifiability import TradeOff
 from mvest.mechanics.parameters import is_positive
 from mvest.problem.estimate import StudyResult
-from mvest.problem.registration import REGISTRATION, unit_of
+from mvest.problem.registration import REGISTRATION, label_of, unit_of
 from mvest.problem.verdict import NONE, Verdict
 from mvest.typing import FloatArray
 
@@ -396,6 +396,7 @@ def _unknowns(result: StudyResult) -> tuple[Unknown, ...]:
     own = [
         Unknown(
             name=name,
+            label=label_of(name),
             unit=unit_of(name),
             kind="modulus" if name.startswith("E_f.") else "nuisance",
         ).model_copy(update={key: finite(values[k]) for key, values in known.items()})
@@ -414,7 +415,11 @@ def _derived_moduli(result: StudyResult, unknowns: Sequence[Unknown]) -> list[Un
         for name, share in (("E_perp", unit.E_p), ("G", unit.G)):
             values = {key: getattr(own, key) for key in ("estimate", "std", "low", "high", "truth")}
             scaled = {key: v if v is None else share * v for key, v in values.items()}
-            about = {"name": f"{name}.{own.region}", "kind": "derived"}
+            about = {
+                "name": f"{name}.{own.region}",
+                "label": f"{name} {own.region}",
+                "kind": "derived",
+            }
             nothing = dict.fromkeys(("prior_mean", "prior_std", "bound"))
             rows.append(own.model_copy(update=about | scaled | nothing))
     return rows

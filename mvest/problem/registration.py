@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.closure.anchors import ClosedState
-from mvest.closure.frames import FramesModel, is_frame_pressure
+from mvest.closure.frames import ERROR, OFFSET, FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
@@ -25,6 +25,15 @@ from mvest.typing import FloatArray
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
 """Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
 UNITS = {"shift": "mm", "turn": "degrees"}
+LABELS = {
+    "pressure_scale": "pressure (factor)",
+    OFFSET: "offset of pressures",
+    "chord_stiffness": "chordal stiffness (factor)",
+    "chord_rest_length": "chordal rest length (factor)",
+    "stiffening": "stiffening",
+    "prestretch": "stretch when seen open (factor)",
+}
+"""What a reader calls an unknown."""
 LARGEST = {"mm": 1000, "degrees": 360}
 
 
@@ -42,6 +51,18 @@ def unit_of(name: str) -> str:
         return "mmHg"
     kind = KINDS.get(name.partition(".")[0])
     return "" if kind is None else kind.unit
+
+
+def label_of(name: str) -> str:
+    """What a reader calls an unknown: ``E_f anterior`` for ``E_f.anterior``."""
+    kind, _, part = name.partition(".")
+    if kind in ("E_f", "E_perp", "G"):
+        return f"{kind} {part}"
+    if kind == ERROR:
+        return f"pressure in frame {part}"
+    if kind in ("shift", "turn"):
+        return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
+    return LABELS.get(name, name)
 
 
 def range_of(name: str) -> Within | None:

@@ -1,7 +1,7 @@
-"""What studies make on their way and share: simulations, cycles, virtual patients, samples.
+"""Caches of what studies share: simulations, cycles, virtual patients, samples.
 
-All of it is kept by one rule. An entry is named by what it was made from and by the code that made
-it (:mod:`mvest.cache`), is made once, and appears whole or not at all.
+A cache entry is named by the values that it was made from and by the code that made it
+(:mod:`mvest.cache`), is made once, and appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -36,58 +36,34 @@ def key_of(described: Mapping[str, Any], made_by: tuple[Any, ...]) -> str:
     return config_hash({"made_from": described, "source": source_key(*made_by)})[:DIGITS]
 
 
-class Store:
-    """Entries in a folder.
+def entry_of(
+    folder: Path,
+    described: Mapping[str, Any],
+    made_by: tuple[Any, ...],
+    read: Callable[[Path], T],
+    name: str = "{key}.npz",
+) -> Entry[T]:
+    """The cache entry of what is made from ``described`` by ``made_by``.
 
     Parameters
     ----------
     folder : Path
         Made when something is cached.
+    described : mapping
+        Plain values: all that decides what is made, but the code.
+    made_by : tuple
+        Modules, functions or classes that make it and write it; what they import counts too.
+    read : callable
+        Reads a path, or refuses it.
+    name : str
+        Of the file or folder, with ``{key}``.
     """
-
-    def __init__(self, folder: Path | str) -> None:
-        self.folder = Path(folder)
-
-    def entry(
-        self,
-        kind: str,
-        described: Mapping[str, Any],
-        made_by: tuple[Any, ...],
-        read: Callable[[Path], T],
-        name: str = "{key}.npz",
-    ) -> Entry[T]:
-        """The entry of what is made from ``described`` by ``made_by``.
-
-        Parameters
-        ----------
-        kind : str
-            Folder within the store's.
-        described : mapping
-            Plain values: all that decides what is made, but the code.
-        made_by : tuple
-            Modules, functions or classes that make it and write it; what they import counts too.
-        read : callable
-            Reads a path, or refuses it.
-        name : str
-            Of the file or folder, with ``{key}``.
-        """
-        path = self.folder / kind / name.format(key=key_of(described, made_by))
-        return Entry(path, read)
-
-    def model(
-        self,
-        kind: str,
-        model: ObservationModel,
-        described: Mapping[str, Any],
-        made_by: tuple[Any, ...],
-    ) -> StoredModel:
-        """A model whose predictions are entries: see `entry` and :class:`StoredModel`."""
-        return StoredModel(model, self.folder / kind, key_of(described, made_by))
+    return Entry(folder / name.format(key=key_of(described, made_by)), read)
 
 
 @dataclass(frozen=True, slots=True)
 class StoredModel:
-    """A model whose converged predictions are kept on disk, without their derivatives.
+    """A model whose converged predictions are cached on disk, without their derivatives.
 
     Attributes
     ----------
@@ -107,7 +83,7 @@ class StoredModel:
         Raises
         ------
         InputError
-            If the store cannot be written.
+            If the cache cannot be written.
         """
 
         def read(path: Path) -> Prediction:
@@ -115,8 +91,7 @@ class StoredModel:
             return Prediction(y, np.zeros((len(y), len(m))))
 
         about = {"key": self.key, "m": [float(v).hex() for v in m]}
-        path = self.folder / f"{config_hash(about)[:DIGITS]}.npz"
-        return Entry(path, read).get_or_make(
+        return Entry(self.folder / f"{config_hash(about)[:DIGITS]}.npz", read).get_or_make(
             lambda: predict(self.model, m),
             lambda file, prediction: np.savez(file, y=prediction.y),
             lambda made: made.converged,
@@ -125,7 +100,7 @@ class StoredModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrapolated:
-    """Predictions that are linear in the size of the cells, at cells of no size.
+    """Predictions that are linear in the mesh size, extrapolated to zero mesh size.
 
     Closed valves of quadratic tetrahedra have nearly this order (Richardson 1911, Phil. Trans. R.
     Soc. A 210:307, with order one): leaflets bend sharply where they touch, and chordae and annulus

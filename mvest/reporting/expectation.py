@@ -6,20 +6,20 @@ well; it needs no observed value. So one run of the model says which intervals t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from mvest.estimation.information.identifiability import TradeOff, identifiability
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.prediction import predict
 from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
-from mvest.problem.estimate import Observed, Problem
-from mvest.problem.registration import unit_of
+from mvest.problem.estimate import Observed, Problem, expected_intervals
+from mvest.problem.registration import label_of, unit_of
 from mvest.reporting.markup import listed
-from mvest.reporting.tables import Column, table
+from mvest.reporting.tables import Column, Table, table
 
 
 def expectation_text(title: str, problem: Problem, observation: Observed, noise: str) -> str:
@@ -43,37 +43,34 @@ def expectation_text(title: str, problem: Problem, observation: Observed, noise:
     scale = np.where(assumed != 0.0, np.abs(assumed), prior.std)
     data = identifiability(seen.jacobian, R, scale, names=problem.parameters)
     transform, n = problem.transform, len(seen.y)
-    z, before = transform.forward(assumed), to_filter(transform, prior)
-    H = seen.jacobian * transform.derivative(z)
+    before = to_filter(transform, prior)
+    H = seen.jacobian * transform.derivative(transform.forward(assumed))
     after = kalman_update(before, np.zeros(n), H, observation_noise(R, n)).posterior
-    rows = [
-        {"parameter": name, "unit": unit_of(name), "generic": value, "alone": alone}
-        for name, value, alone in zip(problem.parameters, assumed, data.std, strict=True)
-    ]
-    for when, std in (("_before", before.std), ("", after.std)):
-        for end, sign in (("low", -1.0), ("high", 1.0)):
-            for row, value in zip(
-                rows, transform.inverse(z + sign * ndtri(0.975) * std), strict=True
-            ):
-                row[end + when] = value
-    expected = table(
-        rows,
-        parameter="",
-        unit="",
-        generic=Column(low="low_before", high="high_before", label="generic (beforehand)"),
-        low="::from",
-        high="::to",
-        alone=":.2g:± by the data alone",
-    )
+    rows = expected_intervals(problem.parameters, transform, assumed, before.std, after.std)
+    own = [row | {"alone": std} for row, std in zip(rows, data.std, strict=True)]
     lines = [
         f"{title}: what the data will tell, intervals of 95 % to first order",
         f"Observed: {n} numbers of {', '.join(observation.frames)}; {noise}",
-        expected.text(),
+        expected_table(own, alone=":.2g:± by the data alone").text(),
         *map(alike_words, data.confounded()),
         *(f"Known badly from the data alone: {words}" for words in data.flat()),
         "No estimation was run.",
     ]
     return "\n".join(lines)
+
+
+def expected_table(rows: Iterable[Mapping[str, Any]], **more: Column | str) -> Table:
+    """The table of `mvest.problem.estimate.expected_intervals`, and more columns."""
+    return table(
+        ({**row, "name": label_of(row["name"])} for row in rows),
+        name="::unknown",
+        unit="",
+        generic=Column(low="low_before", high="high_before", label="generic (beforehand)"),
+        low="::from",
+        high="::to",
+        width=":.2f:width left",
+        **more,
+    )
 
 
 def unknown_text(title: str, reason: str) -> str:

@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, NullFormatter
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
@@ -44,6 +46,7 @@ SEQUENTIAL, DISTANCE_MAP = "cividis", "viridis"
 DPI = 140
 WIDTH = 8.3
 """Inches."""
+SCALE_MM = 10.0
 TEXT, SMALL = 10, 8.5
 """Points, of titles and of everything else."""
 CHARACTERS_AN_INCH = 23
@@ -101,6 +104,16 @@ def plain_axes(axes: Any) -> None:
     axes.tick_params(labelsize=SMALL)
     for axis in (axes.xaxis, axes.yaxis):
         axis.label.set_size(SMALL + 0.5)
+
+
+def scale_bar(axes: Any, colour: str) -> None:
+    """Draw a bar of `SCALE_MM` into the lower left corner of axes in millimetres."""
+    style = {"loc": "lower left", "color": colour, "frameon": False, "size_vertical": 0.25}
+    font = FontProperties(size=SMALL - 0.5)
+    bar = AnchoredSizeBar(
+        axes.transData, SCALE_MM, f"{SCALE_MM:.0f} mm", label_top=True, fontproperties=font, **style
+    )
+    axes.add_artist(bar)
 
 
 def headline(figure: Figure, text: str, note: str) -> None:

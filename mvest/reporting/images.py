@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from scipy.ndimage import map_coordinates
 
 from mvest.cases.from_images.detected import DetectedValve, called, write_detected
@@ -34,6 +33,7 @@ from mvest.reporting.figures import (
     headline,
     panels,
     save_figure_with,
+    scale_bar,
 )
 from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import plane_section
@@ -56,7 +56,6 @@ STEP_MM = 0.4
 MOST_ROWS = 6
 REACH_MM = 3.0
 """Up to which distance from a plane annulus points and papillary tips are drawn in it."""
-SCALE_MM = 10.0
 MARGIN_MM = 7.0
 ROW_INCHES = 2.35
 DOTS: Mapping[str, Mapping[str, Any]] = {
@@ -319,7 +318,7 @@ def montage_figure(
                 axes.text(0.5, 0.5, "no valve", transform=axes.transAxes, ha="center", color="w")
     for axes, (name, how) in zip(grid[0], COLUMNS.items(), strict=True):
         axes.set_title(f"{name}\n({how})", fontsize=9)
-        _scale_bar(axes, extents[name])
+        scale_bar(axes, "white")
     note = f"All {count} frames have a confidence of {low_confidence:g} or more."
     if low.any():
         named = ", ".join(map(str, np.flatnonzero(low)))
@@ -359,18 +358,6 @@ def _draw_valve(axes: Any, valve: ValveSequence, frame: int, plane: SlicePlane) 
         places = plane.coordinates(points)
         close = places[np.abs(places[:, 2]) <= REACH_MM, :2]
         axes.plot(*close.T, label=label, ls="none", mec="black", **style)
-
-
-def _scale_bar(axes: Any, extent: Extent) -> None:
-    left, bottom = extent[0] + 2.0, extent[2] + 2.5
-    axes.plot(
-        [left, left + SCALE_MM], [bottom, bottom], color="white", lw=2.2, label="_scale",
-        path_effects=[withStroke(linewidth=4, foreground="black")], solid_capstyle="butt",
-    )  # fmt: skip
-    axes.text(
-        left + 0.5 * SCALE_MM, bottom + 1.0, f"{SCALE_MM:.0f} mm", color="white", fontsize=7.5,
-        ha="center", va="bottom", path_effects=[withStroke(linewidth=2, foreground="black")],
-    )  # fmt: skip
 
 
 # -- measures over time ---------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Text of tables for readers: Markdown and LaTeX, with every character shown as itself.
+"""Text of tables for readers: Markdown, with every character shown as itself.
 
 Names of runs and reasons of failures are whatever a user typed or a library said, so nothing of
 them may act as markup.
@@ -18,14 +18,6 @@ ACTING = re.compile(
     "\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e007f]"
 )
 """Characters that turn others round, hide or cannot be written; no tab and no end of a line."""
-
-LATEX_WORDS = ("backslash", "asciitilde", "asciicircum", "less", "greater", "bar")
-LATEX = str.maketrans(
-    {character: f"\\{character}" for character in "{}$%_&#"}
-    | {name: rf"\text{word}{{}}" for name, word in zip("\\~^<>|", LATEX_WORDS, strict=True)}
-    | {"±": r"$\pm$", "–": "--", "×": r"$\times$", "≤": r"$\leq$", "≥": r"$\geq$", "²": r"$^2$"}
-    | dict.fromkeys("\n\r", " ")
-)
 
 
 def ended(text: str) -> str:
@@ -47,11 +39,6 @@ def shown_text(text: str, longest: int | None = None) -> str:
     return ACTING.sub(lambda found: f"[U+{ord(found[0]):04X}]", text.replace("\r", " "))
 
 
-def latex_text(text: str) -> str:
-    r"""Text that LaTeX prints as it stands: ``E_f`` as ``E\_f``, ± in its own way."""
-    return shown_text(text).translate(LATEX)
-
-
 def markdown_text(text: str) -> str:
     """Text in a cell of a Markdown table: no cell ends early, no tag, link or emphasis begins."""
     flat = shown_text(" ".join(text.split()))
@@ -66,16 +53,6 @@ def markdown_rows(rows: Sequence[Mapping[str, str]]) -> str:
     body = [[markdown_text(text) for text in row.values()] for row in rows]
     return "\n".join(
         "| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *body)
-    )
-
-
-def latex_cell(text: str) -> str:
-    """The same with a true minus of numbers, and their powers of ten."""
-    signed = re.sub(r"(?<![\w$.-])-(?=\d)", "$-$", latex_text(text))
-    return re.sub(
-        r"(?<![\w.])(\d(?:\.\d+)?)e([+-]\d+)(?!\w)",
-        lambda found: rf"${found[1]}\times10^{{{int(found[2])}}}$",
-        signed,
     )
 
 

@@ -6,16 +6,16 @@ the interval that is believed before anything was seen.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from statistics import mean, median
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import beta, norm
+from scipy.stats import binomtest, norm
 
 from mvest.problem.record import EstimateRecord, Unknown
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.tables import Column, Table, table
+from mvest.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,29 +29,18 @@ HALF = float(norm.ppf(0.975))
 
 def generic_guess(unknown: Unknown) -> Unknown:
     """An unknown as the literature has it: the mean of the prior, without an interval."""
-    return _with(unknown, unknown.prior_mean)
+    nothing: dict[str, None] = dict.fromkeys(("std", "low", "high"))
+    return unknown.model_copy(update={"estimate": unknown.prior_mean, **nothing})
 
 
 def prior_alone(unknown: Unknown) -> Unknown:
     """An unknown as it is believed before anything was seen; see `mvest.estimation.transform`."""
-    mean, std = unknown.prior_mean, unknown.prior_std
+    guess, mean, std = generic_guess(unknown), unknown.prior_mean, unknown.prior_std
     if mean is None or std is None:
-        return _with(unknown, mean, std)
-    if unknown.is_positive:
-        factor = float(np.exp(HALF * std / mean))
-        return _with(unknown, mean, std, mean / factor, mean * factor)
-    return _with(unknown, mean, std, mean - HALF * std, mean + HALF * std)
-
-
-def _with(
-    unknown: Unknown,
-    estimate: float | None,
-    std: float | None = None,
-    low: float | None = None,
-    high: float | None = None,
-) -> Unknown:
-    values = {"estimate": estimate, "std": std, "low": low, "high": high}
-    return unknown.model_copy(update=values)
+        return guess
+    factor, reach = (float(np.exp(HALF * std / mean)) if mean else 1.0), HALF * std
+    ends = (mean / factor, mean * factor) if unknown.is_positive else (mean - reach, mean + reach)
+    return guess.model_copy(update={"std": std, **dict(zip(("low", "high"), ends, strict=True))})
 
 
 def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
@@ -74,48 +63,48 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
         factors, otherwise as the unknown is. ``relative width`` is the median over the estimate,
         ``width over prior`` that of the logarithm's interval over the prior's. None: not known.
     """
-    known = [own for own in unknowns if own.estimate is not None]
+    unit = "" if unknowns[0].is_modulus else unknowns[0].unit
+    prior = [prior_alone(own) for own in unknowns]
+    truth, estimate, low, high, guess = (
+        np.array([getattr(own, name) for own in unknowns], dtype=np.float64)
+        for name in ("truth", "estimate", "low", "high", "prior_mean")
+    )
+    relative = np.isfinite(truth) & (truth != 0.0) & (not unit)
+    scale = np.divide(100.0, truth, out=np.ones_like(truth), where=relative)
+    error, guess_error = (estimate - truth) * scale, np.abs(guess - truth) * scale
+    known, width = np.isfinite(estimate), high + 0.0 * estimate - low
+    after, before = (
+        np.array([np.nan if unit else log_width(own) for own in some]) for some in (unknowns, prior)
+    )
+    ratio = np.divide(after, before, out=np.full_like(after, np.nan), where=known & (before > 0.0))
     judged = [own.inside for own in unknowns if own.inside is not None]
     inside, n = sum(judged), len(judged)
     bounds = share_bounds(inside, n)
     scores = [z**2 for own in unknowns if (z := score(own)) is not None]
-    unit = "" if unknowns[0].is_modulus else unknowns[0].unit
-    errors = _errors(known, unit)
-    sizes = (
-        [abs(error) for error in _errors(map(generic_guess, some), unit)]
-        for some in (known, unknowns)
-    )
-    guess, guess_of_all = (median(each) if each else None for each in sizes)
-    widths = [
-        (own, own.high - own.low) for own in known if own.high is not None and own.low is not None
-    ]
-    ratios = [
-        width / before
-        for own in known
-        if not unit
-        and (width := log_width(own)) is not None
-        and (before := log_width(prior_alone(own)))
-    ]
     return {
         "n": len(unknowns),
-        "estimated": len(known),
+        "estimated": int(known.sum()),
         "inside": inside,
         "coverage": 100 * inside / n if n else None,
         "coverage low": 100 * bounds[0] if n else None,
         "coverage high": 100 * bounds[1] if n else None,
-        "mean square": mean(scores) if scores else None,
+        "mean square": _of_known(np.mean, np.array(scores)),
         "unit": unit or "%",
-        "mean error": mean(errors) if errors else None,
-        "median error": median(map(abs, errors)) if errors else None,
-        GENERIC: guess,
-        f"{GENERIC}, all": guess_of_all,
-        "inside prior": sum(prior_alone(own).inside is True for own in unknowns),
-        "mean width": mean(width * _scale(own, unit) for own, width in widths) if widths else None,
-        "relative width": None
-        if unit or not widths
-        else median(width / (own.estimate or 1.0) for own, width in widths),
-        "width over prior": median(ratios) if ratios else None,
+        "mean error": _of_known(np.mean, error),
+        "median error": _of_known(np.median, np.abs(error)),
+        GENERIC: _of_known(np.median, guess_error[known]),
+        f"{GENERIC}, all": _of_known(np.median, guess_error),
+        "inside prior": sum(own.inside is True for own in prior),
+        "mean width": _of_known(np.mean, width * scale),
+        "relative width": None if unit else _of_known(np.median, width / estimate),
+        "width over prior": _of_known(np.median, ratio),
     }
+
+
+def _of_known(function: Callable[[FloatArray], Any], values: FloatArray) -> float | None:
+    """A mean or median of the finite values; None if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(function(finite)) if finite.size else None
 
 
 def score(unknown: Unknown) -> float | None:
@@ -128,31 +117,17 @@ def score(unknown: Unknown) -> float | None:
     return float(2 * HALF * (truth - estimate) / (high - low))
 
 
-def log_width(unknown: Unknown) -> float | None:
-    """Width of the interval of a modulus' logarithm."""
+def log_width(unknown: Unknown) -> float:
+    """Width of the interval of a modulus' logarithm; NaN without an interval."""
     if unknown.low is None or unknown.high is None:
-        return None
+        return np.nan
     return float(np.log(unknown.high / unknown.low))
 
 
 def share_bounds(inside: int, n: int) -> tuple[float, float]:
     """Exact 95 % interval of a share (Clopper and Pearson 1934, Biometrika 26:404)."""
-    low = 0.0 if inside == 0 else float(beta.ppf(0.025, inside, n - inside + 1))
-    high = 1.0 if inside == n else float(beta.ppf(0.975, inside + 1, n - inside))
-    return low, high
-
-
-def _errors(unknowns: Iterable[Unknown], unit: str) -> list[float]:
-    return [
-        (own.estimate - own.truth) * _scale(own, unit)
-        for own in unknowns
-        if own.estimate is not None and own.truth is not None
-    ]
-
-
-def _scale(unknown: Unknown, unit: str) -> float:
-    """By which errors of an unknown are multiplied: to a share of the truth in %, or 1."""
-    return 1.0 if unit or not unknown.truth else 100.0 / unknown.truth
+    found = binomtest(inside, n).proportion_ci(method="exact") if n else (0.0, 1.0)
+    return float(found[0]), float(found[1])
 
 
 VERDICTS = (TRUSTWORTHY, DOUBTFUL, NONE)

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 from mvest.errors import InputError
-from mvest.reporting.markup import MISSING, latex_cell, latex_text, markdown_rows, number
+from mvest.reporting.markup import MISSING, markdown_rows, number, shown_text
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -129,14 +129,17 @@ class Table:
         r"""The readable table in LaTeX, with ``\usepackage{booktabs}``; first column left."""
         import pandas as pd
 
-        rows = [
-            {latex_text(name): latex_cell(text) for name, text in row.items()}
+        plain = [
+            {
+                shown_text(" ".join(k.split())): shown_text(" ".join(v.split()))
+                for k, v in row.items()
+            }
             for row in self.readable()
         ]
-        if not rows:
+        if not plain:
             return "% no rows\n"
-        sides = "l" + "r" * (len(rows[0]) - 1)
-        return str(pd.DataFrame(rows).to_latex(index=False, escape=False, column_format=sides))
+        sides = "l" + "r" * (len(plain[0]) - 1)
+        return str(pd.DataFrame(plain).to_latex(index=False, escape=True, column_format=sides))
 
     def text(self) -> str:
         """The readable table for a terminal; few wide rows stand beside each other."""

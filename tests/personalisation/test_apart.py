@@ -24,7 +24,7 @@ SETTINGS = PersonaliseSettings(
         {"anterior": TissueSettings(2.65), "posterior": TissueSettings(1.11)},
         ClosureProtocol(pressure_mmHg=120.0),
     ),
-    CaseMesh(columns=24, rows=3),
+    mesh=CaseMesh(columns=24, rows=3),
     errors=ErrorBeliefs(),
     considered_geometry=ConsideredGeometry(),
 )

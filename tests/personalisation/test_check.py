@@ -23,13 +23,14 @@ def test_intervals_are_those_of_an_estimate_of_the_generic_valve(monkeypatch, er
     fit = personalise(case, settings())  # errors as they are stated
     std = fit.result.filtered.transformed.std
     for k, unknown in enumerate(expected.unknowns):
-        assert unknown.name == fit.names[k]
-        high, low = unknown.high, unknown.low
-        positive = unknown.generic > 0.0
+        assert unknown["name"] == fit.result.parameters[k]
+        high, low, generic = unknown["high"], unknown["low"], unknown["generic"]
+        positive = generic > 0.0
         found = np.log(high / low) if positive else high - low
         if errors is None:
             assert found / (2 * REACH) == pytest.approx(std[k], rel=1e-4)
-        assert unknown.low_before < low < unknown.generic < high < unknown.high_before
+        assert unknown["low_before"] < low < generic < high < unknown["high_before"]
+        assert 0.0 < unknown["width"] < 1.0
     assert sum(row.share for row in expected.shares) == pytest.approx(2.0)
     assert {row.what for row in expected.narrower} > {EXACTLY, "mean of 4 beats"}
 

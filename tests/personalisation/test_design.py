@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.case import Role
 from mvest.closure.frames import SCALE
 from mvest.personalisation import PressureErrors, design_case, expect_case
-from mvest.personalisation.design import ERRORS_MMHG, KINDS, StatedErrors
+from mvest.personalisation.design import ERRORS_MMHG, KINDS, errors_of
 from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
 from mvest.personalisation.known import REACH
 from tests.made_up_closure import FIELDS, PRESSURE, made_up_case, settings, unknowns, use
@@ -37,7 +37,7 @@ def held(pressures):
 
 def log_std(unknown):
     """Of a positive unknown, from its interval."""
-    return np.log(unknown.high / unknown.low) / (2 * REACH)
+    return np.log(unknown["high"] / unknown["low"]) / (2 * REACH)
 
 
 def test_a_design_is_what_an_estimation_of_these_frames_expects(designs):
@@ -47,19 +47,20 @@ def test_a_design_is_what_an_estimation_of_these_frames_expects(designs):
     bound = designs.at(3)
     std = dict(zip(bound.names, bound.std, strict=True))
     for unknown in expected.unknowns[:5]:
-        assert std[unknown.name] == pytest.approx(log_std(unknown), rel=1e-6)
+        assert std[unknown["name"]] == pytest.approx(log_std(unknown), rel=1e-6)
     # Known pressures are those of an estimation that takes them as they are.
     calibrated = [replace(u, std=0.02) if u.name == SCALE else u for u in unknowns()]
     known = expect_case(held((75.0, 50.0)), settings(*calibrated))
-    left = designs.left(3, StatedErrors(0.02, 0.0, 0.0))
-    for name, unknown in zip(designs.moduli, known.unknowns, strict=False):
+    left = designs.left(3, {"factor": 0.02, "offset": 0.0, "each": 0.0})
+    for name, unknown in zip(left, known.unknowns, strict=False):
+        assert unknown["name"] == name
         assert left[name] == pytest.approx(log_std(unknown) / designs.knowledge[name], rel=1e-6)
 
 
 def test_frames_and_knowledge_only_help(designs):
     for kind in KINDS:
         table = [
-            [sum(designs.left(n, StatedErrors.of_kind(kind, e, 100.0)).values()) for n in (1, 2, 5)]
+            [sum(designs.left(n, errors_of(kind, e, 100.0)).values()) for n in (1, 2, 5)]
             for e in ERRORS_MMHG
         ]
         assert np.all(np.diff(table, axis=1) <= 1e-9)
@@ -76,11 +77,11 @@ def test_a_common_factor_is_not_told_by_frames_and_an_offset_is(monkeypatch):
     sharp = replace(CASE, uncertainty=replace(CASE.uncertainty, std_mm=1e-3))
     found = design_case(sharp, settings(pressures=STATED))
     factor, offset = (
-        found.left(5, StatedErrors.of_kind(kind, 20.0, PRESSURE))["E_f.anterior"]
+        found.left(5, errors_of(kind, 20.0, PRESSURE))["E_f.anterior"]
         for kind in ("factor", "offset")
     )
     # Common are two moduli, chordae and pressure, each with its prior: 1 / sum of 1 / variance.
-    prior = [found.knowledge[name] for name in (*found.moduli, "chord_stiffness")]
+    prior = [found.knowledge[name] for name in ("E_f.anterior", "E_f.posterior", "chord_stiffness")]
     common = 1.0 / np.sqrt(sum(1.0 / std**2 for std in (*prior, 0.2)))
     assert factor == pytest.approx(common / prior[0], rel=0.02)
     assert offset < 0.2 * factor
@@ -131,4 +132,4 @@ def test_without_an_unknown_pressure_nothing_is_said_of_its_errors(monkeypatch):
     moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
     found = design_case(CASE, settings(*moduli))
     assert set(found.knowledge) == {u.name for u in moduli}
-    assert found.left(2, StatedErrors(0.5, 9.0, 9.0)) == found.left(2)
+    assert found.left(2, {"factor": 0.5, "offset": 9.0, "each": 9.0}) == found.left(2)

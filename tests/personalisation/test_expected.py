@@ -9,8 +9,8 @@ from mvest.cases.case import Role
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.personalisation import personalise
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
-from mvest.personalisation.indications import indications_of
 from mvest.problem.verdict import NONE, judge
 from tests.made_up_closure import BASE, FIELDS, error_source, made_up_case, settings, use
 
@@ -71,7 +71,7 @@ def test_the_law_is_told_from_what_was_seen(stiffening, share):
     expected = way @ np.linalg.solve(S, e) / information
     assert fit.known.law_share == pytest.approx(expected, abs=1e-6)
     assert fit.known.law_share == pytest.approx(share, abs=2.5 / np.sqrt(information))
-    grounds = {g.check: g.trust for g in judge(indications_of(fit)).grounds}
+    grounds = {g.check: g.trust for g in judge(diagnostics_of(fit)).grounds}
     assert grounds.get("law") == (NONE if share else None)
 
 
@@ -80,7 +80,7 @@ def test_nothing_is_told_of_a_law_that_is_not_considered(monkeypatch):
     fit = personalise(made_up_case(STD), settings())
     assert fit.known.law_share is None
     assert fit.known.geometry == ()
-    assert "law" in judge(indications_of(fit)).missing
+    assert "law" in judge(diagnostics_of(fit)).missing
 
 
 def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
@@ -118,7 +118,7 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
     assert fibres.stretch == pytest.approx(np.abs(modes[3:]).max(), abs=0.01)
     assert fibres.size == pytest.approx(10 * np.linalg.norm(modes[3:]) / np.sqrt(2), abs=0.1)
     (ground,) = [
-        g for g in judge(indications_of(fit)).grounds if g.check == "what was known beforehand"
+        g for g in judge(diagnostics_of(fit)).grounds if g.check == "what was known beforehand"
     ]
     assert ground.text.startswith(f"fibres of the valve was moved by {fibres.stretch:.1f} of its")
 

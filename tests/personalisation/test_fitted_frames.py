@@ -62,7 +62,7 @@ def test_the_frames_are_met_with_the_errors_of_their_pressures(monkeypatch):
     )
     found = personalise(case, replace(wanted, unknowns=tuple(scale)))
     assert found.result.converged
-    at = dict(zip(found.names, found.result.estimate, strict=True))
+    at = dict(zip(found.result.parameters, found.result.estimate, strict=True))
     for name in ("E_f.anterior", "E_f.posterior", "chord_stiffness", *REGISTRATION):
         assert at[name] == pytest.approx(TRUE[name], rel=2e-3, abs=2e-3), name
     assert at[OFFSET] + at[f"{ERROR}.early"] == pytest.approx(7.0, abs=0.05)
@@ -94,7 +94,7 @@ def test_without_a_further_frame_nothing_is_added(monkeypatch):
     use(monkeypatch)
     plain = personalise(made_up_case(), settings())
     same = personalise(made_up_case(), settings(pressures=PRESSURES))
-    assert same.names == plain.names
+    assert same.result.parameters == plain.result.parameters
     np.testing.assert_array_equal(same.result.estimate, plain.result.estimate)
 
 
@@ -104,10 +104,10 @@ def test_errors_of_pressures_widen_the_intervals(monkeypatch):
     calibrated = [replace(u, std=0.005) if u.name == "pressure_scale" else u for u in unknowns()]
     known = expect_case(case, settings(*calibrated))
     doubted = expect_case(case, settings(*calibrated, pressures=PressureErrors(0.0, 5.0)))
-    names = [{unknown.name for unknown in one.unknowns} for one in (known, doubted)]
+    names = [{unknown["name"] for unknown in one.unknowns} for one in (known, doubted)]
     assert names[1] - names[0] == {f"{ERROR}.early", f"{ERROR}.closed"}
     for before, after in zip(known.unknowns[:2], doubted.unknowns[:2], strict=True):
-        assert after.width > 1.02 * before.width
+        assert after["width"] > 1.02 * before["width"]
 
 
 def test_errors_of_each_frame_are_learned(monkeypatch):

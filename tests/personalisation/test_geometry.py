@@ -20,8 +20,9 @@ from mvest.estimation.transform import Log, to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import Treatment, estimation, personalise
+from mvest.personalisation import estimation, personalise
 from mvest.personalisation.chain import predicted_frames
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.estimation import (
     SETTLED,
     CaseProblem,
@@ -37,11 +38,10 @@ from mvest.personalisation.geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.indications import indications_of
 from mvest.personalisation.model import CaseClosure
 from mvest.personalisation.sources import geometry_sources
 from mvest.problem.registration import REGISTRATION, RegisteredModel
-from mvest.problem.verdict import MOVED
+from mvest.problem.verdict import CHECKS
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 from tests.made_up_closure import (
@@ -255,7 +255,7 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
         doubtful = personalise(
             case, settings(errors=errors, considered_geometry=ConsideredGeometry())
         )
-        anterior = doubtful.names.index("E_f.anterior")
+        anterior = doubtful.result.parameters.index("E_f.anterior")
         assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
         shares = {row.source: row.share for row in doubtful.known.shares[::2]}
         assert shares["open shape"] > 0.3
@@ -336,7 +336,7 @@ def bent_case(monkeypatch, curve, std):
 def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(monkeypatch, curve):
     std = 0.5
     case, known = bent_case(monkeypatch, curve, std)
-    free = unknowns(Treatment.FIXED, **known)
+    free = unknowns(fixed=True, **known)
     seen = case.frame(Role.CLOSED).vertices.ravel()
 
     def objective(z):
@@ -383,7 +383,7 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
         assert fit.moved < SETTLED
     else:
         # Twelve steps do not reach the end of such a valley, although the estimate is there.
-        assert fit.moved > MOVED
+        assert fit.moved > CHECKS["moved"].limits[0]
 
 
 def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
@@ -400,7 +400,7 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
     fit = personalise(
         case,
         settings(
-            *unknowns(Treatment.FIXED, **known),
+            *unknowns(fixed=True, **known),
             considered_geometry=ConsideredGeometry(renewals=6),
             tolerance=1e-9,
         ),
@@ -419,7 +419,7 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
 
 def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
-    others = [u for u in unknowns(Treatment.FIXED, **known) if u.name != "pressure_scale"]
+    others = [u for u in unknowns(fixed=True, **known) if u.name != "pressure_scale"]
     given = settings(
         replace(unknowns()[2], std=0.3),
         *others,
@@ -487,7 +487,7 @@ def test_frames_that_are_not_fitted_are_held_as_the_closed_one_is(monkeypatch):
     later = replace(closed, name="later", time=1.0, role=Role.HELD_OUT)
     case = replace(case, frames=(*case.frames, later))
     parts = {"annulus": np.full(closed.annulus.shape, 0.3), "tips": np.full((1, 3), -0.4)}
-    problem = CaseProblem.of(case, settings(*unknowns(Treatment.FIXED, **known)))
+    problem = CaseProblem.of(case, settings(*unknowns(fixed=True, **known)))
     stated = problem.generic()
     off = replace(stated, closure=replace(stated.closure, displacement=parts))
     for place, by, tips in ((stated, 0.0, 0.0), (off, 0.3, -0.4)):
@@ -523,7 +523,8 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
     assert torn.moved is None
     assert torn.unaccounted == (f"about the geometry that is expected: {why}",)
-    assert any("about the geometry" in doubt for doubt in indications_of(torn).unaccounted)
+    unaccounted = [words["what"] for _, words in diagnostics_of(torn)["unaccounted"]]
+    assert any("about the geometry" in doubt for doubt in unaccounted)
 
 
 def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
@@ -543,7 +544,7 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
         personalise(
             case,
             settings(
-                *unknowns(Treatment.FIXED, **known),
+                *unknowns(fixed=True, **known),
                 considered_geometry=ConsideredGeometry(renewals=renewals),
             ),
         )
@@ -561,7 +562,7 @@ def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
     fit = personalise(
         case,
         settings(
-            *unknowns(Treatment.FIXED, **known),
+            *unknowns(fixed=True, **known),
             considered_geometry=ConsideredGeometry(renewals=2),
             considered_law={"anterior": ExponentialTissue(0.06, 4.325, 1446.5)},
         ),

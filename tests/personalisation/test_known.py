@@ -46,7 +46,7 @@ def dense(fit):
     filtered = fit.result.filtered
     z = filtered.transformed.mean
     H = filtered.prediction.jacobian * filtered.transform.derivative(z)
-    return to_filter(filtered.transform, fit.prior).covariance, H
+    return to_filter(filtered.transform, fit.result.filtered.prior).covariance, H
 
 
 def rows_of(fit):
@@ -62,7 +62,7 @@ def test_what_would_narrow_is_the_update_by_hand(monkeypatch):
     P, H = dense(fit)
 
     def by_hand(better=None, thickness=1.0, beats=1.0):
-        share = np.array([(better or {}).get(name, 1.0) for name in fit.names])
+        share = np.array([(better or {}).get(name, 1.0) for name in fit.result.parameters])
         joint = np.concatenate([H, thickness * COLUMN], axis=1) * np.sqrt(beats) / STD
         prior = np.zeros((len(P) + 1,) * 2)
         prior[:-1, :-1], prior[-1, -1] = np.linalg.inv(P * np.outer(share, share)), 1.0
@@ -116,7 +116,7 @@ def test_shares_are_parts_of_the_variance(monkeypatch):
     left = np.eye(len(P)) - K @ H
     variance = np.diag(left @ P)
     shares = {(row.source, row.parameter): row.share for row in fit.known.shares}
-    for k, name in enumerate(fit.names[:2]):
+    for k, name in enumerate(fit.result.parameters[:2]):
         expected = {
             SINGLE: STD**2 * K[k] @ K[k],
             "thickness": (K[k] @ COLUMN[:, 0]) ** 2,

@@ -13,7 +13,7 @@ from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
 from mvest.personalisation import personalise
-from mvest.personalisation.indications import indications_of
+from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.sources import law_and_mesh_sources, law_change
 from mvest.problem.registration import RegisteredModel
 from mvest.problem.verdict import judge
@@ -106,7 +106,7 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
     )
     known = personalise(case, settings(moduli_only=True))
     doubtful = personalise(case, settings(moduli_only=True, considered_law=STIFFENING))
-    anterior = doubtful.names.index("E_f.anterior")
+    anterior = doubtful.result.parameters.index("E_f.anterior")
     assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
     shares = {row.source: row.share for row in doubtful.known.shares[::2]}
     assert shares["law"] > 0.3
@@ -123,5 +123,5 @@ def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
     )
     fit = personalise(case, settings(considered_law=STIFFENING))
     assert fit.unaccounted == ("it did not close",)
-    grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "errors left out"]
+    grounds = [g.text for g in judge(diagnostics_of(fit)).grounds if g.check == "errors left out"]
     assert any(text.endswith("is not in the intervals: it did not close") for text in grounds)

@@ -17,7 +17,6 @@ from mvest.personalisation import (
     PaperSettings,
     PersonaliseSettings,
     Prior,
-    Treatment,
     build_model,
     personalise,
 )
@@ -48,24 +47,24 @@ NUISANCES = tuple(name for name in PRIORS if name not in MODULI)
 
 
 def true_of(found):
-    return np.array([TRUE[name] for name in found.names])
+    return np.array([TRUE[name] for name in found.result.parameters])
 
 
 def right_nuisances():
     """The moduli unknown, what acts on the closure fixed where it truly is."""
-    given = unknowns(Treatment.FIXED)
+    given = unknowns(fixed=True)
     return (*given[:2], *(replace(u, mean=TRUE[u.name]) for u in given[2:5]))
 
 
 def std_of(found, name):
-    return float(found.result.std[found.names.index(name)])
+    return float(found.result.std[found.result.parameters.index(name)])
 
 
 def test_a_twin_without_noise_gives_back_the_moduli_and_what_was_hidden(monkeypatch):
     use(monkeypatch)
     found = personalise(made_up_case(std_mm=1e-4), settings(tolerance=1e-6))
     assert found.result.converged
-    assert found.names == tuple(PRIORS)
+    assert found.result.parameters == tuple(PRIORS)
     np.testing.assert_allclose(found.result.estimate, true_of(found), rtol=1e-4, atol=1e-4)
     assert [(d.frame, d.seen) for d in found.distances] == [("closed", True), ("late", False)]
     for distance in found.distances:
@@ -102,8 +101,8 @@ def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch)
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     whole = personalise(case, settings(moduli_only=True))
-    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
-    assert fixed.names == MODULI
+    fixed = personalise(case, settings(*unknowns(fixed=True)))
+    assert fixed.result.parameters == MODULI
     assert whole.moduli_only.parameters == MODULI
     np.testing.assert_array_equal(fixed.result.estimate, whole.moduli_only.estimate)
     np.testing.assert_array_equal(fixed.result.std, whole.moduli_only.std)
@@ -124,8 +123,8 @@ def test_unknowns_may_come_in_any_order(monkeypatch):
     one = personalise(case, settings())
     order = [*unknowns()[::-1]]
     other = personalise(case, settings(*order))
-    assert set(other.names[-6:]) == set(REGISTRATION)
-    at = [other.names.index(name) for name in one.names]
+    assert set(other.result.parameters[-6:]) == set(REGISTRATION)
+    at = [other.result.parameters.index(name) for name in one.result.parameters]
     np.testing.assert_allclose(other.result.estimate[at], one.result.estimate, rtol=1e-6, atol=1e-9)
 
 
@@ -326,7 +325,7 @@ def test_the_fitted_valve_is_closed_anew(monkeypatch):
 
 BAD = [
     ((), "at least one modulus"),
-    ((Prior("E_f.anterior", 6.0, 3.0, Treatment.FIXED),), "at least one modulus"),
+    ((Prior("E_f.anterior", 6.0, 3.0, fixed=True),), "at least one modulus"),
     ((Prior("E_f.anterior", 6.0, 3.0),) * 2, "not all different"),
 ]
 
@@ -372,7 +371,7 @@ def test_unknown_unknowns_are_refused_before_anything_is_closed(name):
 @pytest.mark.parametrize("name", ["shift.x", "turn.z"])
 def test_a_displacement_that_is_fixed_elsewhere_is_not_passed_over(name):
     with pytest.raises(InputError, match=f"{name} is fixed at 1.0"):
-        settings(*unknowns()[:2], Prior(name, 1.0, 0.5, Treatment.FIXED))
+        settings(*unknowns()[:2], Prior(name, 1.0, 0.5, fixed=True))
 
 
 def test_a_structured_mesh_is_of_two_leaflets():
@@ -399,7 +398,7 @@ SMALL = CaseMesh(
 
 def test_the_model_has_the_pressure_and_the_boundary_of_the_case():
     case = made_up_case()
-    given = (*unknowns()[:2], Prior("pressure_scale", 1.3, 0.1, Treatment.FIXED), *unknowns()[4:])
+    given = (*unknowns()[:2], Prior("pressure_scale", 1.3, 0.1, fixed=True), *unknowns()[4:])
     wanted = replace(settings(*given), mesh=SMALL)
     model = build_model(case, wanted)
     assert model.settings.protocol.pressure_mmHg == 100.0
@@ -445,7 +444,9 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
         Prior("shift.z", 0.0, 1.0),
     ]
     protocol = ClosureProtocol(ramp=0.2, dt=0.04, growth=2.0, end=0.4)
-    wanted = PersonaliseSettings(tuple(given), replace(MECHANICS, protocol=protocol), TWIN, 1e-5)
+    wanted = PersonaliseSettings(
+        tuple(given), replace(MECHANICS, protocol=protocol), mesh=TWIN, tolerance=1e-5
+    )
     case = made_up_case(std_mm=1e-3)
     model = build_model(case, wanted)
     twin = RegisteredModel(model, names)
@@ -591,7 +592,7 @@ def test_errors_rougher_than_stated_are_learned(monkeypatch, correspondence):
     z = (learned.mean - true_of(found)) / learned.std
     assert np.sqrt(np.mean(z**2)) < 1.6
     # What would be known if more were known starts from what is.
-    moduli = [found.names.index(name) for name in MODULI]
+    moduli = [found.result.parameters.index(name) for name in MODULI]
     now = [row.std_now for row in found.known.narrower[:2]]
     np.testing.assert_allclose(now, learned.transformed.std[moduli], rtol=1e-6)
 

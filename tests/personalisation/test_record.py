@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from mvest.personalisation import PaperSettings, personalise
-from mvest.personalisation.record import arrays_of_case, label_of, record_of_case
+from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.problem.fields import case_fields
 from mvest.problem.record import EstimateRecord
+from mvest.problem.registration import label_of
 from mvest.problem.verdict import ONE_STATE
 from tests.made_up_closure import TISSUE, made_up_case, settings, use
 
@@ -35,13 +36,13 @@ def test_it_is_plain_data_and_knows_no_truth(fit, record):
     assert EstimateRecord.model_validate_json(text) == record
     assert (record.case, record.simulated, record.status) == ("made_up", True, "converged")
     free = [row for row in record.unknowns if row.kind != "derived"]
-    assert tuple(row.name for row in free) == fit.names
+    assert tuple(row.name for row in free) == fit.result.parameters
     assert [row.estimate for row in free] == fit.result.estimate.tolist()
     assert [(row.prior_mean, row.prior_std) for row in free[:2]] == [(6.23, 3.1), (2.09, 1.05)]
     for one in (record, *record.alternatives.values()):
         assert all(row.truth is None for row in one.unknowns)
     assert all(frame.personalised_to_truth is None for frame in record.frames)
-    assert np.diag(record.correlation) == pytest.approx(np.ones(len(fit.names)))
+    assert np.diag(record.correlation) == pytest.approx(np.ones(len(fit.result.parameters)))
     shown = {row["setting"]: row["value"] for row in record.details["settings"]}
     assert shown["mesh.columns"] == fit.settings.mesh.columns
     assert shown["mechanics.tissue.anterior.nu"] == TISSUE["anterior"].nu
@@ -67,7 +68,7 @@ def test_derived_moduli_follow_by_their_ratios(record):
 
 
 def test_intervals_of_what_is_positive_are_those_of_its_logarithm(fit, record):
-    for k, name in enumerate(fit.names):
+    for k, name in enumerate(fit.result.parameters):
         row, std = record.unknown(name), fit.result.filtered.transformed.std[k]
         if name.startswith(("shift", "turn")):
             assert row.high - row.estimate == pytest.approx(1.959964 * std)
@@ -120,22 +121,24 @@ def test_a_failed_estimation_has_a_record_too():
     fit = personalised(fails_above=4.0, moduli_only=True)
     record = record_of_case(fit)
     assert (record.status, record.frames, record.correlation) == ("failed", (), ())
-    assert [row.name for row in record.unknowns] == list(fit.names)
+    assert [row.name for row in record.unknowns] == list(fit.result.parameters)
     assert all(row.estimate is row.low is None for row in record.unknowns)
     assert record.unknowns[0].prior_mean == 6.23
     assert not record.alternatives["moduli_only"].converged
-    assert not {"narrower", "errors", "whiteness"} & set(record.details)
+    assert not {"narrower", "errors", "known"} & set(record.details)
     assert arrays_of_case(fit) == {}
 
 
 @pytest.mark.parametrize("corresponds", [True, False])
 def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     fit = fit if corresponds else personalised(corresponds=False)
-    np.savez(tmp_path / "fields.npz", **arrays_of_case(fit))
+    arrays = arrays_of_case(fit)
+    # Studies compare all three closed valves with the truth.
+    assert {"generic", "registered", "fitted"} <= arrays.keys()
+    np.savez(tmp_path / "fields.npz", **arrays)
     fields = case_fields(tmp_path / "fields.npz")
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
-    assert fields.truth is None
     if corresponds:
         distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
         np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)

@@ -64,11 +64,9 @@ def case(model=None, filter_=None) -> Problem:
 
 def test_paper_filter_finds_the_truth_of_a_twin() -> None:
     data = observe()
-    assert data.observation is not None
     result = estimate(case(filter_=PaperFilter(0.01)), data.observation).against(data.truth)
     assert result.converged
     np.testing.assert_allclose(result.estimate, TRUTH, rtol=1e-6)
-    assert result.distance is not None
     assert result.distance.shape == (VERTICES,)
     assert result.distance.max() < 1e-6
 
@@ -76,7 +74,6 @@ def test_paper_filter_finds_the_truth_of_a_twin() -> None:
 def test_all_six_moduli_follow_through_the_fixed_ratios() -> None:
     # E_perp = E_f / r and G = E_f / (2 (1 + 0.488)): the errors of one leaflet are all alike.
     data = observe(noise_mm=0.05)
-    assert data.observation is not None
     result = estimate(case(), data.observation).against(data.truth)
     unknowns = record_of(result).unknowns
     assert {one.name: round(one.truth or 0, 2) for one in unknowns} == {
@@ -101,8 +98,6 @@ def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
     fields = {f.name for cls in (Problem, Observation) for f in dataclasses.fields(cls)}
     assert not any("truth" in name or "true" in name for name in fields)
     data = observe()
-    assert data.observation is not None
-    assert data.truth is not None
     # The observation is a copy: changing what it was made from changes nothing that is estimated.
     assert not np.shares_memory(data.observation.positions, data.truth.positions)
     result = estimate(case(), data.observation)
@@ -112,10 +107,6 @@ def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
 
 def test_noise_has_the_stated_size_and_follows_the_seed() -> None:
     data, again, other = observe(noise_mm=0.5), observe(noise_mm=0.5), observe(noise_mm=0.5, seed=2)
-    assert data.observation is not None
-    assert data.truth is not None
-    assert again.observation is not None
-    assert other.observation is not None
     noise = data.observation.positions - data.truth.positions
     # 240 numbers: the standard error of their SD is 0.5 / sqrt(480) = 0.023.
     assert noise.std() == pytest.approx(0.5, abs=3 * 0.023)
@@ -125,10 +116,7 @@ def test_noise_has_the_stated_size_and_follows_the_seed() -> None:
 
 def test_the_distance_to_the_truth_leaves_the_noise_out() -> None:
     data = observe(noise_mm=0.5)
-    assert data.observation is not None
     result = estimate(case(), data.observation).against(data.truth)
-    assert result.distance is not None
-    assert result.distance_to_truth is not None
     # The norm of three N(0, 0.5²) numbers has the mean 0.5 · sqrt(8/π) = 0.80.
     assert result.distance.mean() == pytest.approx(0.80, rel=0.15)
     # Two parameters take up 2 of 120 parts of the noise's variance: 0.80 · sqrt(2/120) = 0.10.
@@ -140,7 +128,6 @@ def test_only_the_closed_frame_gives_the_same_estimate_as_both() -> None:
     estimates = []
     for frames in (("open", "closed"), ("closed",)):
         data = observe(frames=frames, noise_mm=0.0)
-        assert data.observation is not None
         assert data.observation.positions.shape == (len(frames), VERTICES, 3)
         estimates.append(estimate(case(), data.observation).estimate)
     np.testing.assert_allclose(estimates[0], estimates[1], rtol=1e-9)
@@ -148,7 +135,6 @@ def test_only_the_closed_frame_gives_the_same_estimate_as_both() -> None:
 
 def test_each_frame_may_have_its_own_variance() -> None:
     data = observe(variance=[0.01, 0.04])
-    assert data.observation is not None
     R = data.observation.R
     assert R.shape == (2 * 3 * VERTICES,)
     np.testing.assert_array_equal(np.unique(R[: 3 * VERTICES]), [0.01])
@@ -159,9 +145,7 @@ def test_the_bound_scales_with_the_noise() -> None:
     stds = []
     for variance in (0.01, 0.04):
         data = observe(variance=variance)
-        assert data.observation is not None
         found = estimate(case(), data.observation).identifiability
-        assert found is not None
         stds.append(found.std)
     # The two estimates differ by the prior's pull, hence not exactly 2.
     np.testing.assert_allclose(stds[1] / stds[0], 2.0, rtol=1e-2)
@@ -181,7 +165,6 @@ def test_a_failing_truth_is_a_value_with_its_reason() -> None:
 
 def test_a_failing_model_is_a_value_with_its_reason() -> None:
     data = observe()
-    assert data.observation is not None
     result = estimate(case(failing), data.observation).against(data.truth)
     assert not result.converged
     assert result.estimate is None
@@ -191,7 +174,6 @@ def test_a_failing_model_is_a_value_with_its_reason() -> None:
 def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
     # From a start of 40 MPa the first step of Gauss-Newton on 1/m goes far below zero.
     data = observe()
-    assert data.observation is not None
     prior = Gaussian.from_variance(np.array([40.0, 40.0]), 1e4)
     far = Problem(NAMES, Sheet(), prior, IteratedFilter(), Identity(), TISSUE)
     result = estimate(far, data.observation)
@@ -236,7 +218,6 @@ def test_bad_values_and_shapes_are_refused() -> None:
             {},
         )
     data = observe()
-    assert data.observation is not None
     with pytest.raises(InputError, match="truth is of"):
         estimate(case(), data.observation).against(Truth(("a", "b"), TRUTH, np.zeros((2, 1, 3))))
 
@@ -244,7 +225,6 @@ def test_bad_values_and_shapes_are_refused() -> None:
 def test_an_unseen_vertex_has_no_say() -> None:
     # Its position is nowhere to be read, and the estimate is that of the remaining rows.
     data = observe(noise_mm=0.2)
-    assert data.observation is not None
     positions = data.observation.positions.copy()
     hidden = np.arange(VERTICES) % 4 > 0
     positions[1, hidden] = np.nan
@@ -262,7 +242,6 @@ def test_an_unseen_vertex_has_no_say() -> None:
     np.testing.assert_allclose(result.estimate, by_hand.mean, rtol=1e-12)
     assert np.abs(result.estimate - estimate(case(), data.observation).estimate).max() > 1e-3
     # What was not seen is fitted all the same, and has no distance to an observation.
-    assert result.fitted is not None
     assert result.fitted.shape == (2, VERTICES, 3)
     np.testing.assert_array_equal(np.isnan(result.distance), hidden)
     assert np.isfinite(result.distance_to_truth).all()
@@ -291,7 +270,6 @@ def test_the_filter_may_be_told_that_errors_are_correlated() -> None:
         for seed in range(60):
             sheet = smooth_sheet(points)
             data = observe(sheet, seed=seed, errors=errors, correlation=told, variance=0.25)
-            assert data.observation is not None
             result = estimate(case(sheet), data.observation).against(data.truth)
             found.append((result.estimate - TRUTH) / result.std)
         z[told is None] = np.std(found)
@@ -349,11 +327,9 @@ def test_estimates_from_a_shared_start_do_not_depend_on_each_other() -> None:
 
 def test_a_result_prints_what_a_person_wants_to_know() -> None:
     data = observe(noise_mm=0.05)
-    assert data.observation is not None
     result = dataclasses.replace(
         estimate(case(), data.observation).against(data.truth), seconds=1.25
     )
-    assert result.filtered is not None
     std = result.filtered.std
     rows = str(result).splitlines()
     assert rows[0] == f"E_f.anterior   {result.filtered.mean[0]:.4g} ± {std[0]:.2g} MPa"
@@ -370,7 +346,6 @@ def test_a_result_prints_what_a_person_wants_to_know() -> None:
 def test_a_result_without_an_estimate_prints_why() -> None:
     assert str(StudyResult.failed(case(), "no frame")) == "no estimate: no frame"
     data = observe()
-    assert data.observation is not None
     failed = estimate(case(failing), data.observation)
     assert str(failed).startswith("no estimate: not converged: the model gives no prediction")
     assert "Newton's method did not converge" in str(failed)

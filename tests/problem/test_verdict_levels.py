@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 from scipy.stats import rankdata
 
-from mvest.problem.verdict import CHECKS, DOUBTFUL, LAW, NONE, TRUSTWORTHY, Indications, judge
+from mvest.problem.verdict import CHECKS, DOUBTFUL, NONE, TRUSTWORTHY, Found, judge, texts
 from tests.places import ROOT
 
 FILE = ROOT / "results" / "calibration_estimates.csv"
@@ -33,33 +33,32 @@ class Level:
     median_error: float
 
 
-def indications(grounds: str) -> Indications:
+def diagnostics(grounds: str) -> dict[str, Found]:
     """What was seen of an estimate, from what spoke against it."""
-    names = "|".join(map(re.escape, (*{check.name for check in CHECKS}, *OLD)))
-    parts = re.split(rf"; (?=(?:{names}): )", grounds) if grounds else []
-    texts: dict[str, list[str]] = {}
-    for part in parts:
+    names = "|".join(map(re.escape, (*{check.name for check in CHECKS.values()}, *OLD)))
+    found: dict[str, list[str]] = {}
+    for part in re.split(rf"; (?=(?:{names}): )", grounds) if grounds else []:
         check, _, text = part.partition(": ")
-        texts.setdefault(check, []).append(text)
-    case = texts.get("case", [])
-    found = {"law": None, "moved": None}
-    for key, check, pattern in (
-        ("law", "law", r"at (-?[\d.]+) of the way"),
-        ("moved", "geometry", r"a modulus is ([\d.]+) of its"),
+        found.setdefault(check, []).append(text)
+    case = found.get("case", [])
+    seen: dict[str, Found] = {
+        "failed": (),
+        "unfinished": texts(*found.get("iterations", [])),
+        "approximation": texts(*found.get("approximation", [])),
+        "mistakes": (),
+        "unlike": (),
+        "doubts": texts(*(text for text in case if LEFT_OUT not in text)),
+        "unaccounted": texts(*(text for text in case if LEFT_OUT in text)),
+        "innovation": (),
+        "stretch": [(3.0, {"what": "prior"})] if "what was known beforehand" in found else (),
+    }
+    for key, pattern in (
+        ("law", r"at (-?[\d.]+) of the way"),
+        ("moved", r"a modulus is ([\d.]+) of its"),
     ):
-        if check in texts:
-            found[key] = float(re.search(pattern, texts[check][0]).group(1))
-    return Indications(
-        estimated=True,
-        converged="iterations" not in texts,
-        approximation="; ".join(texts.get("approximation", [])),
-        nis=1.0,
-        nis_band=(0.9, 1.1),
-        stretch={"prior": 3.0 if "what was known beforehand" in texts else 0.0},
-        doubts=tuple(text for text in case if LEFT_OUT not in text),
-        unaccounted=tuple(text for text in case if LEFT_OUT in text),
-        **found,
-    )
+        if (check := CHECKS[key].name) in found:
+            seen[key] = [(float(re.search(pattern, found[check][0]).group(1)), {})]
+    return seen
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +67,7 @@ def judged():
     table = pd.read_csv(FILE, comment="#")
     table = table[table["estimate"].notna()]
     grounds = table["grounds"].fillna("")
-    verdicts = {text: judge(indications(text)).trust for text in grounds.unique()}
+    verdicts = {text: judge(diagnostics(text)).trust for text in grounds.unique()}
     return pd.DataFrame(
         {
             "seed": table["seed"],
@@ -97,5 +96,5 @@ def test_the_levels_order_estimates_whose_seeds_chose_nothing(judged):
 
 
 def test_a_law_that_is_far_off_is_grave(judged):
-    assert judge(indications(f"law: at {LAW[1] + 0.01} of the way")).trust == NONE
-    assert judge(indications("distance: it is far")).trust == TRUSTWORTHY
+    assert judge(diagnostics("law: at 0.31 of the way")).trust == NONE
+    assert judge(diagnostics("distance: it is far")).trust == TRUSTWORTHY

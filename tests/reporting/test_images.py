@@ -143,7 +143,7 @@ def test_the_montage_has_frames_in_rows_and_draws_the_valve_on_them(valve, volum
     # A saddle 6.5 mm high: most of the annulus is within 3 mm of its plane.
     assert len(drawn(panel(figure, 1, 2), ANNULUS).get_xdata()) > 40
     for column in range(4):
-        assert np.ptp(drawn(panel(figure, 0, column), "_scale").get_xdata()) == pytest.approx(10.0)
+        assert [type(a).__name__ for a in panel(figure, 0, column).artists] == ["AnchoredSizeBar"]
     # One scale in all panels of a column.
     for column in range(4):
         assert panel(figure, 0, column).get_xlim() == panel(figure, 1, column).get_xlim()

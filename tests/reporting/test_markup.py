@@ -1,12 +1,9 @@
+import re
+
 import pytest
 from markdown_it import MarkdownIt
 
-from mvest.reporting.markup import (
-    latex_text,
-    markdown_rows,
-    markdown_text,
-    number,
-)
+from mvest.reporting.markup import markdown_rows, markdown_text, number
 from mvest.reporting.tables import table
 
 HOSTILE = r"<script>alert('x')</script> | `a` *b* [c](javascript:d) _e_ 5 % & $x$ \input{f} #1 ~"
@@ -29,20 +26,12 @@ def test_ordinary_names_stay_legible_in_markdown() -> None:
 
 
 def test_latex_prints_every_special_character() -> None:
-    text = latex_text(HOSTILE)
-    assert r"\textbackslash{}input\{f\}" in text
-    assert r"\$x\$ " in text
-    assert r"5 \% \& " in text
-    assert r"\#1 \textasciitilde{}" in text
-    assert "_" not in text.replace(r"\_", "")
-
-
-def test_latex_table_has_equal_rows_and_true_numbers() -> None:
-    tex = table([{"a": "P & Q", "b": "-3.5e-05 ± 1.0e-06"}, {"a": "x-y", "b": "–"}]).latex()
+    tex = table([{"a": HOSTILE, "b_c": "5 ± 1"}, {"a": "x-y\nz", "b_c": "–"}]).latex()
     lines = [line for line in tex.splitlines() if line.endswith(r"\\")]
-    assert [line.count(" & ") for line in lines] == [1, 1, 1]
-    assert r"P \& Q & $-$$3.5\times10^{-5}$ $\pm$ $1.0\times10^{-6}$ \\" in tex
-    assert r"x-y & -- \\" in tex
+    assert [len(re.findall(r"(?<!\\)&", line)) for line in lines] == [1, 1, 1]
+    assert r"a & b c \\" in tex
+    for escaped in (r"input\{f\}", r"\$x\$ ", r"5 \% \& ", r"\#1 \textasciitilde", "x-y z & –"):
+        assert escaped in tex
     assert tex.startswith("\\begin{tabular}{lr}\n\\toprule\n")
 
 

@@ -38,7 +38,6 @@ def test_readers_get_one_rounded_cell_and_a_cross_where_the_truth_is_outside() -
 def test_no_text_of_a_run_acts() -> None:
     assert "<i>" not in WHOLE.markdown()
     assert {line.count(" | ") for line in WHOLE.markdown().splitlines()} == {4}
-    assert r"\textbar{}" in WHOLE.latex()
 
 
 def test_a_table_comes_back_from_plain_data() -> None:

@@ -12,7 +12,7 @@ from experiments.common.building.closure import mechanics_of, template_of
 from experiments.common.schema import Values
 from mvest.cases.folder import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.problem.stored import Store
+from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.npz import read_npz
@@ -69,8 +69,8 @@ def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlac
         "mechanics": values["mechanics"],
         "seed": values["seed"],
     }
-    store = Store(values["paths"]["outputs"])
-    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+    folder = Path(values["paths"]["outputs"]) / "virtual"
+    entry = entry_of(folder, described, (_simulate, _write), _place, "{key}")
 
     def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
         _write(root, *made, described)

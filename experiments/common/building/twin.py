@@ -43,7 +43,7 @@ from mvest.observation.errors import (
 )
 from mvest.observation.vertices import require_frames
 from mvest.problem.estimate import Problem, StudyResult, estimate
-from mvest.problem.stored import Extrapolated, Store, StoredModel
+from mvest.problem.stored import Extrapolated, StoredModel, key_of
 from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.reporting.expectation import expectation_text, unknown_text
 from mvest.typing import FloatArray
@@ -70,8 +70,8 @@ def build_truth(
             model.guide = guide_of(model, anatomy, mesh)
         decisive = model.valve, model.contact_valve, model.mesh, settings, model.names, model.fixed
         described = {"model": content_digest(*decisive), "guided": bool(coarser)}
-        store = Store(config["paths"]["outputs"])
-        return model, store.model("truth", model, described, MADE_BY)
+        folder = Path(config["paths"]["outputs"]) / "truth"
+        return model, StoredModel(model, folder, key_of(described, MADE_BY))
 
     model, fine = on(changed)
     if not coarser:
@@ -153,7 +153,7 @@ class Twin:
     truth_model : ClosureModel
         The observation's; an object of its own.
     source : StoredModel or Extrapolated
-        ``truth_model`` behind its cache on disk, extrapolated to zero mesh size if configured.
+        ``truth_model`` behind its cache on disk, extrapolated to zero mesh size if requested.
     truth_values : (p,)
     valve : Valve
         The observed surface.

@@ -34,26 +34,21 @@ from mvest.cases.schema import files_of_case
 from mvest.errors import ConfigurationError
 from mvest.exchange.volumes import files_of_volume
 from mvest.imaging.detection.detect import NoValveError
-from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation.chain import personalise
-from mvest.personalisation.check import expect_case
-from mvest.personalisation.geometry import ConsideredGeometry
+from mvest.personalisation.design import expect_case
 from mvest.personalisation.model import build_coarse, gate_case, gate_lines, with_pressures
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.personalisation.result import Expected
 from mvest.personalisation.settings import (
-    CaseMesh,
-    PaperSettings,
+    CaseChoices,
     PersonaliseSettings,
-    PressureErrors,
     Prior,
-    Treatment,
     with_stiffening,
 )
 from mvest.problem.record import Row
 from mvest.problem.registration import REGISTRATION
-from mvest.quantities import Count, Logarithm, Tolerance, Value
+from mvest.quantities import Value
 from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 
 TYPICAL_SOLVES = 8
@@ -82,22 +77,11 @@ class UnknownSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PersonalSettings:
-    """How a case is personalised (see mvest.personalisation.PersonaliseSettings)."""
+class PersonalSettings(CaseChoices):
+    """How a case is personalised; errors are learned where a configuration says how well known."""
 
     unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
-    mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: Tolerance = 2e-3
-    max_iterations: Count = 15
-    largest_change: Logarithm = 0.2  # of a parameter's logarithm from one equilibrium to the next
-    paper: PaperSettings | None = None
-    moduli_only: bool = False  # estimate also with all nuisances fixed
-    confirm: bool = False  # close the fitted valve anew from the open one
-    correspondence: bool = True  # use corresponding vertices as such, where there are any
-    errors: ErrorBeliefs | None = None  # learn the errors that the case states
-    considered_geometry: ConsideredGeometry | None = None  # how well it is known; null: exactly
-    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)  # it may follow
-    pressures: PressureErrors | None = None  # of several closed frames, beside a common factor
+    errors: ErrorBeliefs | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,13 +103,11 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         If a setting is inadmissible.
     """
     unknowns = tuple(
-        Prior(name, about.mean, about.std, Treatment(about.treatment))
+        Prior(name, about.mean, about.std, about.treatment == "fixed")
         for name, about in personal.unknowns.items()
     )
-    # All other settings have the names of the library's.
-    others = {f.name: getattr(personal, f.name) for f in fields(personal) if f.name != "unknowns"}
-    others |= {"unknowns": unknowns, "mechanics": mechanics_of(values)}
-    return with_stiffening(PersonaliseSettings(**others))
+    choices = {f.name: getattr(personal, f.name) for f in fields(CaseChoices)}
+    return with_stiffening(PersonaliseSettings(unknowns, mechanics_of(values), **choices))
 
 
 def read_configured(place: str | None) -> ValveCase:
@@ -152,7 +134,7 @@ def run_case(
         print(f"implausible: {value}", file=sys.stderr)
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
-    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    free = [u.name for u in settings.unknowns if not u.fixed]
     # As they are estimated: those of the closure first.
     names = sorted(free, key=lambda name: name in REGISTRATION)
     with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:

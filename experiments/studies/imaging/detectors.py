@@ -28,7 +28,7 @@ from mvest.imaging.learning.training import (
     volume_samples,
 )
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, MovingValve
-from mvest.problem.stored import Store
+from mvest.problem.stored import entry_of
 from mvest.processes import side_by_side
 from mvest.quantities import Count, Length, Processes, Seed, Share, within
 from mvest.reading.documents import parse_json
@@ -110,7 +110,7 @@ class ImagingStore:
     """
 
     def __init__(self, config: Values, settings: ImagingSettings) -> None:
-        self._store = Store(Path(config["paths"]["outputs"]) / "detectors")
+        self._folder = Path(config["paths"]["outputs"]) / "detectors"
         self.settings, self.seed = settings, int(config["seed"])
         self._mechanics = mechanics_of(config)
 
@@ -122,7 +122,7 @@ class ImagingStore:
             "mechanics": asdict(self._mechanics),
         }
         made_by = (draw_population, save_population)
-        return self._store.entry("valves", described, made_by, load_population)
+        return entry_of(self._folder / "valves", described, made_by, load_population)
 
     def population(self, which: str) -> tuple[MovingValve, ...]:
         """A population of simulated valves: ``train``, ``calibration`` or ``test``."""
@@ -144,12 +144,12 @@ class ImagingStore:
     def model_entry(self) -> Entry[DetectionModel]:
         """Where the trained detectors are cached."""
         described = {**self._sampling(), "training": asdict(self.settings.training)}
-        return self._store.entry("models", described, (*SAMPLED_BY, save_model), load_model)
+        return entry_of(self._folder / "models", described, (*SAMPLED_BY, save_model), load_model)
 
     def samples_entry(self, number: int) -> Entry[Path]:
         """Where the samples of a training volume are cached, however many volumes there are."""
         described = {**self._sampling(), "number": number}
-        return self._store.entry("samples", described, SAMPLED_BY, lambda path: path)
+        return entry_of(self._folder / "samples", described, SAMPLED_BY, lambda path: path)
 
     def _sampling(self) -> dict[str, Any]:
         known = ("modes", "samples", "acquisition", "draft_volumes", "boosting")
@@ -211,7 +211,7 @@ class ImagingStore:
         entries = []
         for trial, which in zip(trials, of, strict=True):
             described = {"model": key, "trial": asdict(trial), "valves": drawn[which]}
-            entries.append(self._store.entry("trials", described, (function,), _read_trial))
+            entries.append(entry_of(self._folder / "trials", described, (function,), _read_trial))
 
         def make(missing: list[int]) -> Iterator[Any]:
             calls = (

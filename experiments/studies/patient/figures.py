@@ -49,8 +49,13 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    from mvest.reporting.case.drawing import draw_valve, paint_leak, same_scale
-    from mvest.reporting.case.figures import corner_colours, distance_top
+    from mvest.reporting.case.drawing import (
+        corner_colours,
+        distance_top,
+        draw_valve,
+        paint_leak,
+        same_scale,
+    )
     from mvest.reporting.figures import ATRIUM, DISTANCE_MAP
 
     closed = {

@@ -10,11 +10,12 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, View
+from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, View, scale_bar
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.annulus import annulus_plane
@@ -41,7 +42,7 @@ LARGEST_EDGE_MM = 1.2
 """Triangles are drawn by the depth of their middles; below this, touching leaflets stay apart."""
 MAX_SPLITS = 2
 LINE_PIECES = 6
-SCALE_MM = 10.0
+HIGH_QUANTILE = 0.99
 
 Part: TypeAlias = tuple[FloatArray, FloatArray, float]
 """Corners of triangles ``(k, 3, 3)`` mm, their colours ``(k, 3)`` and their width of line."""
@@ -50,6 +51,26 @@ Part: TypeAlias = tuple[FloatArray, FloatArray, float]
 def leaflet_colours(region: IntArray) -> FloatArray:
     """Colours ``(m, 3, 3)`` of the corners of triangles by their leaflet."""
     return np.repeat(LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)][:, None], 3, axis=1)
+
+
+def distance_top(*distances: FloatArray) -> float:
+    """Upper end in mm of a scale for several fields: a round number at or above nearly all."""
+    top = max(float(np.nanquantile(values, HIGH_QUANTILE)) for values in distances)
+    if top <= 0:
+        return 1e-3
+    step = 10.0 ** np.floor(np.log10(top)) / 2
+    return float(step * np.ceil(top / step - 1e-9))
+
+
+def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
+    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
+
+    A triangle is grey where one of its corners has no value.
+    """
+    known = np.isfinite(values)
+    colours: FloatArray = scale.to_rgba(np.where(known, values, 0.0))[:, :3]
+    whole = np.asarray(known[triangles].all(axis=1))
+    return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
 def draw_valve(
@@ -224,9 +245,4 @@ def same_scale(panels: Sequence[Any], shapes: Sequence[FloatArray], view: View) 
     for axes in panels:
         axes.set_xlim(low[0] - margin, high[0] + margin)
         axes.set_ylim(low[1] - 1.8 * margin, high[1] + margin)
-    # Below everything else, where no leaflet's name is written.
-    x, y = low[0] - 0.5 * margin, low[1] - 1.6 * margin
-    panels[0].plot([x, x + SCALE_MM], [y, y], color="black", linewidth=2, solid_capstyle="butt")
-    panels[0].text(
-        x + SCALE_MM / 2, y + 0.15 * margin, f"{SCALE_MM:.0f} mm", fontsize=8, ha="center"
-    )
+    scale_bar(panels[0], "black")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +17,8 @@ from mvest.errors import InputError
 from mvest.problem.fields import CaseFields, case_fields, turn_of
 from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
-    UNSEEN,
+    corner_colours,
+    distance_top,
     draw_valve,
     leaflet_colours,
     name_leaflets,
@@ -24,13 +26,12 @@ from mvest.reporting.case.drawing import (
     same_scale,
 )
 from mvest.reporting.figures import ATRIUM, COLOURS, DISTANCE_MAP, SIDE, TEXT, VIEWS
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
 if TYPE_CHECKING:
     from mvest.cases.case import ValveCase
 
-HIGH_QUANTILE = 0.99
 PRIOR, POSTERIOR, WITHOUT = "0.75", COLOURS[0], COLOURS[1]
 TWO_SIDED = 1.96
 """Standard deviations within which 95 % of a normal distribution lie."""
@@ -118,22 +119,21 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
         ring = cKDTree(annulus)
         loops = boundary_loops(frame.triangles)
         loops.sort(key=lambda loop: float(np.mean(ring.query(vertices[loop])[0])))
-        arrays: dict[str, Any] = {
-            "triangles": frame.triangles,
-            "region": frame.region,
-            "rest": vertices,
-            "annulus": loops[0],
-            "free_edge": loops[-1],
-            "frames": [frame.name],
-            "seen": [True],
-            "tips": np.stack([(frame.papillary_tips - middle) @ axes] * 2),
-        }
+        fields = CaseFields(
+            triangles=frame.triangles,
+            region=frame.region,
+            rest=vertices,
+            annulus=loops[0],
+            free_edge=loops[-1],
+            frames=(frame.name,),
+            seen=np.array([True]),
+            tips=np.stack([(frame.papillary_tips - middle) @ axes] * 2),
+            observed_points={},
+            reach_mm=reach_mm if shut else None,
+        )
         if at_rest:
-            arrays["chord_tip"] = chordae.tip
-            arrays["chord_insertion"] = cKDTree(vertices).query(insertion)[1]
-        if shut:
-            arrays["reach_mm"] = reach_mm
-        fields = case_fields(arrays, turned=False)
+            ends = np.asarray(cKDTree(vertices).query(insertion)[1], dtype=np.int64)
+            fields = replace(fields, chord_tip=chordae.tip, chord_insertion=ends)
         title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
         # Of a closed one the gap is drawn, as of a frame that is not the reference.
         shapes.append(_Shape(title, fields, vertices, int(shut)))
@@ -186,26 +186,6 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.02, extend=beyond)
     bar.set_label(f"distance from the observed closed valve [{unit}]")
     return figure
-
-
-def distance_top(*distances: FloatArray) -> float:
-    """Upper end in mm of a scale for several fields: a round number at or above nearly all."""
-    top = max(float(np.nanquantile(values, HIGH_QUANTILE)) for values in distances)
-    if top <= 0:
-        return 1e-3
-    step = 10.0 ** np.floor(np.log10(top)) / 2
-    return float(step * np.ceil(top / step - 1e-9))
-
-
-def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
-    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
-
-    A triangle is grey where one of its corners has no value.
-    """
-    known = np.isfinite(values)
-    colours: FloatArray = scale.to_rgba(np.where(known, values, 0.0))[:, :3]
-    whole = np.asarray(known[triangles].all(axis=1))
-    return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
 def estimates_figure(record: EstimateRecord) -> Figure:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import json_normalize
 
-from mvest.cases.from_images.detected import DetectedValve
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.personalisation.record import arrays_of_case, record_of_case
@@ -26,10 +24,9 @@ from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord, Spread
 from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure
 from mvest.reporting.case.tables import expected_tables, report_tables, unknown_table
-from mvest.reporting.case.view import CAMERAS, case_view
+from mvest.reporting.case.view import case_view
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
-from mvest.reporting.images import write_image_step
 from mvest.reporting.markup import ended, number
 from mvest.reporting.pictures import TEMPLATES, embedded, rendered
 
@@ -45,7 +42,6 @@ def report(
     folder: Path | str,
     *,
     arrays: Mapping[str, Any] | Path | None = None,
-    images: DetectedValve | None = None,
     line: str = "",
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
@@ -59,8 +55,6 @@ def report(
     arrays : mapping or Path, optional
         Of a record: those of `mvest.personalisation.record.arrays_of_case`, or the ``.npz`` file
         that holds them. Without them there is no page.
-    images : DetectedValve, optional
-        The valve in a volume that the case was made of; its measures and files are written, too.
     line : str
         Where the record came from, for the foot of each picture.
     provenance : mapping, optional
@@ -81,9 +75,8 @@ def report(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    step = None if images is None else write_image_step(images, folder)
     if isinstance(result, Personalised):
-        record, arrays = record_of_case(result, images=step), arrays or arrays_of_case(result)
+        record, arrays = record_of_case(result), arrays or arrays_of_case(result)
     else:
         record = result
     written = [write_atomically(folder / UNKNOWNS, unknown_table(record.unknowns).csv())]
@@ -161,17 +154,15 @@ def _write_page(
             pictures[row["file"]] = embedded(folder / row["file"]) | {"percent": 100}
         except InputError as error:
             missing[row["file"]] = str(error)
-    scene, buttons = case_view(shapes, names)
     labels = {one.name: one.label or one.name for one in record.unknowns}
     rows = json_normalize(dict(provenance)).assign(**{"case files, SHA-256": sha256})
     page = rendered(
         "case_report.html.jinja",
-        scripts=_policy(scene, SCRIPT.read_text(encoding="utf-8")),
+        # The hash of the only script of the page, so that a browser runs no other.
+        script=base64.b64encode(hashlib.sha256(SCRIPT.read_bytes()).digest()).decode(),
         pictures=pictures,
         missing=missing,
-        scene=scene,
-        buttons=buttons,
-        cameras=CAMERAS,
+        states=case_view(shapes),
         files=[path.name for path in written],
         record=record,
         about=about,
@@ -196,10 +187,3 @@ def _first(record: EstimateRecord, name: str) -> Mapping[str, Any]:
     """The only row of a detail, in which what is missing is None."""
     rows = record.detail_rows(name)
     return defaultdict(lambda: None, rows[0] if rows else {})
-
-
-def _policy(scene: str, script: str) -> str:
-    """The scripts of the page by their hashes, so that a browser runs no other."""
-    own = re.findall(r"<script[^>]*>(.*?)</script>", scene, re.DOTALL)
-    digests = (hashlib.sha256(text.encode()).digest() for text in [*own, script])
-    return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)

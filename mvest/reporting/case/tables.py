@@ -7,10 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from mvest.personalisation.record import label_of
 from mvest.personalisation.result import Expected
 from mvest.problem.record import EstimateRecord, FrameFit, Row, Unknown
+from mvest.problem.registration import label_of
 from mvest.problem.verdict import NONE
+from mvest.reporting.expectation import expected_table
 from mvest.reporting.markup import ended
 from mvest.reporting.tables import Column, Table, table
 
@@ -76,9 +77,8 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
         "unknowns": unknown_table(free),
         "moduli_only": unknown_table(() if alone is None else alone.moduli),
         "frames": frame_table(record.frames),
-        "steps": _steps(record, free),
         "measurements": _measurements(rows("measurements")),
-        "narrower": _narrower(rows("narrower"), record.moduli),
+        "narrower": _narrower(rows("narrower")),
         "errors": table(
             rows("errors"),
             name="::errors of the closed frame",
@@ -94,7 +94,6 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             unit="",
             stretch="::largest [SD]",
         ),
-        "whiteness": table(rows("whiteness"), name="::test", statistic="", p_value=":.2g"),
         "known": table(
             rows("known"),
             name="::quantity",
@@ -108,7 +107,7 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             estimate=Column("MPa", low="low", high="high", label="by the data alone"),
             prior_stds=":.1f:from its prior [SD]",
         ),
-        "shares": _shares(rows("shares"), record.moduli),
+        "shares": _shares(rows("shares")),
         "image_frames": _chosen(rows("image_frames")),
         "settings": table(rows("settings")),
     }
@@ -117,26 +116,11 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
 
 def expected_tables(expected: Expected) -> dict[str, Table]:
     """What an estimate could tell, by name: ``unknowns``, ``shares`` and ``narrower``."""
-    moduli = [
-        Unknown(name=one.name, label=label_of(one.name))
-        for one in expected.unknowns
-        if one.name.startswith("E_f.")
-    ]
-    rows = [asdict(one) | {"label": label_of(one.name)} for one in expected.unknowns]
     shares = [asdict(one) | {"source": label_of(one.source)} for one in expected.shares]
     return {
-        "unknowns": table(
-            rows,
-            name=HIDDEN,
-            label="::unknown",
-            unit="",
-            generic=Column(low="low_before", high="high_before", label="generic (beforehand)"),
-            low="::from",
-            high="::to",
-            width=Column(label="width left", digits=".2f"),
-        ),
-        "shares": _shares(shares, moduli),
-        "narrower": _narrower([asdict(one) for one in expected.narrower], moduli),
+        "unknowns": expected_table(expected.unknowns),
+        "shares": _shares(shares),
+        "narrower": _narrower([asdict(one) for one in expected.narrower]),
     }
 
 
@@ -156,48 +140,30 @@ def estimate_text(record: EstimateRecord) -> str:
     return "\n".join(lines)
 
 
-def _narrower(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
+def _narrower(rows: Sequence[Row]) -> Table:
     """A row for each measurement: how wide each modulus' interval would be, in % of now."""
     shares: dict[str, dict[str, float]] = {}
-    labels = {one.name: one.label or one.name for one in moduli}
     columns: dict[str, Column | str] = {"what": "::if this were known"}
     for row in rows:
-        label = labels.get(row["parameter"]) or str(row["parameter"])
+        label = label_of(row["parameter"])
         what = str(row["what"]).removeprefix(f"{label}, ")
-        share = 100.0 * row["std_if_known"] / row["std_now"]
         columns[label] = "%:.0f"
+        share = 100.0 * row["std_if_known"] / row["std_now"]
         shares.setdefault(what, {})[label] = share
     ordered = sorted(shares.items(), key=lambda one: min(one[1].values()))
     return table(({"what": what, **share} for what, share in ordered), **columns)
 
 
-def _shares(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
+def _shares(rows: Sequence[Row]) -> Table:
     """A row for each source of variance of the moduli, the largest first; none below 1 %."""
-    labels = {one.name: one.label or one.name for one in moduli}
     sources: dict[str, dict[str, float]] = {}
     for row in rows:
         own = sources.setdefault(row["source"], {})
-        own[labels.get(row["parameter"]) or str(row["parameter"])] = 100.0 * row["share"]
+        own[label_of(row["parameter"])] = 100.0 * row["share"]
     ordered = sorted(sources.items(), key=lambda one: -max(one[1].values()))
     shown = [{"source": name, **own} for name, own in ordered if max(own.values()) >= 1.0]
     columns = dict.fromkeys((label for own in sources.values() for label in own), "%:.0f")
     return table(shown, source="::share of the variance", **columns)
-
-
-def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:
-    """A row for each unknown and the objective, a column for each step of the filter."""
-    own = [one for one in free if one.treatment == "estimated"]
-    if not record.iterates or not own or len(own) != len(record.iterates[0]):
-        return table(())
-    numbers = ["start", *map(str, range(1, len(record.iterates)))]
-    rows: list[dict[str, Any]] = [
-        {"unknown": one.label or one.name, "unit": one.unit}
-        | dict(zip(numbers, values, strict=True))
-        for one, values in zip(own, zip(*record.iterates, strict=True), strict=True)
-    ]
-    objective = dict(zip(numbers, record.objective, strict=False))
-    rows.append({"unknown": "misfit plus departure from the prior", "unit": ""} | objective)
-    return table(rows)
 
 
 def _measurements(rows: Sequence[Row]) -> Table:

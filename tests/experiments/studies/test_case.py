@@ -15,7 +15,7 @@ from experiments.studies.case import STUDY, Settings
 from mvest.cases.case import ErrorSamples
 from mvest.cases.folder import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.personalisation import Treatment, check, default_settings
+from mvest.personalisation import default_settings, design
 from mvest.problem.verdict import ONE_STATE
 from tests.experiments.configured import composed, plain
 from tests.made_up_closure import made_up_case, use
@@ -54,7 +54,7 @@ def test_settings_are_those_of_the_configuration(config):
     about = {unknown.name: unknown for unknown in settings.unknowns}
     assert list(about)[:2] == ["E_f.anterior", "E_f.posterior"]
     assert (about["E_f.anterior"].mean, about["E_f.anterior"].std) == (6.23, 3.1)
-    assert {u.treatment for u in settings.unknowns} == {Treatment.ESTIMATED}
+    assert not any(u.fixed for u in settings.unknowns)
     assert (settings.moduli_only, settings.confirm, settings.paper) == (True, True, None)
     assert settings.mesh.source == "automatic"
     assert settings.correspondence
@@ -68,9 +68,9 @@ def test_settings_are_those_of_the_configuration(config):
     )  # fmt: skip
     given["personal"]["paper"] = {"P0": 1.0, "Q": 0.1, "R": 0.25, "max_iterations": 3}
     settings = personalising(given)
-    treated = {u.name: u.treatment for u in settings.unknowns}
-    assert treated["E_f.posterior"] is Treatment.ESTIMATED
-    assert treated["turn.x"] is Treatment.FIXED
+    fixed = {u.name for u in settings.unknowns if u.fixed}
+    assert "turn.x" in fixed
+    assert "E_f.posterior" not in fixed
     assert (settings.tolerance, settings.max_iterations, settings.largest_change) == (0.03, 4, 0.3)
     assert (settings.correspondence, settings.confirm, settings.moduli_only) == (False,) * 3
     assert settings.paper.R == 0.25
@@ -151,7 +151,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
 
 def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
     built = use(monkeypatch)
-    monkeypatch.setattr("experiments.common.cases.own_case.build_coarse", check.build_coarse)
+    monkeypatch.setattr("experiments.common.cases.own_case.build_coarse", design.build_coarse)
     monkeypatch.setattr(
         "mvest.personalisation.estimation.estimate",
         lambda *a, **k: pytest.fail("something was estimated"),

@@ -198,7 +198,6 @@ def _record(fields: dict[str, np.ndarray]) -> EstimateRecord:
                     "stretch": 0.5,
                 },
             ),
-            "whiteness": ({"name": "mean zero", "statistic": 0.03, "p_value": 0.21},),
             "narrower": (
                 {
                     "what": "E_f anterior, if the pressure were known",

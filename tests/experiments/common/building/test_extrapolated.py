@@ -1,4 +1,4 @@
-"""A truth that is carried on to cells of no size."""
+"""A truth that is extrapolated to zero mesh size."""
 
 from pathlib import Path
 from typing import Any

@@ -7,7 +7,7 @@ import mvest.cache
 from experiments.common.building.twin import MADE_BY
 from mvest.cases.folder import write_case
 from mvest.estimation import Prediction
-from mvest.problem.stored import Store, StoredModel, key_of
+from mvest.problem.stored import StoredModel, key_of
 
 
 class Model:
@@ -75,7 +75,7 @@ def test_the_key_covers_every_value():
 def test_a_truth_is_made_anew_after_a_change_of_the_code(tmp_path, monkeypatch):
     def is_simulated() -> bool:
         model = Model()
-        Store(tmp_path).model("truth", model, VALUES, MADE_BY)(AT)
+        StoredModel(model, tmp_path / "outputs", key_of(VALUES, MADE_BY))(AT)
         return model.calls == 1
 
     assert is_simulated()

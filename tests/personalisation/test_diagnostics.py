@@ -8,8 +8,8 @@ import pytest
 from mvest.cases.case import Role, Uncertainty
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalisation import personalise
+from mvest.personalisation.diagnostics import _alike, diagnostics_of
 from mvest.personalisation.estimation import CaseProblem
-from mvest.personalisation.indications import _alike, indications_of
 from mvest.problem.verdict import NONE, TRUSTWORTHY, judge
 from tests.made_up_closure import PRIORS, made_up_case, settings, use
 
@@ -28,30 +28,43 @@ def fit(monkeypatch):
     return run
 
 
-def test_a_world_as_stated_is_trusted(fit):
+def size(seen, key):
+    """The only value that was found."""
+    ((value, _),) = seen[key]
+    return value
+
+
+PLAUSIBLE = {"mistakes": (), "doubts": ()}
+
+
+def test_a_case_whose_errors_are_as_stated_is_trusted(fit):
     found = fit()
-    seen = indications_of(found)
-    assert seen.estimated
-    assert seen.converged
-    assert seen.approximation == ""
+    seen = diagnostics_of(found)
+    assert not seen["failed"]
+    assert not seen["unfinished"]
+    assert not seen["approximation"]
     assert found.result.filtered.check is not None
-    assert seen.nis_band[0] <= seen.nis <= seen.nis_band[1]
-    assert abs(seen.alike) < 0.1
-    assert [held.frame for held in seen.held_out] == ["late"]
-    assert set(seen.data_alone) == {"E_f.anterior", "E_f.posterior"}
+    ((_, innovation),) = seen["innovation"]
+    assert innovation["low"] <= innovation["root"] <= innovation["high"]
+    assert size(seen, "alike") < 0.1
+    assert [words["frame"] for _, words in seen["held_out"]] == ["late"]
+    assert {words["what"] for _, words in seen["data_alone"]} == {"E_f.anterior", "E_f.posterior"}
     # Of a factor, estimated by its logarithm: a prior of 1.00 and 10 %.
-    k = found.names.index("pressure_scale")
+    stretch = {words["what"]: value for value, words in seen["stretch"]}
+    k = found.result.parameters.index("pressure_scale")
     moved = np.log(found.result.estimate[k]) / np.sqrt(np.log(1.01))
-    assert seen.stretch["pressure_scale"] == pytest.approx(moved, abs=0.06)
-    k = found.names.index("shift.x")
-    assert seen.stretch["shift.x"] == pytest.approx(found.result.estimate[k] / PRIORS["shift.x"][1])
-    assert judge(replace(seen, mistakes=(), doubts=())).trust == TRUSTWORTHY
+    assert stretch["pressure_scale"] == pytest.approx(abs(moved), abs=0.06)
+    shift = found.result.estimate[found.result.parameters.index("shift.x")] / PRIORS["shift.x"][1]
+    assert stretch["shift.x"] == pytest.approx(abs(shift))
+    assert judge(seen | PLAUSIBLE).trust == TRUSTWORTHY
 
 
 def test_errors_three_times_those_that_are_stated_show_in_what_is_left_over(fit):
-    seen = indications_of(fit(Uncertainty(0.1)))
-    assert seen.nis == pytest.approx(9.0, rel=0.15)
-    verdict = judge(replace(seen, mistakes=(), doubts=()))
+    seen = diagnostics_of(fit(Uncertainty(0.1)))
+    ((value, words),) = seen["innovation"]
+    assert words["root"] == pytest.approx(3.0, rel=0.08)
+    assert value == pytest.approx((words["root"] / words["high"]) ** 2)
+    verdict = judge(seen | PLAUSIBLE)
     assert verdict.trust == NONE
     assert "size of what is left over" in [ground.check for ground in verdict.grounds]
 
@@ -67,14 +80,14 @@ def test_smooth_errors_that_are_stated_as_independent_show_as_a_pattern(monkeypa
         replace(f, vertices=f.vertices + smooth) if f.role is Role.CLOSED else f
         for f in case.frames
     )
-    alike = indications_of(personalise(replace(case, frames=frames), settings())).alike
+    alike = size(diagnostics_of(personalise(replace(case, frames=frames), settings())), "alike")
     assert alike > 0.4 if pattern else alike < 0.15
 
 
 def test_a_fit_by_distances_is_looked_at_as_well(fit):
-    seen = indications_of(fit(correspondence=False))
-    assert seen.nis is not None
-    assert abs(seen.alike) < 0.15
+    seen = diagnostics_of(fit(correspondence=False))
+    assert "innovation" in seen
+    assert size(seen, "alike") < 0.15
 
 
 @pytest.mark.parametrize("smooth", [0, 1])
@@ -97,9 +110,9 @@ def test_of_several_surfaces_the_last_is_looked_at(monkeypatch, smooth):
 def test_without_an_estimate_there_is_its_reason(monkeypatch):
     use(monkeypatch, fails_above=1.0)
     found = personalise(made_up_case(0.3), settings())
-    seen = indications_of(found)
-    assert not seen.estimated
-    assert found.result.reason in seen.ended
+    seen = diagnostics_of(found)
+    ((_, words),) = seen["failed"]
+    assert found.result.reason in words["what"]
     assert judge(seen).trust == NONE
 
 
@@ -107,12 +120,11 @@ def test_a_posterior_that_is_not_the_filters_is_named(fit):
     found = fit()
     filtered = found.result.filtered
     bent = replace(filtered, check=replace(filtered.check, value=3 * filtered.check.limit))
-    seen = indications_of(replace(found, result=replace(found.result, filtered=bent)))
-    assert seen.approximation == bent.check.sentence
+    seen = diagnostics_of(replace(found, result=replace(found.result, filtered=bent)))
+    assert [words["what"] for _, words in seen["approximation"]] == [bent.check.sentence]
     assert "approximation" in [ground.check for ground in judge(seen).grounds]
     # The check is of the worst direction among all unknowns.
     hardly = replace(bent, check=replace(bent.check, value=1.9 * bent.check.limit))
     assert not hardly.check.holds
-    assert not indications_of(
-        replace(found, result=replace(found.result, filtered=hardly))
-    ).approximation
+    found = replace(found, result=replace(found.result, filtered=hardly))
+    assert not diagnostics_of(found)["approximation"]
