@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from mvest.problem.fields import CaseFields, case_fields
 from mvest.problem.record import EstimateRecord, Spread
 from mvest.reporting.case.figures import case_figure, estimates_figure, shapes_figure
 from mvest.reporting.case.tables import expected_tables, report_tables, unknown_table
-from mvest.reporting.case.view import case_view
+from mvest.reporting.case.view import CAMERAS, case_view
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import ended, number
@@ -154,15 +155,17 @@ def _write_page(
             pictures[row["file"]] = embedded(folder / row["file"]) | {"percent": 100}
         except InputError as error:
             missing[row["file"]] = str(error)
+    scene, buttons = case_view(shapes, names)
     labels = {one.name: one.label or one.name for one in record.unknowns}
     rows = json_normalize(dict(provenance)).assign(**{"case files, SHA-256": sha256})
     page = rendered(
         "case_report.html.jinja",
-        # The hash of the only script of the page, so that a browser runs no other.
-        script=base64.b64encode(hashlib.sha256(SCRIPT.read_bytes()).digest()).decode(),
+        scripts=_policy(scene, SCRIPT.read_text(encoding="utf-8")),
         pictures=pictures,
         missing=missing,
-        states=case_view(shapes),
+        scene=scene,
+        buttons=buttons,
+        cameras=CAMERAS,
         files=[path.name for path in written],
         record=record,
         about=about,
@@ -187,3 +190,10 @@ def _first(record: EstimateRecord, name: str) -> Mapping[str, Any]:
     """The only row of a detail, in which what is missing is None."""
     rows = record.detail_rows(name)
     return defaultdict(lambda: None, rows[0] if rows else {})
+
+
+def _policy(scene: str, script: str) -> str:
+    """The scripts of the page by their hashes, so that a browser runs no other."""
+    own = re.findall(r"<script[^>]*>(.*?)</script>", scene, re.DOTALL)
+    digests = (hashlib.sha256(text.encode()).digest() for text in [*own, script])
+    return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)

@@ -1,132 +1,209 @@
-"""The valve of one case to be turned by hand: shapes for the script of the page, which draws them.
-
-A shape is triangles, lines and points, each with its positions and colours as bytes in Base64.
-"""
+"""The valve of one case to be turned by hand: a plotly scene, its script, and its buttons."""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+import plotly.graph_objects as go
+from markupsafe import Markup
+from matplotlib.colors import to_hex
+from numpy.typing import NDArray
 
 from mvest.problem.fields import CaseFields
-from mvest.reporting.case.drawing import (
-    BLOOD,
-    CHORD,
-    LINE,
-    TIP,
-    TISSUE,
-    UNSEEN,
-    corner_colours,
-    distance_top,
-    leaflet_colours,
-    leak_of,
-)
-from mvest.reporting.figures import DISTANCE_MAP
-from mvest.typing import BoolArray, FloatArray
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.reporting.case.drawing import BLOOD, TISSUE, distance_top, leak_of
+from mvest.reporting.figures import LEAFLET_COLOURS
+from mvest.reporting.markup import shown_text
+from mvest.typing import FloatArray, IntArray
+
+DECIMALS = 2
+"""Positions are stored to 0.01 mm, a fiftieth of what is seen of a valve."""
+LINE, CHORD, TIP = "#1a1a1a", "#8a817c", "#59382f"
+GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
 
 PERSONALISED = "closed, personalised"
-"""The shape that is shown first, if there is an estimate."""
+"""The state that is shown first, if there is an estimate."""
 
-Part = tuple[FloatArray, FloatArray]
-"""Positions ``(k, c, 3)`` mm of primitives with c corners, and colours that fit them."""
+CAMERAS: Mapping[str, Any] = {
+    "obliquely": {"eye": {"x": 0.48, "y": -1.04, "z": 1.25}, "up": {"x": 0, "y": 0, "z": 1}},
+    "from the atrium": {"eye": {"x": 0.0, "y": -0.01, "z": 1.75}, "up": {"x": 0, "y": 1, "z": 0}},
+    "from the side": {"eye": {"x": 0.85, "y": -1.50, "z": 0.38}, "up": {"x": 0, "y": 0, "z": 1}},
+}
+"""In perspective: plotly lights no surface from the front in an orthographic scene."""
 
 
-def case_view(fields: CaseFields) -> list[dict[str, Any]]:
-    """The valve open and closed, as observed and as models have it.
+def case_view(fields: CaseFields, names: Sequence[str]) -> tuple[Markup, list[dict[str, Any]]]:
+    """The valve open and closed, as observed and as models have it, one of them shown at a time.
+
+    Parameters
+    ----------
+    fields : CaseFields
+    names : sequence of str
+        Of the leaflets, for what is shown under the pointer.
 
     Returns
     -------
-    list of dict
-        ``label`` of each shape, whether it is ``pressed`` at first, and ``triangles``, ``lines``
-        and ``points``: positions (float32, mm) and colours (uint8) of all corners.
+    markup, buttons : Markup, list of mapping
+        The scene with plotly's script; and for each button its ``label``, which traces of the scene
+        it ``shows``, and whether it is ``pressed`` at first.
     """
-    shapes = shapes_of(fields)
-    start = PERSONALISED if PERSONALISED in shapes else next(iter(shapes))
-    return [
-        {"label": label, "pressed": label == start}
-        | {
-            kind: _bytes([part for part in parts if part[0].shape[1] == corners])
-            for kind, corners in (("triangles", 3), ("lines", 2), ("points", 1))
-        }
-        for label, parts in shapes.items()
+    states = states_of(fields, names)
+    start = PERSONALISED if PERSONALISED in states else next(iter(states))
+    owner = np.array([label for label, parts in states.items() for _ in parts])
+    scene = go.Figure([trace for parts in states.values() for trace in parts])
+    for trace, label in zip(scene.data, owner, strict=True):
+        trace.visible = bool(label == start)
+    axis = {"visible": False, "showbackground": False}
+    scene.update_layout(
+        template=None,
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        paper_bgcolor="white",
+        showlegend=False,
+        scene={"aspectmode": "data", "camera": CAMERAS["obliquely"]}
+        | {f"{name}axis": axis for name in "xyz"},
+    )
+    markup = scene.to_html(
+        full_html=False,
+        include_plotlyjs=True,
+        div_id="valve",
+        default_height="100%",
+        config={"displaylogo": False, "displayModeBar": False, "responsive": True},
+    )
+    buttons = [
+        {"label": label, "shows": (owner == label).tolist(), "pressed": label == start}
+        for label in states
     ]
+    return Markup(markup), buttons
 
 
-def shapes_of(fields: CaseFields) -> dict[str, list[Part]]:
-    """Parts of each shape by its label."""
+def states_of(fields: CaseFields, names: Sequence[str]) -> dict[str, list[Any]]:
+    """Traces of the scene by the label of the state that they belong to."""
     k, frame = fields.closed, fields.closed + 1
-    shapes, seen = {"open": _anatomy(fields, fields.rest, 0)}, list[Part]()
+    states = {"open": _anatomy(fields, fields.rest, 0, names)}
+    seen = []
     if (cloud := fields.observed_points.get(fields.frames[k])) is not None:
-        seen = shapes["closed, observed"] = [(cloud[:, None], UNSEEN)]
-    models = {
-        "observed": (fields.observed, None),
-        "generic": (fields.generic, fields.distance_generic),
-        "personalised": (fields.fitted, fields.distance_fitted),
-    }
-    drawn = {label: (x[k], off) for label, (x, off) in models.items() if x is not None}
-    for label, (points, _) in drawn.items():
-        shapes[f"closed, {label}"] = _anatomy(fields, points, frame)
-    compared = {label: (x, off[k]) for label, (x, off) in drawn.items() if off is not None}
-    for label, (points, off) in compared.items():
-        top = distance_top(*(each for _, each in compared.values()))
-        scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
-        colours = corner_colours(scale, off, fields.triangles)
-        shapes[f"distance, {label}"] = _surface(fields, points, frame, colours)
+        seen = states["closed, observed"] = [_dots(cloud, GHOST, 2.2, hoverinfo="skip")]
     if fields.observed is not None:
-        seen = [(fields.observed[k][surface_edges(fields.triangles)], UNSEEN)]
+        ghost = _mesh(fields.observed[k], fields.triangles, color=GHOST, hoverinfo="skip")
+        seen = [ghost.update(opacity=0.45)]
+        states["closed, observed"] = _anatomy(fields, fields.observed[k], frame, names)
+    models = (
+        ("generic", fields.generic, fields.distance_generic),
+        ("personalised", fields.fitted, fields.distance_fitted),
+    )
+    for label, shape, _ in models:
+        if shape is not None:
+            states[f"closed, {label}"] = _anatomy(fields, shape[k], frame, names)
+    known = [off[k] for _, shape, off in models if shape is not None and off is not None]
+    for label, shape, off in models:
+        if shape is not None and off is not None:
+            top = distance_top(*known)
+            states[f"distance, {label}"] = _coloured(fields, shape[k], frame, off[k], top)
     if fields.fitted is not None and seen:
-        model = _anatomy(fields, fields.fitted[k], frame)
-        shapes["observed (grey) over personalised"] = [*model, *seen]
-    return shapes
+        model = _anatomy(fields, fields.fitted[k], frame, names)
+        states["observed (grey) over personalised"] = [*model, *seen]
+    return states
 
 
-def _anatomy(fields: CaseFields, points: FloatArray, frame: int) -> list[Part]:
-    """Leaflets in their colours, chordae and papillary tips."""
-    return [
-        *_surface(fields, points, frame, leaflet_colours(fields.region)),
-        (fields.chords(points, frame), CHORD),
-        (fields.tips[frame][:, None], TIP),
-    ]
-
-
-def _surface(fields: CaseFields, points: FloatArray, frame: int, colours: FloatArray) -> list[Part]:
-    """Leaflets, annulus and free edge; of a closed valve the gap, and the slit of the contact."""
-    parts = [(points[fields.triangles], colours)]
-    for loop in (fields.annulus, fields.free_edge):
-        parts.append((np.stack([points[loop], points[np.roll(loop, -1)]], axis=1), LINE))
-    if frame and (leak := leak_of(fields, points, frame)) is not None:
-        gap, corners = leak
-        parts.append((_cells(corners, gap.slit), np.array(TISSUE)))
-        parts.append((_cells(corners, gap.open), np.array(BLOOD)))
+def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence[str]) -> list[Any]:
+    """One mesh for each leaflet, lines, chordae and papillary tips."""
+    parts = []
+    for r, name in enumerate(names):
+        triangles = fields.triangles[fields.region == r]
+        colour = to_hex(LEAFLET_COLOURS[r % len(LEAFLET_COLOURS)])
+        # plotly reads tags in its texts.
+        text = escape(shown_text(str(name)))
+        parts.append(_mesh(points, triangles, color=colour, name=text, hoverinfo="name"))
+    parts += [*_leak(fields, points, frame), *_rings(fields, points)]
+    if len(fields.chord_tip):
+        ends = fields.chords(points, frame)
+        # A gap after each chord, so that all of them are one line.
+        broken = np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1)
+        parts.append(_line(broken.reshape(-1, 3), CHORD, 2))
+    if fields.tips.shape[1]:
+        parts.append(_dots(fields.tips[frame], TIP, 6, hoverinfo="name", name="papillary tip"))
     return parts
 
 
-def _cells(corners: FloatArray, pixels: BoolArray) -> FloatArray:
-    """Two triangles ``(k, 3, 3)`` mm for each of some pixels, whose corners are given."""
-    a, b = corners[:-1, :-1][pixels], corners[:-1, 1:][pixels]
-    c, d = corners[1:, :-1][pixels], corners[1:, 1:][pixels]
-    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+def _coloured(
+    fields: CaseFields, points: FloatArray, frame: int, distance: FloatArray, top: float
+) -> list[Any]:
+    """A mesh coloured by distance, and grey where that is not known."""
+    known = np.isfinite(distance[fields.triangles]).all(axis=1)
+    mesh = _mesh(
+        points,
+        fields.triangles[known],
+        distance,
+        colorscale="Viridis",
+        cmin=0.0,
+        cmax=top,
+        colorbar={"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
+        hovertemplate="%{intensity:.2f} mm<extra></extra>",
+    )
+    parts = [mesh, *_leak(fields, points, frame), *_rings(fields, points)]
+    if not known.all():
+        unseen = fields.triangles[~known]
+        parts.append(_mesh(points, unseen, color=UNOBSERVED, hoverinfo="skip"))
+    return parts
 
 
-def _bytes(parts: Sequence[Part]) -> list[str]:
-    """Positions and colours of the primitives whose corners were all seen."""
-    known = [np.isfinite(corners).all(axis=(1, 2)) for corners, _ in parts]
-    places = [corners[seen].reshape(-1, 3) for (corners, _), seen in zip(parts, known, strict=True)]
-    colours = [
-        np.broadcast_to(colour, corners.shape)[seen].reshape(-1, 3)
-        for (corners, colour), seen in zip(parts, known, strict=True)
-    ]
-    nothing = np.empty((0, 3))
+def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
+    """The gap of a closed valve, and the slit where leaflets touch, as high as what is nearest."""
+    if not frame or (leak := leak_of(fields, points, frame)) is None:
+        return []
+    # Of two pixels along both directions there is one.
+    gap, corners = leak[0], leak[1][::2, ::2]
+    parts = []
+    for name, pixels, colour in (("touching", gap.slit, TISSUE), ("gap", gap.open, BLOOD)):
+        row, column = np.nonzero(pixels[:-1:2, :-1:2])
+        a = row * corners.shape[1] + column
+        b = a + corners.shape[1]
+        halves = [np.stack([a, a + 1, b], axis=1), np.stack([a + 1, b + 1, b], axis=1)]
+        if len(a):
+            mesh = _mesh(corners.reshape(-1, 3), np.concatenate(halves), color=to_hex(colour))
+            parts.append(mesh.update(name=name, hoverinfo="name"))
+    return parts
+
+
+def _mesh(
+    points: FloatArray, triangles: IntArray, values: FloatArray | None = None, **style: Any
+) -> Any:
+    """A mesh of the triangles whose corners were all seen, of the vertices that they use."""
+    known = np.isfinite(points[triangles]).all(axis=(1, 2))
+    used, corner = np.unique(triangles[known], return_inverse=True)
+    i, j, k = corner.reshape(-1, 3).T.astype(np.min_scalar_type(len(used)))
+    x, y, z = small(points[used]).T
+    return go.Mesh3d(
+        x=x, y=y, z=z, i=i, j=j, k=k,
+        intensity=None if values is None else small(values[used]),
+        flatshading=False,
+        lighting={"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "roughness": 0.6},
+        lightposition={"x": -4e4, "y": -4e4, "z": 1e5},
+        **style,
+    )  # fmt: skip
+
+
+def _rings(fields: CaseFields, points: FloatArray) -> list[Any]:
+    loops = ((fields.annulus, 6), (fields.free_edge, 2))
     return [
-        base64.b64encode(values.tobytes()).decode("ascii")
-        for values in (
-            np.concatenate([nothing, *places]).astype("<f4"),
-            np.concatenate([nothing, *(255.0 * each for each in colours)]).astype(np.uint8),
-        )
+        _line(points[np.append(loop, loop[0])], LINE, width) for loop, width in loops if len(loop)
     ]
+
+
+def _line(points: FloatArray, colour: str, width: int) -> Any:
+    x, y, z = small(points).T
+    line = {"color": colour, "width": width}
+    return go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, hoverinfo="skip")
+
+
+def _dots(points: FloatArray, colour: str, size: float, **style: Any) -> Any:
+    x, y, z = small(points).T
+    marker = {"size": size, "color": colour}
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **style)
+
+
+def small(values: FloatArray) -> NDArray[np.float32]:
+    """Values as they are stored in a page: rounded, in single precision."""
+    return np.round(values, DECIMALS).astype(np.float32)

@@ -1,6 +1,5 @@
 """Pictures of one case. Fields are made up; see `tests.reporting.case.made_up_case`."""
 
-import base64
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,7 @@ from mvest.reporting.case.figures import (
     frames_figure,
     shapes_figure,
 )
-from mvest.reporting.case.view import case_view, shapes_of
+from mvest.reporting.case.view import case_view, small, states_of
 from mvest.reporting.figures import ATRIUM, SIDE
 from tests.made_up_closure import made_up_case as case_of_frames
 from tests.reporting.case.made_up_case import COLUMNS, made_up_case
@@ -264,23 +263,16 @@ def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds)
     assert [len(leaks(axes)) for axes in figure.axes] == [0, 1, 0, 0, 0, 0]
 
 
-def test_shapes_to_turn_are_triangles_lines_and_points_with_their_colours(fields) -> None:
-    view = {shape["label"]: shape for shape in case_view(fields)}
-    assert [label for label, shape in view.items() if shape["pressed"]] == ["closed, personalised"]
-    decoded = {
-        kind: [base64.b64decode(text) for text in view["open"][kind]]
-        for kind in ("triangles", "lines", "points")
-    }
-    places, colours = decoded["triangles"]
-    corners = np.frombuffer(places, dtype="<f4").reshape(-1, 3, 3)
-    np.testing.assert_allclose(corners, fields.rest[fields.triangles], atol=1e-5)
-    first = np.frombuffer(colours, dtype=np.uint8).reshape(-1, 3, 3)[fields.region == 0]
-    assert len(np.unique(first.reshape(-1, 3), axis=0)) == 1
-    assert len(decoded["lines"][1]) == 3 * 2 * (2 * COLUMNS + len(fields.chord_tip))
-    assert len(decoded["points"][0]) == 4 * 3 * fields.tips.shape[1]
-    # Triangles with a vertex that was not seen are left out.
-    seen = len(base64.b64decode(view["closed, observed"]["triangles"][1]))
-    assert seen == 9 * np.isfinite(fields.observed[0][fields.triangles]).all(axis=(1, 2)).sum()
+def test_positions_of_the_scene_are_rounded_and_in_single_precision(fields) -> None:
+    values = small(np.array([1.23456789, -0.004]))
+    assert values.dtype == np.float32
+    np.testing.assert_allclose(values, [1.23, 0.0], atol=1e-7)
+    # Without plotly's script, 480 vertices and 880 triangles in a dozen meshes.
+    markup = str(case_view(fields, NAMES)[0])
+    own = markup[markup.rindex("Plotly.newPlot") :]
+    assert '"f4"' in own
+    assert '"f8"' not in own
+    assert len(own) < 400_000
 
 
 # --- leaks --------------------------------------------------------------------------------------
@@ -301,23 +293,26 @@ def test_every_picture_of_a_closed_valve_shows_its_leak(fields):
     assert [len(leaks(axes)) for axes in case_figure(valve).axes[:4]] == [1, 1, 0, 0]
 
 
-def test_the_gap_that_is_turned_is_where_it_is(fields):
-    def parts(reach, label="closed, personalised"):
-        drawn = shapes_of(replace(fields, reach_mm=reach, observed=None))[label]
-        return {
-            name: corners
-            for corners, colour in drawn
-            for name, own in (("touching", TISSUE), ("gap", BLOOD))
-            if colour.shape == (3,) and tuple(colour) == own and len(corners)
-        }
+def test_the_scene_has_the_gap_where_it_is(fields):
+    def parts(reach):
+        seen = replace(fields, reach_mm=reach, observed=None)
+        states = states_of(seen, NAMES)
+        leaks = {part.name: part for part in states["closed, personalised"] if part.name in KINDS}
+        return states, leaks
 
-    assert list(parts(200.0)) == list(parts(200.0, "distance, generic")) == ["touching"]
-    assert not parts(200.0, "open")
-    assert not parts(None)
-    (corner,) = parts(0.0).values()
+    KINDS = ("touching", "gap")
+    states, leaks = parts(200.0)
+    assert list(leaks) == ["touching"]
+    assert not [part for part in states["open"] if part.name in KINDS]
+    assert [part.name for part in states["distance, generic"]].count("touching") == 1
+    assert not parts(None)[1]
+    _, leaks = parts(0.0)
+    (gap,) = leaks.values()
+    assert gap.name == "gap"
     # It lies within the annulus, between the free edges, and is as large as it is drawn flat.
     points = fields.fitted[fields.closed]
     flat, _ = leak_of(replace(fields, reach_mm=0.0), points, fields.closed + 1)
+    corner = np.stack([gap.x, gap.y, gap.z], axis=1)[np.stack([gap.i, gap.j, gap.k], axis=1)]
     across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])[:, 2]
     assert np.abs(across).sum() / 2 == pytest.approx(flat.area, rel=0.1)
     assert points[:, 2].min() <= corner[..., 2].min()
