@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from experiments.common.building.filters import build_filter
@@ -163,7 +164,23 @@ def test_the_default_observation_has_3248_vertices() -> None:
     assert observation["columns"] * observation["rows"] == 3248
 
 
-@pytest.mark.parametrize("name", ["own_valve", "patients", "population", "calibration"])
+def test_a_population_is_drawn_from_what_its_estimator_states() -> None:
+    config = plain(composed("experiment=population"))
+    known, patient = config["personal"], config["patient"]
+    geometry = {
+        k: v for k, v in known["considered_geometry"].items() if k.endswith(("_mm", "scale"))
+    }
+    assert set(v for k, v in geometry.items() if "length" not in k) == {0.0}
+    assert known["considered_geometry"]["thickness"] == 0.0
+    for name in ("pressure", "chord_stiffness", "chord_rest_length"):
+        unknown = "pressure_scale" if name == "pressure" else name
+        assert known["unknowns"][unknown]["std"] == patient["deviations"][name]
+    modulus = known["unknowns"]["E_f.anterior"]
+    log_std = np.sqrt(np.log1p((modulus["std"] / modulus["mean"]) ** 2))
+    assert patient["moduli_spread"] == pytest.approx(log_std, abs=0.005)
+
+
+@pytest.mark.parametrize("name", ["own_valve", "patients", "calibration"])
 def test_what_is_not_known_is_carried_by_default(name: str) -> None:
     personal = plain(composed(f"experiment={name}"))["personal"]
     assert personal["considered_geometry"]["thickness"] == 0.2
