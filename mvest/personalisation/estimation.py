@@ -322,7 +322,7 @@ def estimate_all(problem: CaseProblem, generic: Place) -> CaseEstimate:
     place = linearised(
         replace(generic, errors=FrameErrors(problem.fitted), m=at, prediction=prediction), problem
     )
-    moved, unaccounted = None, place.errors.unaccounted
+    moved, unaccounted, seen = None, place.errors.unaccounted, place
     if problem.case.error_samples is not None:
         # They say what is likely of the geometry; nothing is expected of it.
         place = sampled(place)
@@ -330,6 +330,10 @@ def estimate_all(problem: CaseProblem, generic: Place) -> CaseEstimate:
         place, moved, more = _expected(problem, place)
         unaccounted = place.errors.unaccounted + more
     result = _estimate_about(problem, place)
+    if not result.converged and place.errors.displaced_by:
+        reason = f"about the geometry that is expected: {result.reason} ({result.detail})"
+        place, moved, unaccounted = seen, None, (*seen.errors.unaccounted, reason)
+        result = _estimate_about(problem, place)
     result = replace(result, seconds=time.perf_counter() - began)
     return CaseEstimate(result, place, moved, unaccounted)
 
@@ -392,7 +396,7 @@ def _renewed(problem: CaseProblem, place: Place) -> tuple[Place, StudyResult] | 
     if not place.errors.geometry:
         return "; ".join(place.errors.unaccounted)
     result = _estimate_about(problem, place, final=False)
-    return f"{result.reason} ({result.detail})" if result.estimate is None else (place, result)
+    return (place, result) if result.converged else f"{result.reason} ({result.detail})"
 
 
 def _nearer(problem: CaseProblem, result: StudyResult, place: Place) -> Place | str:
