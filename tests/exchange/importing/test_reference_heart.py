@@ -40,7 +40,7 @@ HEART = Path(os.environ.get("MVEST_HRA") or ROOT.parent / "shared" / "data" / "h
 
 
 def imported(folder: Path, closed_depth: float = 0.5, **changes: object):
-    return import_heart(settings_of(folder, **changes), closed_depth)[0]
+    return import_heart(settings_of(folder, closed_depth=closed_depth, **changes))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def case(folder):
-    return imported(folder, citation="whose heart", description="its shape is all that is real")
+    return imported(folder, citation="whose heart")
 
 
 def test_the_valve_that_was_thickened_comes_back(folder):
@@ -80,7 +80,6 @@ def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_pa
     back = read_case(write_case(tmp_path / "case", case))
     np.testing.assert_array_equal(back.surface.vertices, case.surface.vertices)
     assert back.source == "whose heart"
-    assert "shape is all that is real" in back.description
     said = " ".join(back.derived)
     for word in ("papillary tips", "thickness: kept between", "assumed closure", "smoothed"):
         assert word in said
