@@ -30,6 +30,7 @@ LEAST_GB = 1.2
 """Address space that loading the libraries takes; with less they fail in many ways."""
 
 CHECK = "only read, check and draw it, in seconds, and say what an estimate would be able to tell"
+EXAMPLES = {"own-valve": "examples/case", "volume": "examples/volume.seq.nrrd"}
 OVERRIDES = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
 
 
@@ -54,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _help() -> str:
     about = "Leaflet stiffness of a mitral valve, from how the valve is seen to close."
     lines = [f"  mvest {name:<10} {text}" for name, (text, _) in COMMANDS.items()]
-    return "\n".join([about, "", *lines, "", "mvest COMMAND --help says more of each."])
+    more = "mvest COMMAND --help says more of each; mvest --version says which one this is."
+    return "\n".join([about, "", *lines, "", more])
 
 
 def _parsed(command: str, rest: list[str], **arguments: dict[str, Any]) -> Namespace:
@@ -162,16 +164,29 @@ def _application(overrides: list[str]) -> int:
     from experiments.run import main as application
 
     before = sys.argv
-    sys.argv = ["mvest run", *overrides]
+    sys.argv = ["mvest run", *map(named, overrides)]
     try:
         return application()
     finally:
         sys.argv = before
 
 
+def named(word: str) -> str:
+    """A word of `mvest run`; the bare name of an experiment stands for it."""
+    if not re.fullmatch(r"[a-z]\w*", word):
+        return word
+    known = list(experiments_in(EXPERIMENTS))
+    if word in known:
+        return f"experiment={word}"
+    close = [f"experiment={name}" for name in difflib.get_close_matches(word, known, n=1)]
+    hint = f"did you mean {close[0]}?" if close else "expected NAME=VALUE; mvest list names them"
+    raise ConfigurationError(f"{word}: no such experiment; {hint}")
+
+
 def _one_file(command: str, metavar: str, experiment: str, setting: str, rest: list[str]) -> int:
     """An experiment on one file or folder."""
-    parser = Parser(f"mvest {command}", description=COMMANDS[command][0])
+    shown = f"for example: mvest {command} {EXAMPLES[command]} --check"
+    parser = Parser(f"mvest {command}", description=COMMANDS[command][0], epilog=shown)
     parser.add_argument("path", type=Path, metavar=metavar)
     parser.add_argument("--check", action="store_true", help=CHECK)
     parser.add_argument("overrides", nargs="*", metavar="NAME=VALUE", help=OVERRIDES)
@@ -179,6 +194,11 @@ def _one_file(command: str, metavar: str, experiment: str, setting: str, rest: l
     for override in parsed.overrides:
         if "=" not in override:
             parser.error(f"{override}: expected NAME=VALUE; one {metavar} at a time")
+    if metavar == "FOLDER" and parsed.path.is_file():
+        raise InputError(
+            f"{parsed.path}: a file, expected a folder with case.yaml; for a volume over time: "
+            f"mvest volume {parsed.path}"
+        )
     check = ["check=true"] if parsed.check else []
     named = [f"experiment={experiment}", f"{setting}={quoted(str(parsed.path))}"]
     return _application([*named, *check, *parsed.overrides])

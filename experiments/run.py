@@ -158,8 +158,11 @@ def explain(error: BaseException) -> str:
         choices = takewhile(
             lambda line: not line.startswith("Config search path"), lines[listed[0] + 1 :]
         )
-        known = ", ".join(choices)
-        return f"{text.removeprefix(PRIMARY)}; known: {known}"
+        known = [name.strip() for name in choices]
+        wrong = text.rpartition("/")[2].strip("'")
+        close = difflib.get_close_matches(wrong, known, n=1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        return f"{text.removeprefix(PRIMARY)}; {hint}known: {', '.join(known)}"
     if refused := text.partition(RESOLVING)[2]:
         return refused
     if isinstance(causes[-1], OmegaConfBaseException):

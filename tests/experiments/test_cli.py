@@ -15,6 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from experiments import cli
 from experiments.common.places import CONF
 from mvest.cases.folder import write_case
+from mvest.errors import ConfigurationError
 from tests.made_up_closure import made_up_case
 from tests.places import ROOT
 
@@ -87,6 +88,7 @@ def test_a_path_is_taken_literally(text):
     [
         (["lsit"], "lsit: no such command; did you mean list?"),
         (["xyz"], "xyz: no such command; known: list, run"),
+        (["own-valve", "pyproject.toml"], "for a volume over time: mvest volume pyproject.toml"),
         (["own-valve"], "required: FOLDER"),
         (["own-valve", "a", "b"], "b: expected NAME=VALUE"),
         (["volume", "a", "--chekc"], "unrecognized arguments: --chekc"),
@@ -104,6 +106,24 @@ def test_a_wrong_request_is_one_line_and_status_2(arguments, message, capsys, ha
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     assert message in line
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("tabel1", "tabel1: no such experiment; did you mean experiment=table1?"),
+        ("qqqq", "qqqq: no such experiment; expected NAME=VALUE"),
+    ],
+)
+def test_the_name_of_an_experiment_stands_for_it(word, message):
+    assert cli.named("table1") == "experiment=table1"
+    assert [cli.named(one) for one in ("-m", "seed=1,2", "~filter")] == [
+        "-m",
+        "seed=1,2",
+        "~filter",
+    ]
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
+        cli.named(word)
 
 
 def test_help_names_every_command(capsys):

@@ -74,6 +74,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
 
 ERRORS = [
     ("experiment=nope", "Could not find 'experiment/nope'; known: calibration"),
+    ("experiment=tabel1", "Could not find 'experiment/tabel1'; did you mean table1? known: "),
     ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
     ("mesh/nope=a", "Key 'mesh/nope'"),
     ("filter.inital=[1,2]", "did you mean initial?"),
