@@ -157,7 +157,7 @@ def test_a_check_says_what_a_cycle_will_tell_and_estimates_nothing(tmp_path, mon
     said = capsys.readouterr().out
     # 16 x 5 vertices in 5 frames, three coordinates each.
     assert "1200 numbers of 0 s, 0.05 s, 0.1 s, 0.15 s, 0.25 s; 0.01 mm of noise assumed" in said
-    rows = [line.split() for line in said.splitlines() if line.strip().startswith("E_f.")]
-    assert [row[2] for row in rows] == ["3.74", "2.93"]  # where the filter starts
+    rows = [line.split() for line in said.splitlines() if line.strip().startswith("E_f ")]
+    assert [row[3] for row in rows] == ["3.74", "2.93"]  # where the filter starts
     assert "No estimation was run." in said
     assert not list(tmp_path.rglob("result.json"))

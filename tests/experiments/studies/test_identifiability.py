@@ -143,9 +143,9 @@ def test_a_check_tells_of_a_twin_and_estimates_nothing(tmp_path, monkeypatch, ca
     )  # fmt: skip
     assert status == 0, said.err
     assert "480 numbers of open, closed; 0.02 mm of noise assumed, independent" in said.out
-    rows = [line.split() for line in said.out.splitlines() if line.strip().startswith("E_f.")]
-    assert [row[0] for row in rows] == ["E_f.anterior", "E_f.posterior"]
-    assert [row[2] for row in rows] == ["5", "3"]  # the filter's start, not the truth
+    rows = [line.split() for line in said.out.splitlines() if line.strip().startswith("E_f ")]
+    assert [row[1] for row in rows] == ["anterior", "posterior"]
+    assert [row[3] for row in rows] == ["5", "3"]  # the filter's start, not the truth
     assert "No estimation was run." in said.out
     assert not list(Path(tmp_path).rglob("result.json"))
 
