@@ -91,10 +91,11 @@ class SolveBar:
         before = self._before if number else None
         self._before = m, objective
         change = "" if before is None else f" ({objective - before[1]:+.2g})"
-        values = []
-        for k, value in enumerate(m):
-            # A part of an estimation may be of some of the parameters only.
-            name = self._names[k] if len(self._names) == len(m) else f"m[{k}]"
+        values, names = [], self._names
+        if len(names) != len(m):
+            # A part of an estimation is of the moduli alone.
+            names = [name for name in names if name.startswith("E_f.")]
+        for k, (name, value) in enumerate(zip(names, m, strict=False)):
             moved = "" if before is None else f" ({value - before[0][k]:+.2g})"
             values.append(f"{name} {value:.4g}{moved}")
         say(

@@ -116,3 +116,10 @@ def test_the_time_left_is_right_within_a_factor_of_two_from_the_third_job_on(wor
             bar.step(seconds=spent)
             if 3 <= count <= len(ends) - workers:
                 assert 0.5 < bar.left() / (last - now) < 2.0
+
+
+def test_an_estimation_of_the_moduli_alone_names_them(capsys):
+    names = ("E_f.anterior", "pressure_scale", "E_f.posterior")
+    with SolveBar("case", 3, 2, names) as bar:
+        bar.iterate(0, np.array([5.0, 3.0]), 12.5)
+    assert "E_f.anterior 5, E_f.posterior 3" in capsys.readouterr().err
