@@ -160,7 +160,7 @@ def explain(error: BaseException) -> str:
         )
         known = [name.strip() for name in choices]
         wrong = text.rpartition("/")[2].strip("'")
-        close = difflib.get_close_matches(wrong, known, n=1)
+        close = difflib.get_close_matches(wrong, known, n=1, cutoff=0.7)
         hint = f"did you mean {close[0]}? " if close else ""
         return f"{text.removeprefix(PRIMARY)}; {hint}known: {', '.join(known)}"
     if refused := text.partition(RESOLVING)[2]:

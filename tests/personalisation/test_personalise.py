@@ -262,7 +262,8 @@ def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, l
     # Errors of 0.02 mm that are correlated over 8 mm leave 1.1 % (one standard deviation) of the
     # anterior modulus; smoothing this coarse surface adds half a per cent.
     np.testing.assert_allclose(found.result.estimate[:2], true_of(found)[:2], rtol=0.03)
-    assert abs(found.result.estimate[2]) < 0.01
+    # Correlated errors move the whole valve by up to their own size.
+    assert abs(found.result.estimate[2]) < 0.02
     assert [len(d.personalised) for d in found.distances] == [288, 288]
     assert all(d.personalised.max() < 0.05 < d.generic.max() for d in found.distances)
     assert {row.parameter for row in found.known.narrower} == set(MODULI)

@@ -313,7 +313,7 @@ WRONG = [
         ("sweep=debug", "hydra.launcher.cluster=LocalCluster", "hydra.launcher.address=tcp://a:1"),
         "hydra.launcher: address and cluster, expected one of them",
     ),
-    (("sweep=nope",), "Could not find 'sweep/nope'; did you mean noise? known: "),
+    (("sweep=nope",), "Could not find 'sweep/nope'; known: "),
     (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
     (("sweep=debug", "sweep.sise=full"), "did you mean size?"),
     (("sweep=debug", "sed=1,2"), "did you mean seed?"),
