@@ -208,5 +208,6 @@ def _label(value: Any) -> str:
 
 def _titled(figure: Figure, sweep: Sweep, note: str) -> Figure:
     simulated = {run.simulated for record in sweep.records for run in record.estimates} == {True}
-    headline(figure, sweep.title + (" (simulated)" if simulated else ""), note)
+    title = sweep.title.removesuffix(" (simulated)") + (" (simulated)" if simulated else "")
+    headline(figure, title, note)
     return figure

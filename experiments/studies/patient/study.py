@@ -145,11 +145,14 @@ def _true_quantities(
     frames as they were seen.
     """
     known = {str(own["name"]): own for own in estimate.details.get("known", ())}
-    first, second = (own.truth for own in estimate.moduli[:2])
+    truths = [own.truth for own in estimate.moduli if own.truth]
     numbers: dict[str, Number] = {}
     for name in known:
-        if name.startswith("ratio") and first and second:
-            numbers |= {f"true {name}": first / second, f"else {name}": known[name]["generic"]}
+        if name.startswith("ratio") and len(truths) == 2:
+            numbers |= {
+                f"true {name}": truths[0] / truths[1],
+                f"else {name}": known[name]["generic"],
+            }
     strains, rest = [own for own in known if own.startswith("strain")], case.surface.vertices
     seen = case.frame(Role.CLOSED)
     if strains and seen.corresponds:

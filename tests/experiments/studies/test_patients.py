@@ -3,6 +3,8 @@
 import copy
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from experiments.results.published import publish, records_of
 from experiments.studies.patient import study
 from experiments.studies.patient.figures import figure_3, ranks_figure
 from experiments.studies.patient.study import KEPT_ARRAYS, STUDY, figure, keep, summary
+from mvest.cases.case import Role
 from mvest.errors import InputError
 from mvest.problem.fields import case_fields
 from mvest.problem.record import Unknown
@@ -28,6 +31,7 @@ from tests.experiments.studies.made_up_patients import (
     patient,
     unknown,
 )
+from tests.made_up_closure import made_up_case
 from tests.reporting.case.made_up_case import arrays
 
 
@@ -232,6 +236,53 @@ def test_the_population_counts_how_often_intervals_hold():
     tidy = rows(population(), "estimates")
     assert len(tidy) == 20 * (4 + 2)
     assert {row["estimation"] for row in tidy} == {"with nuisances", "without nuisances"}
+
+
+RATIO, STRAIN = "ratio of E_f anterior to posterior", "strain of the {} leaflet {} its fibres"
+STRAINS = [STRAIN.format(*two) for two in product(("anterior", "posterior"), ("along", "across"))]
+
+
+def known(name: str, unit: str, estimate: float, half: float) -> dict[str, Any]:
+    """What an estimate says of a quantity, with the interval estimate ± half."""
+    ends = {"low": estimate - half, "high": estimate + half}
+    return {"name": name, "unit": unit, "estimate": estimate, **ends, "generic": 2.5}
+
+
+def test_ratio_and_strain_stand_beside_what_one_has_without_an_estimate():
+    def one(name: str, trust: str) -> Record:
+        rows = known(RATIO, "", 3.3, 0.5), known(STRAINS[0], "%", 4.0, 0.5)
+        numbers = {f"true {RATIO}": 3.0, f"else {RATIO}": 2.4}
+        numbers |= {f"true {STRAINS[0]}": 5.0, f"else {STRAINS[0]}": 7.0}
+        verdict = Verdict(trust, (), (), ())
+        details = {"known": rows}
+        return patient(name, "population", details=details, numbers=numbers, verdict=verdict)
+
+    # A patient of whom nothing is stated is not counted.
+    records = [one("a", TRUSTWORTHY), one("b", NONE)]
+    found = {row["quantity"]: row for row in rows(records, "quantities")}
+    assert [(row["n"], row["inside"]) for row in found.values()] == [(1, 1), (1, 0)]
+    # A ratio is off by a share of the truth, a strain by percentage points.
+    assert found[RATIO]["median error"] == pytest.approx(10.0)
+    assert found[RATIO]["generic guess"] == pytest.approx(20.0)
+    assert found[STRAINS[0]]["median error"] == pytest.approx(1.0)
+    assert found[STRAINS[0]]["generic guess"] == pytest.approx(2.0)
+    assert found[STRAINS[0]]["mean square"] == pytest.approx((1.96 / 0.5) ** 2, rel=1e-4)
+    assert study.keep(one("a", TRUSTWORTHY)).estimates[0].details["known"]
+
+
+def test_true_strains_are_those_of_the_true_valve():
+    case = made_up_case(0.02)
+    rest, seen = case.surface.vertices, case.frame(Role.CLOSED)
+    closed = [replace(f, vertices=1.2 * rest) if f is seen else f for f in case.frames]
+    stated = tuple(known(name, "%", 9.0, 1.0) for name in STRAINS)
+    estimate = patient(details={"known": (known(RATIO, "", 3.3, 0.5), *stated)}).estimates[0]
+    numbers = study._true_quantities(
+        estimate, replace(case, frames=tuple(closed)), {seen.name: 1.1 * rest}
+    )
+    assert numbers[f"true {RATIO}"] == pytest.approx(3.0)
+    for name in STRAINS:
+        assert numbers[f"true {name}"] == pytest.approx(10.0)
+        assert numbers[f"else {name}"] == pytest.approx(20.0)
 
 
 def test_failures_of_the_population_are_counted_and_not_averaged():
