@@ -57,7 +57,7 @@ test: $(DEVELOP) ## the tests that finish in minutes
 test-all: $(DEVELOP) ## every test
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-fuzz: $(DEVELOP) ## damaged files at every door, and a table of how they ended (FUZZ_SECONDS=3600)
+fuzz: $(DEVELOP) ## damaged files at every importer, and a table of how they ended (FUZZ_SECONDS=3600)
 	$(BIN)/python -m tests.fuzz --seconds $(or $(FUZZ_SECONDS),3600)
 
 docs: $(DEVELOP) ## the documentation site, in docs/_build/html; warnings are errors

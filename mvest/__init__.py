@@ -1,6 +1,6 @@
 """Patient-specific mitral leaflet stiffness, estimated from how the valve is seen to move.
 
-The front door: what a user needs first, each loaded when it is asked for. What they are made of,
+The public names: what a user needs first, each loaded when it is asked for. What they are made of,
 and all the rest, is in the rooms.
 
 * A valve: `Template`, `TemplateParameters`, `Valve`; `structured_mesh` fills its leaflets.

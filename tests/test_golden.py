@@ -96,7 +96,7 @@ PATIENT = ("experiment=patients", "patient=normal_small", "hydra.mode=RUN")
 VOLUME = ("experiment=volume", "volume=examples/volume.seq.nrrd", "imaged.pressure_mmHg=120")
 FEWER = (
     "imaged.error_samples=20",
-    "personal.considered_geometry=null",
+    "personal.nuisance_geometry=null",
     "personal.moduli_only=false",
 )
 OWN = ("experiment=own_valve", "case=examples/case")

@@ -40,8 +40,8 @@ settings = replace(
     mvest.default_settings(case),
     mesh=CaseMesh(columns=16, rows=2, guide_columns=12, guide_rows=2, contact_columns=60,
                   contact_rows=16),
-    considered_geometry=None,
-    considered_law={},
+    nuisance_geometry=None,
+    nuisance_law={},
     moduli_only=False,
     confirm=False,
 )  # fmt: skip

@@ -30,7 +30,7 @@ from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import ALL_VERTICES, vertex_sets
 from mvest.personalisation.chain import personalise
 from mvest.personalisation.design import FrameDesigns, design_case
-from mvest.personalisation.geometry import ConsideredGeometry
+from mvest.personalisation.geometry import NuisanceGeometry
 from mvest.personalisation.model import build_coarse
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
 from mvest.problem.record import EstimateRecord, finite, record_of
@@ -92,7 +92,7 @@ class Corner:
 class FramesSettings:
     """Frames of a virtual patient that are designed, and which designs are also tried."""
 
-    geometry: ConsideredGeometry | None = None  # how well it is known where it is not exactly
+    geometry: NuisanceGeometry | None = None  # how well it is known where it is not exactly
     corners: dict[str, Corner] | None = None  # name -> design
 
 
@@ -249,7 +249,7 @@ def _patient_designs(job: Job[Settings], frames: FramesSettings, about: PatientS
     designs: dict[str, FrameDesigns] = {}
     for name, geometry in known.items():
         say(f"designs, geometry {name}")
-        found = design_case(patient.case, replace(wanted, considered_geometry=geometry))
+        found = design_case(patient.case, replace(wanted, nuisance_geometry=geometry))
         if isinstance(found, str):
             raise GeometryError(f"the generic valve does not close in every frame: {found}")
         designs[name] = found

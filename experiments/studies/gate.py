@@ -15,11 +15,11 @@ import numpy as np
 from experiments.common.building.closure import closure_model
 from experiments.common.building.gate import (
     anatomy_digest,
-    ask_gate,
     close_valve,
     closures_of,
     draw_closing,
     gate_of,
+    gate_report,
     gate_rows,
 )
 from experiments.common.records.record import Mesh
@@ -52,7 +52,7 @@ def run(job: Job[Settings]) -> Result:
 
 def _gate(job: Job[Settings]) -> Result:
     values = job.values
-    report = ask_gate(values)
+    report = gate_report(values)
     model = closure_model(values)
     reference, closures = report.rows[0], closures_of(report)
     verdict = {"passed": report.passed, "closures": closures}

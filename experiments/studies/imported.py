@@ -21,10 +21,10 @@ from experiments.common.building.closure import folder_hash, mechanics_of
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import (
     anatomy_digest,
-    ask_gate,
     close_valve,
     closures_of,
     draw_closing,
+    gate_report,
     gate_rows,
 )
 from experiments.common.building.twin import build_twin, estimate_twin
@@ -338,7 +338,7 @@ def _heart(job: Job[Settings]) -> Result:
     case = import_heart(heart)
     own = _on_case(values, case, job.folder / "case")
     closing = close_valve(own)
-    gate = ask_gate(own)
+    gate = gate_report(own)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
     states = zip(("open", "closed"), closing.ends().steps().rows, strict=True)
     failed = [one.reason for one in records if not one.converged]

@@ -32,7 +32,7 @@ from mvest.cases.folder import read_case, write_case
 from mvest.problem.record import EstimateRecord
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.tables import Column, Table, table
-from mvest.simulation.arrival import KINDS, Arrived, DoorSettings, arrive
+from mvest.simulation.arrival import KINDS, ArrivalSettings, Arrived, arrive
 from mvest.simulation.virtual_patient import PatientSettings
 from mvest.typing import FloatArray
 from mvest.valve.geometry.proximity import closest_points
@@ -44,25 +44,25 @@ class Settings:
 
     patient: PatientSettings
     personal: PersonalSettings
-    door: DoorSettings
+    arrival: ArrivalSettings
 
 
 # -- run ------------------------------------------------------------------------------------------
 def run_surfaces(job: Job[Settings]) -> Result:
     """Simulate, export, import, estimate in a process of its own, reveal the truth."""
-    door, folder = job.settings.door, job.folder
+    arrival, folder = job.settings.arrival, job.folder
     place = make_patient(job.values, job.settings.patient)
     hidden, positions = place.truth()
     patient = read_case(place.case)
-    for name in ("door", "case"):
+    for name in ("arrival", "case"):
         # Of an earlier run.
         shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / "door").mkdir()
+    (folder / "arrival").mkdir()
     registration = np.array([hidden["values"][name] for name in REGISTRATION])
-    arrived = arrive(patient, positions["closed"], registration, door, folder / "door")
+    arrived = arrive(patient, positions["closed"], registration, arrival, folder / "arrival")
     case = write_case(folder / "case", arrived.case)
     found = estimate_hidden(job.values, folder, case, place.hidden, job.settings.personal)
-    numbers: dict[str, Number] = {"kind": door.kind, "geometry": door.label}
+    numbers: dict[str, Number] = {"kind": arrival.kind, "geometry": arrival.label}
     for role, true in (("open", arrived.opened), ("closed", arrived.closed)):
         numbers[f"{role}_back_mm"] = surface_error(arrived.case.frame(true.role), true)
     numbers["thickness_mean_mm"] = thickness_error(arrived, patient.surface.thickness)
@@ -94,21 +94,21 @@ def summary(results: Results) -> dict[str, Table]:
     """Each modulus by how the geometry arrived, and what estimates of each way are worth."""
     rows = []
     for record, estimate in _runs(results):
-        grounds = () if estimate.verdict is None else estimate.verdict.grounds
+        failed_checks = () if estimate.verdict is None else estimate.verdict.failed_checks
         rows += [
             {
                 "patient": estimate.case,
                 "geometry": record.numbers["geometry"],
                 **{name: record.numbers[f"{name}_mm"] for name in OFF},
                 **modulus_row(estimate, own),
-                "grounds": "; ".join(f"{one.check}: {one.text}" for one in grounds),
+                "failed_checks": "; ".join(f"{one.check}: {one.text}" for one in failed_checks),
                 "ended": record.reason,
             }
             for own in estimate.moduli
         ]
     about = {"patient": Column(label="patient (simulated)"), "geometry": Column()}
     about |= dict.fromkeys(OFF, Column("mm", ".2f"))
-    hidden = dict.fromkeys(("grounds", "ended"), Column(hidden=True))
+    hidden = dict.fromkeys(("failed_checks", "ended"), Column(hidden=True))
     return {
         "": table(rows, **about, **MODULUS_COLUMNS, **hidden),
         "geometries": verdicts_and_skill("geometry", _by_geometry(results)),

@@ -86,7 +86,7 @@ EXTREME_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class Implausible:
     """An implausible value of a case.
 
     Attributes
@@ -111,7 +111,7 @@ Value: TypeAlias = tuple[str, str, float, str, str]
 """Field, quantity, value, its entry in `RANGES`, and the mistake that is likely (empty: none)."""
 
 
-def doubts(case: ValveCase) -> tuple[Doubt, ...]:
+def implausible_values(case: ValveCase) -> tuple[Implausible, ...]:
     """All implausible values of a case, likely mistakes first."""
     values = [*_anatomy(case), *_motion(case)]
     if case.closed is not None:
@@ -124,13 +124,13 @@ def doubts(case: ValveCase) -> tuple[Doubt, ...]:
             # Single vertices that were seen elsewhere are no mistake of the whole case: with one in
             # fifty of them, 38 of 40 intervals held. Vertices in another order are far beyond.
             mistake = bool(hint) and (name != "stretch" or not LOST[0] < value < LOST[1])
-            found.append(Doubt(field, f"{text}: {hint}" if hint else text, mistake=mistake))
+            found.append(Implausible(field, f"{text}: {hint}" if hint else text, mistake=mistake))
     return tuple(sorted(found, key=lambda doubt: not doubt.mistake))
 
 
 def require_plausible(case: ValveCase) -> None:
     """Raise InputError that names all implausible values of a case, if it has any."""
-    found = doubts(case)
+    found = implausible_values(case)
     if found:
         raise InputError(f"case {case.name} is not plausible: " + "; ".join(map(str, found)))
 
@@ -246,7 +246,7 @@ def _stretches(rest: FloatArray, closed: Frame, members: IntArray) -> tuple[floa
     return tuple(np.quantile(now[far] / apart[far], [EXTREME_SHARE, 1 - EXTREME_SHARE]).tolist())
 
 
-def _exchanged(case: ValveCase) -> Iterator[Doubt]:
+def _exchanged(case: ValveCase) -> Iterator[Implausible]:
     """Leaflets, frames and pressures that seem to be exchanged."""
     reference, closed, length = case.frame(Role.REFERENCE), case.closed, _leaflet_lengths(case)
     part = _annulus_share(case, "anterior") if length else 0.0
@@ -256,7 +256,7 @@ def _exchanged(case: ValveCase) -> Iterator[Doubt]:
             f"{length['anterior']:.1f} mm long, the posterior {length['posterior']:.1f} mm; the "
             "anterior one is the longer, on the shorter part of the annulus: are they exchanged?"
         )
-        yield Doubt("regions", text, mistake=True)
+        yield Implausible("regions", text, mistake=True)
     if closed is None:
         return
     before, after = (free_orifice(case, frame) for frame in (reference, closed))
@@ -265,7 +265,7 @@ def _exchanged(case: ValveCase) -> Iterator[Doubt]:
             f"the closed frame {closed.name!r} leaves {after:.0f} mm² free, the reference "
             f"{reference.name!r} {before:.0f} mm²: are the frames exchanged?"
         )
-        yield Doubt("frames", text, mistake=True)
+        yield Implausible("frames", text, mistake=True)
     for other in case.fitted:
         rise = _rise_with_pressure(case, closed, other)
         if rise < 0:
@@ -275,7 +275,7 @@ def _exchanged(case: ValveCase) -> Iterator[Doubt]:
                 f"{-rise:.1f} mm farther from the atrium than under {low.pressure_mmHg:.3g} mmHg "
                 f"in {low.name!r}: are frames or pressures exchanged?"
             )
-            yield Doubt(f"frames.{other.name}.pressure", text, mistake=True)
+            yield Implausible(f"frames.{other.name}.pressure", text, mistake=True)
 
 
 def _annulus_share(case: ValveCase, name: str) -> float:

@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix, csr_array
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
-from mvest.cases.plausibility import doubts, free_orifice
+from mvest.cases.plausibility import free_orifice, implausible_values
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.evidence import LENGTH
 from mvest.estimation.information.consistency import moran
@@ -50,14 +50,14 @@ def diagnostics_of(
     dict
         As `mvest.problem.verdict.judge` takes it.
     """
-    result, filtered, found = fit.result, fit.result.filtered, doubts(fit.case)
+    result, filtered, found = fit.result, fit.result.filtered, implausible_values(fit.case)
     ended = f"{result.reason} ({result.detail})" if result.detail else result.reason
     estimated = filtered is not None and result.estimate is not None
     seen: dict[str, Found] = {
         "failed": texts("" if estimated else ended or "the run gives no reason"),
         "unfinished": texts(ended) if estimated and not result.converged else (),
         "mistakes": texts(*(str(doubt) for doubt in found if doubt.mistake)),
-        "doubts": texts(*(str(doubt) for doubt in found if not doubt.mistake)),
+        "implausible": texts(*(str(doubt) for doubt in found if not doubt.mistake)),
         "unlike": texts(unlike),
         "unaccounted": texts(*fit.unaccounted),
     }

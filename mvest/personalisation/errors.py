@@ -305,7 +305,7 @@ def linearise(
         Of the valve as it was seen, if the geometry of ``registered`` is displaced.
     """
     settings, observation = errors.fitted.settings, errors.fitted.observation()
-    geometry, laws = settings.considered_geometry, settings.considered_law
+    geometry, laws = settings.nuisance_geometry, settings.nuisance_law
     mesh = settings.mesh.error_share
     if geometry is None and not laws:
         return errors

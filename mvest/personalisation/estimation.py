@@ -305,7 +305,7 @@ def estimate_all(problem: CaseProblem, generic: Place) -> CaseEstimate:
         With what error samples do, if the case has any.
     """
     settings = problem.settings
-    if settings.considered_geometry is None and not settings.considered_law:
+    if settings.nuisance_geometry is None and not settings.nuisance_law:
         plain = problem.filter(settings.tolerance)
         result = problem.estimate(generic, plain, generic.errors.observation())
         return CaseEstimate(result, generic)
@@ -364,7 +364,7 @@ def _expected(problem: CaseProblem, place: Place) -> tuple[Place, float | None, 
     Steps of Gauss and Newton for parameters and geometry together: the closure is that of a
     displaced valve, and the prior of the geometry's errors stays about what was seen.
     """
-    considered = problem.settings.considered_geometry
+    considered = problem.settings.nuisance_geometry
     assert considered is not None
     result, moved = None, None
     for _ in range(considered.renewals):

@@ -28,7 +28,7 @@ from mvest.valve.geometry.triangles import surface_edges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ConsideredGeometry:
+class NuisanceGeometry:
     """How well the geometry of a case is known: standard deviations, 0 where it is known exactly.
 
     The defaults are choices: a third of the spread between observers of a leaflet in 3D
@@ -129,7 +129,7 @@ def displacement(
 
 
 def geometry_modes(
-    case: ValveCase, considered: ConsideredGeometry, model: ClosureModel
+    case: ValveCase, considered: NuisanceGeometry, model: ClosureModel
 ) -> tuple[GeometryModes, ...]:
     """What is not known of the geometry that the closure of a case is built from.
 

@@ -36,7 +36,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
-from mvest.cases.plausibility import doubts
+from mvest.cases.plausibility import implausible_values
 from mvest.personalisation.diagnostics import diagnostics_of
 from mvest.personalisation.result import FrameDistance, Personalised
 from mvest.problem.estimate import StudyResult
@@ -129,7 +129,7 @@ def _details(fit: Personalised) -> dict[str, Iterable[Row]]:
         "sha256": case.sha256,
         "regions": list(case.surface.region_names),
         "derived": list(case.derived),
-        "implausible": list(map(str, doubts(case))),
+        "implausible": list(map(str, implausible_values(case))),
         "confirmed_mm": fit.confirmed_mm,
         "law_share": known.law_share,
         "error_samples": fit.error_samples,

@@ -15,7 +15,7 @@ from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import NewtonSettings
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalisation.geometry import ConsideredGeometry
+from mvest.personalisation.geometry import NuisanceGeometry
 from mvest.problem.registration import REGISTRATION
 from mvest.quantities import (
     CellsAlong,
@@ -195,10 +195,10 @@ class CaseChoices:
     errors : ErrorBeliefs or None
         How well the errors are known that the case states: they are learned with the unknowns;
         None takes them as they are stated.
-    considered_geometry : ConsideredGeometry or None
+    nuisance_geometry : NuisanceGeometry or None
         How well the geometry is known that the model is built from: what is not counts as an error
         of the observation. None takes it as it was seen.
-    considered_law : dict of str to ExponentialTissue
+    nuisance_law : dict of str to ExponentialTissue
         Leaflet -> another law that its tissue may follow: what it would do to the prediction counts
         as an error of the observation. Empty: the linear law is taken to be right.
     pressures : PressureErrors or None
@@ -215,8 +215,8 @@ class CaseChoices:
     confirm: bool = False
     correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
-    considered_geometry: ConsideredGeometry | None = None
-    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)
+    nuisance_geometry: NuisanceGeometry | None = None
+    nuisance_law: dict[str, ExponentialTissue] = field(default_factory=dict)
     pressures: PressureErrors | None = None
 
 
@@ -256,14 +256,14 @@ class PersonaliseSettings(CaseChoices):
 def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
     """The settings where tissue whose stiffening is an unknown is on its way to another law.
 
-    That law is the one that would be considered otherwise (`PersonaliseSettings.considered_law`).
+    That law is the one that would be considered otherwise (`PersonaliseSettings.nuisance_law`).
 
     Raises
     ------
     InputError
         If there is no such leaflet or no such law, or its tissue is not linear.
     """
-    tissue, laws = dict(settings.mechanics.tissue), dict(settings.considered_law)
+    tissue, laws = dict(settings.mechanics.tissue), dict(settings.nuisance_law)
     for unknown in settings.unknowns:
         if not unknown.name.startswith(STIFFENS):
             continue
@@ -275,12 +275,12 @@ def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
             )
         if region not in laws:
             raise InputError(
-                f"unknown {unknown.name}: considered_law.{region} is missing, the law that the "
+                f"unknown {unknown.name}: nuisance_law.{region} is missing, the law that the "
                 "tissue is on its way to"
             )
         tissue[region] = replace(tissue[region], law="stiffening", exponential=laws.pop(region))
     mechanics = replace(settings.mechanics, tissue=tissue)
-    return replace(settings, mechanics=mechanics, considered_law=laws)
+    return replace(settings, mechanics=mechanics, nuisance_law=laws)
 
 
 UNKNOWNS = (
@@ -326,7 +326,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
         moduli_only=True,
         confirm=True,
         errors=ErrorBeliefs(resolution_mm=0.1),
-        considered_geometry=ConsideredGeometry(
+        nuisance_geometry=NuisanceGeometry(
             leaflet_scale=0.03,
             annulus_scale=0.02,
             frame_scale=0.02,
@@ -335,7 +335,7 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
             share=0.98,
             renewals=6,
         ),
-        considered_law=CURVES,
+        nuisance_law=CURVES,
         pressures=PressureErrors(),
     )
     if case.error_samples is None:
@@ -349,8 +349,8 @@ def default_settings(case: ValveCase) -> PersonaliseSettings:
             for unknown in UNKNOWNS
         ),
         errors=ErrorBeliefs(resolution_mm=0.3),
-        considered_geometry=ConsideredGeometry(
+        nuisance_geometry=NuisanceGeometry(
             shape_mm=0.0, annulus_mm=0.0, tips_mm=0.0, frame_scale=0.02, rest_lengths=0.04
         ),
-        considered_law={},
+        nuisance_law={},
     )

@@ -50,7 +50,7 @@ FINE_MM, MARGIN_MM = 0.2, 6.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DoorSettings:
+class ArrivalSettings:
     """How the geometry of a virtual patient arrives."""
 
     kind: str  # vertices, surfaces, slicerheart or labels
@@ -74,7 +74,7 @@ def arrive(
     case: ValveCase,
     positions: FloatArray,
     registration: FloatArray,
-    door: DoorSettings,
+    arrival: ArrivalSettings,
     folder: Path,
 ) -> Arrived:
     """What becomes of a virtual patient's geometry on its way.
@@ -87,7 +87,7 @@ def arrive(
         ``(n, 3)`` mm, where these truly were in the closed frame.
     registration : ndarray
         ``(6,)`` by which they are displaced against the annulus and the tips that the case states.
-    door : DoorSettings
+    arrival : ArrivalSettings
     folder : Path
         Empty; what is exported and imported is left there.
 
@@ -98,25 +98,27 @@ def arrive(
     """
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
     patient = Arrived(case, opened, replace(closed, vertices=positions))
-    drawn = closed.vertices if door.seen_with_errors else positions
+    drawn = closed.vertices if arrival.seen_with_errors else positions
     closed = replace(closed, vertices=drawn, free_edge=drawn[case.free_edge], corresponds=False)
-    if door.kind == "vertices":
+    if arrival.kind == "vertices":
         return patient
-    if door.kind == "surfaces":
+    if arrival.kind == "surfaces":
         return replace(patient, case=replace(case, frames=(opened, closed)))
-    if door.kind not in KINDS:
-        raise ConfigurationError(f"door.kind = {door.kind!r}, expected one of {', '.join(KINDS)}")
+    if arrival.kind not in KINDS:
+        raise ConfigurationError(
+            f"arrival.kind = {arrival.kind!r}, expected one of {', '.join(KINDS)}"
+        )
     # Leaflets, annulus and tips are drawn in one image.
     tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
     closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)
     seen = (_in_lps(opened), _in_lps(closed))
-    through = _through_slicerheart if door.kind == "slicerheart" else _through_labels
-    imported = replace(through(patient, seen, door, folder), simulated=True)
+    through = _through_slicerheart if arrival.kind == "slicerheart" else _through_labels
+    imported = replace(through(patient, seen, arrival, folder), simulated=True)
     return Arrived(imported, _in_lps(opened), _in_lps(patient.closed))
 
 
 def _through_slicerheart(
-    patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
+    patient: Arrived, frames: tuple[Frame, Frame], arrival: ArrivalSettings, folder: Path
 ) -> ValveCase:
     """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
 
@@ -150,24 +152,24 @@ def _through_slicerheart(
     table_of = pd.DataFrame(contour).assign(AnnulusContourLabel="")
     table_of.to_csv(folder / "AnnulusContourPoints.csv", index=False)
     pd.DataFrame(marks).to_csv(folder / "ValveLandmarkPoints.csv", index=False)
-    options = SlicerheartOptions(pressure_mmHg=frames[1].pressure_mmHg, std_mm=door.std_mm)
+    options = SlicerheartOptions(pressure_mmHg=frames[1].pressure_mmHg, std_mm=arrival.std_mm)
     return import_slicerheart(folder, options)
 
 
 def _through_labels(
-    patient: Arrived, frames: tuple[Frame, Frame], door: DoorSettings, folder: Path
+    patient: Arrived, frames: tuple[Frame, Frame], arrival: ArrivalSettings, folder: Path
 ) -> ValveCase:
     thickness = patient.case.surface.thickness
-    if door.voxel_mm is None:
-        raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
+    if arrival.voxel_mm is None:
+        raise ConfigurationError("arrival.voxel_mm is not given; a label map has voxels")
     opened, closed = (folder / f"{frame.name}.nii.gz" for frame in frames)
     tips = [tuple(frame.papillary_tips.ravel().tolist()) for frame in frames]
     options = LeafletsOptions(anterior=1, posterior=2, tips=tips[0], observer_mm=0.0)
-    _write_label_map(opened, frames[0], thickness, door.voxel_mm)
-    if not door.closed:
+    _write_label_map(opened, frames[0], thickness, arrival.voxel_mm)
+    if not arrival.closed:
         imported = import_leaflets(opened, options)
-        return _with_closed(imported, frames[1], door.std_mm, folder / "by_hand")
-    _write_label_map(closed, frames[1], thickness, door.voxel_mm)
+        return _with_closed(imported, frames[1], arrival.std_mm, folder / "by_hand")
+    _write_label_map(closed, frames[1], thickness, arrival.voxel_mm)
     pressure = frames[1].pressure_mmHg
     both = replace(options, closed=str(closed), tips_closed=tips[1], pressure_mmHg=pressure)
     return import_leaflets(opened, both)

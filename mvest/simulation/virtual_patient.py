@@ -114,7 +114,7 @@ class PatientSimulation:
         The same of the frames that are held out, one after another.
     held_tips : (float, float, float)
         mm, displacement of the papillary tips per unit of relaxation.
-    world : Misspecification
+    misspecification : Misspecification
         Further differences from what the case states and an estimator assumes.
     """
 
@@ -135,7 +135,7 @@ class PatientSimulation:
     held_pressure_mmHg: tuple[Pressure, ...] = (100.0, 80.0, 60.0)
     held_relaxation: tuple[Share, ...] = (0.15, 0.3, 0.45)
     held_tips: tuple[Place, Place, Place] = (0.0, 0.0, 2.0)
-    world: Misspecification = field(default_factory=Misspecification)
+    misspecification: Misspecification = field(default_factory=Misspecification)
 
     def __post_init__(self) -> None:
         for kind in (FITTED, HELD):
@@ -175,7 +175,7 @@ class PatientSettings:
 
     name: str
     description: str
-    world: str = ""  # the misspecification in words
+    misspecification: str = ""  # the misspecification in words
     moduli: dict[str, Modulus] = field(default_factory=dict)  # MPa
     moduli_spread: Factor = 0.0  # SD of the logarithm by which they are drawn about these
     variation: Factor = 0.0  # size of the random variation of the anatomy; 0: as configured
@@ -286,11 +286,11 @@ def simulate_patient(
     GeometryError
         If the valve does not close, or has no equilibrium in a further frame.
     """
-    world, other = simulation.world, rng.spawn(1)[0]
-    values = world.values(values, other)
+    misspecification, other = simulation.misspecification, rng.spawn(1)[0]
+    values = misspecification.values(values, other)
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
-    real = Template(world.anatomy(template.parameters, other))
-    drawn = DrawnValve(name, real, values, world.mechanics(mechanics, values))
+    real = Template(misspecification.anatomy(template.parameters, other))
+    drawn = DrawnValve(name, real, values, misspecification.mechanics(mechanics, values))
     there = drawn.sampled(simulation.seen_columns, simulation.seen_rows)
     shapes = close_patient(drawn, there, simulation)
     centre = seen.motion.annulus[-1].mean(axis=0)
@@ -339,7 +339,7 @@ def close_patient(
 def _model(drawn: DrawnValve, seen: Valve, simulation: PatientSimulation) -> ClosureModel:
     """The model that closes a virtual patient, with the guides that it follows."""
     not_modelled = {*REGISTRATION, *filter(is_frame_pressure, drawn.values)}
-    if simulation.world.exponential:
+    if simulation.misspecification.exponential:
         # Its coefficients follow from a modulus, which is no parameter of its own.
         not_modelled |= {name for name in drawn.values if name.startswith("E_f.")}
     protocol = drawn.mechanics.protocol
@@ -377,14 +377,14 @@ def _case(
 ) -> ValveCase:
     other = rng.spawn(1)[0]
     surface, chordae, motion = seen.surface, seen.chordae, seen.motion
-    world, length = simulation.world, simulation.correlation_length_mm
+    misspecification, length = simulation.misspecification, simulation.correlation_length_mm
     exact, moved = surface.vertices, np.stack(list(true.values()))
-    seen_later = world.noise(simulation.std_mm, exact, length)(moved, moved, rng)
+    seen_later = misspecification.noise(simulation.std_mm, exact, length)(moved, moved, rng)
     if simulation.rough_std_mm:
         seen_later = WhiteNoise(simulation.rough_std_mm)(seen_later, moved, rng)
-    open_shape = exact + world.open_moves(seen, other)
+    open_shape = exact + misspecification.open_moves(seen, other)
     if simulation.rest_std_mm:
-        rest_error = world.noise(simulation.rest_std_mm, exact, length)
+        rest_error = misspecification.noise(simulation.rest_std_mm, exact, length)
         open_shape = rest_error(open_shape[None], exact[None], rng)[0]
     if np.any(open_shape != exact):
         surface = replace(surface, vertices=open_shape)
@@ -392,8 +392,10 @@ def _case(
         nearest = cKDTree(exact).query(chordae.insertion)[1]
         moved_ends = (open_shape - exact)[nearest]
         chordae = replace(chordae, insertion=chordae.insertion + moved_ends)
-    at_annulus, at_tips = world.boundary(motion.annulus[-1], motion.papillary_tips[-1], other)
-    seen_later[0] = world.seen(seen_later[0], seen.surface, other)
+    at_annulus, at_tips = misspecification.boundary(
+        motion.annulus[-1], motion.papillary_tips[-1], other
+    )
+    seen_later[0] = misspecification.seen(seen_later[0], seen.surface, other)
     states = {
         REFERENCE: HeldState(0.0, open_shape[seen.annulus], seen.papillary_tips + at_tips),
         CLOSED: HeldState(

@@ -8,7 +8,7 @@ import pytest
 from experiments.run import main
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
-from mvest.cases.plausibility import doubts
+from mvest.cases.plausibility import implausible_values
 from mvest.cases.tissue import CLOSED_DEPTH, assumed_closure, lay_out_chordae
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
@@ -44,9 +44,11 @@ def test_the_closed_frame_is_asked_for_in_one_line(anatomy):
 
 
 def test_what_is_there_is_judged(anatomy):
-    assert {doubt.field for doubt in doubts(anatomy)} == set()
+    assert {doubt.field for doubt in implausible_values(anatomy)} == set()
     exchanged = replace(anatomy.surface, region=1 - anatomy.surface.region)
-    assert "regions" in {doubt.field for doubt in doubts(replace(anatomy, surface=exchanged))}
+    assert "regions" in {
+        doubt.field for doubt in implausible_values(replace(anatomy, surface=exchanged))
+    }
 
 
 def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):

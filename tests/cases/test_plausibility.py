@@ -8,7 +8,7 @@ import pytest
 
 from mvest.cases.case import Role, Uncertainty
 from mvest.cases.folder import read_case
-from mvest.cases.plausibility import _plane, doubts, require_plausible
+from mvest.cases.plausibility import _plane, implausible_values, require_plausible
 from mvest.errors import InputError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "case"
@@ -39,7 +39,7 @@ def moved(case, how):
 
 
 def test_the_example_is_in_order(case):
-    assert doubts(case) == ()
+    assert implausible_values(case) == ()
     require_plausible(case)
 
 
@@ -51,8 +51,8 @@ def test_errors_of_an_image_are_no_mistake(case, seed):
     rng = np.random.default_rng(seed)
     n = len(case.surface.vertices)
     factor = SpatialCorrelation(case.surface.vertices, 10.0).factor
-    assert doubts(moved(case, lambda x: x + factor @ rng.standard_normal((n, 3)))) == ()
-    assert doubts(moved(case, lambda x: x + 0.3 * rng.standard_normal((n, 3)))) == ()
+    assert implausible_values(moved(case, lambda x: x + factor @ rng.standard_normal((n, 3)))) == ()
+    assert implausible_values(moved(case, lambda x: x + 0.3 * rng.standard_normal((n, 3)))) == ()
 
 
 def exchanged_leaflets(case):
@@ -120,14 +120,18 @@ def large_annulus(case):
     ],
 )
 def test_each_mistake_is_named(case, made, field, words, mistake):
-    found = [doubt for doubt in doubts(made(case)) if doubt.field == field and words in doubt.text]
+    found = [
+        doubt
+        for doubt in implausible_values(made(case))
+        if doubt.field == field and words in doubt.text
+    ]
     assert found
     assert all(doubt.mistake is mistake for doubt in found)
 
 
 def test_mistakes_come_first_and_strictness_refuses_all(case):
     wrong = under(16.0)(tips_away(case))
-    found = doubts(wrong)
+    found = implausible_values(wrong)
     assert [doubt.mistake for doubt in found] == sorted((d.mistake for d in found), reverse=True)
     with pytest.raises(InputError, match=r"is not plausible: .*kPa.*; .*tip"):
         require_plausible(wrong)
@@ -153,15 +157,15 @@ def with_second(case, pressure, rise):
 def test_pressures_in_the_wrong_order_are_named(case):
     exact = replace(case, uncertainty=Uncertainty(0.2, 0.0))
     # Under 80 mmHg instead of 120 the leaflets lie farther from the atrium, not nearer to it.
-    assert doubts(with_second(exact, 80.0, -0.5)) == ()
-    (doubt,) = doubts(with_second(exact, 80.0, 0.5))
+    assert implausible_values(with_second(exact, 80.0, -0.5)) == ()
+    (doubt,) = implausible_values(with_second(exact, 80.0, 0.5))
     assert doubt.mistake
     assert "are frames or pressures exchanged?" in doubt.text
-    assert doubts(with_second(exact, 160.0, 0.5)) == ()
-    assert doubts(with_second(exact, 160.0, -0.5)) != ()
+    assert implausible_values(with_second(exact, 160.0, 0.5)) == ()
+    assert implausible_values(with_second(exact, 160.0, -0.5)) != ()
     # What such errors may do is no mistake.
     smooth = replace(case, uncertainty=Uncertainty(1.0, 10.0))
-    assert doubts(with_second(smooth, 80.0, 0.5)) == ()
+    assert implausible_values(with_second(smooth, 80.0, 0.5)) == ()
     # Every pressure is checked.
-    (doubt,) = [d for d in doubts(with_second(case, 10.7, -0.5)) if "kPa" in d.text]
+    (doubt,) = [d for d in implausible_values(with_second(case, 10.7, -0.5)) if "kPa" in d.text]
     assert doubt.field == "frames.second.pressure"

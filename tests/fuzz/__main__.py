@@ -1,4 +1,4 @@
-"""Damaged files at all doors for a while, and a table of how they ended."""
+"""Damaged files at all importers for a while, and a table of how they ended."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.fuzz.doors import DOORS
+from tests.fuzz.importers import IMPORTERS
 from tests.fuzz.trial import ENDS, FAULTS, Bench
 from tests.places import ROOT
 
 ROUND = 50
-"""Inputs of a door before it is the next one's turn."""
+"""Inputs of an importer before it is the next one's turn."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--seed", type=int, default=0, help="of the first input")
-    parser.add_argument("--door", action="append", choices=sorted(DOORS), default=None)
+    parser.add_argument("--importer", action="append", choices=sorted(IMPORTERS), default=None)
     given = parser.parse_args()
     end, seed = time.monotonic() + given.seconds, given.seed
-    counts: dict[str, Counter[str]] = {name: Counter() for name in given.door or DOORS}
+    counts: dict[str, Counter[str]] = {name: Counter() for name in given.importer or IMPORTERS}
     with tempfile.TemporaryDirectory() as folder:
-        benches = {name: Bench(*DOORS[name], Path(folder) / name) for name in counts}
+        benches = {name: Bench(*IMPORTERS[name], Path(folder) / name) for name in counts}
         while time.monotonic() < end:
             for name, bench in benches.items():
                 counts[name].update(_end(name, bench, one) for one in range(seed, seed + ROUND))
             seed += ROUND
     print(f"seeds {given.seed} to {seed - 1}")
-    print(f"{'door':16}" + "".join(f"{name:>10}" for name in ("inputs", *ENDS)))
+    print(f"{'importer':16}" + "".join(f"{name:>10}" for name in ("inputs", *ENDS)))
     for name, count in [*counts.items(), ("all", sum(counts.values(), Counter()))]:
         print(f"{name:16}{count.total():>10}" + "".join(f"{count[kind]:>10}" for kind in ENDS))
     return int(any(count[kind] for count in counts.values() for kind in FAULTS))

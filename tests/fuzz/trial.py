@@ -1,4 +1,4 @@
-"""How a door ends on a file, within limits of memory and of computing."""
+"""How an importer ends on a file, within limits of memory and of computing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Late(BaseException):
 
 
 class Bench:
-    """The valid files of a door in a folder, each written over by what is made of it."""
+    """The valid files of an importer in a folder, each written over by what is made of it."""
 
     def __init__(self, enter: Enter, makers: Makers, folder: Path) -> None:
         self.enter, self.paths = enter, list[Path]()
@@ -40,7 +40,7 @@ class Bench:
             self.paths.append(maker(folder / str(number)))
         self.contents = [path.read_bytes() for path in self.paths]
         self.whole = [outcome(self.enter, path) for path in self.paths]
-        """How the valid files are read, which also loads what the door needs."""
+        """How the valid files are read, which also loads what the importer needs."""
 
     def damaged(self, seed: int) -> tuple[int, bytes]:
         """The number of a valid file, and bytes made of it; both follow from a number."""
@@ -49,7 +49,7 @@ class Bench:
         return number, changed(self.contents[number], draw)
 
     def tried(self, content: bytes, number: int = 0) -> tuple[str, str]:
-        """How the door ends on bytes in the place of a valid file, and in which words."""
+        """How the importer ends on bytes in the place of a valid file, and in which words."""
         path = self.paths[number]
         path.write_bytes(content)
         with limited():

@@ -11,7 +11,7 @@ from mvest.cases.folder import read_case
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import CaseMesh, PersonaliseSettings, personalise
-from mvest.personalisation.geometry import ConsideredGeometry
+from mvest.personalisation.geometry import NuisanceGeometry
 from mvest.personalisation.model import build_model
 from mvest.valve.mesh.given import GivenValve
 from tests.made_up_closure import unknowns
@@ -26,7 +26,7 @@ SETTINGS = PersonaliseSettings(
     ),
     mesh=CaseMesh(columns=24, rows=3),
     errors=ErrorBeliefs(),
-    considered_geometry=ConsideredGeometry(),
+    nuisance_geometry=NuisanceGeometry(),
 )
 
 

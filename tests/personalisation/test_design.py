@@ -9,7 +9,7 @@ from mvest.cases.case import Role
 from mvest.closure.frames import SCALE
 from mvest.personalisation import PressureErrors, design_case, expect_case
 from mvest.personalisation.design import ERRORS_MMHG, KINDS, errors_of
-from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
+from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
 from mvest.personalisation.known import REACH
 from tests.made_up_closure import FIELDS, PRESSURE, made_up_case, settings, unknowns, use
 
@@ -110,9 +110,7 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
 
     monkeypatch.setattr("mvest.personalisation.sources.RestGeometry", Rest)
     exact = design_case(CASE, settings(pressures=STATED))
-    doubted = design_case(
-        CASE, settings(pressures=STATED, considered_geometry=ConsideredGeometry())
-    )
+    doubted = design_case(CASE, settings(pressures=STATED, nuisance_geometry=NuisanceGeometry()))
     assert [n for n in doubted.knowledge if n.startswith("geometry")] == ["geometry.0"]
     for count in (1, 5):
         own, other = exact.left(count), doubted.left(count)

@@ -34,7 +34,7 @@ def size(seen, key):
     return value
 
 
-PLAUSIBLE = {"mistakes": (), "doubts": ()}
+PLAUSIBLE = {"mistakes": (), "implausible": ()}
 
 
 def test_a_case_whose_errors_are_as_stated_is_trusted(fit):
@@ -66,7 +66,7 @@ def test_errors_three_times_those_that_are_stated_show_in_what_is_left_over(fit)
     assert value == pytest.approx((words["root"] / words["high"]) ** 2)
     verdict = judge(seen | PLAUSIBLE)
     assert verdict.trust == NONE
-    assert "size of what is left over" in [ground.check for ground in verdict.grounds]
+    assert "size of what is left over" in [failed.check for failed in verdict.failed_checks]
 
 
 @pytest.mark.parametrize(("std", "pattern"), [(0.3, True), (0.1, False)])
@@ -122,7 +122,7 @@ def test_a_posterior_that_is_not_the_filters_is_named(fit):
     bent = replace(filtered, check=replace(filtered.check, value=3 * filtered.check.limit))
     seen = diagnostics_of(replace(found, result=replace(found.result, filtered=bent)))
     assert [words["what"] for _, words in seen["approximation"]] == [bent.check.sentence]
-    assert "approximation" in [ground.check for ground in judge(seen).grounds]
+    assert "approximation" in [failed.check for failed in judge(seen).failed_checks]
     # The check is of the worst direction among all unknowns.
     hardly = replace(bent, check=replace(bent.check, value=1.9 * bent.check.limit))
     assert not hardly.check.holds

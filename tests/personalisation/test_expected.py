@@ -10,7 +10,7 @@ from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.personalisation import personalise
 from mvest.personalisation.diagnostics import diagnostics_of
-from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
+from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
 from mvest.problem.verdict import NONE, judge
 from tests.made_up_closure import BASE, FIELDS, error_source, made_up_case, settings, use
 
@@ -57,7 +57,7 @@ def stiffening(monkeypatch):
 
     def run(share):
         moved = share * OTHER.sum(axis=1).reshape(-1, 3)
-        return personalise(seen_with(2, moved), settings(considered_law=CURVES))
+        return personalise(seen_with(2, moved), settings(nuisance_law=CURVES))
 
     return run
 
@@ -71,8 +71,8 @@ def test_the_law_is_told_from_what_was_seen(stiffening, share):
     expected = way @ np.linalg.solve(S, e) / information
     assert fit.known.law_share == pytest.approx(expected, abs=1e-6)
     assert fit.known.law_share == pytest.approx(share, abs=2.5 / np.sqrt(information))
-    grounds = {g.check: g.trust for g in judge(diagnostics_of(fit)).grounds}
-    assert grounds.get("law") == (NONE if share else None)
+    failed_checks = {g.check: g.trust for g in judge(diagnostics_of(fit)).failed_checks}
+    assert failed_checks.get("law") == (NONE if share else None)
 
 
 def test_nothing_is_told_of_a_law_that_is_not_considered(monkeypatch):
@@ -99,9 +99,7 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
     monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", lambda *_: sources)
     sizes = (2.0, -1.0, 0.5, 0.0, -2.8)
     moved = sum(q * r for q, r in zip(sizes, np.hstack(rows).T, strict=True)).reshape(-1, 3)
-    fit = personalise(
-        seen_with(2, moved), settings(considered_geometry=ConsideredGeometry(renewals=0))
-    )
+    fit = personalise(seen_with(2, moved), settings(nuisance_geometry=NuisanceGeometry(renewals=0)))
     e, S = dense(fit.result)
     G = np.hstack(rows)
     modes = G.T @ np.linalg.solve(S + G @ G.T, e)
@@ -117,15 +115,15 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
     assert (fibres.name, fibres.unit) == ("fibres", "degrees")
     assert fibres.stretch == pytest.approx(np.abs(modes[3:]).max(), abs=0.01)
     assert fibres.size == pytest.approx(10 * np.linalg.norm(modes[3:]) / np.sqrt(2), abs=0.1)
-    (ground,) = [
-        g for g in judge(diagnostics_of(fit)).grounds if g.check == "what was known beforehand"
+    (failed,) = [
+        g
+        for g in judge(diagnostics_of(fit)).failed_checks
+        if g.check == "what was known beforehand"
     ]
-    assert ground.text.startswith(f"fibres of the valve was moved by {fibres.stretch:.1f} of its")
+    assert failed.text.startswith(f"fibres of the valve was moved by {fibres.stretch:.1f} of its")
 
 
 def test_a_geometry_of_which_nothing_is_in_doubt_is_not_told(monkeypatch):
     use(monkeypatch)
-    fit = personalise(
-        made_up_case(STD), settings(considered_geometry=ConsideredGeometry(renewals=1))
-    )
+    fit = personalise(made_up_case(STD), settings(nuisance_geometry=NuisanceGeometry(renewals=1)))
     assert fit.known.geometry == ()

@@ -29,8 +29,8 @@ from mvest.personalisation.estimation import (
     linearised,
 )
 from mvest.personalisation.geometry import (
-    ConsideredGeometry,
     GeometryModes,
+    NuisanceGeometry,
     displacement,
     geometry_modes,
     leaflet_scales,
@@ -58,7 +58,7 @@ from tests.made_up_closure import (
 )
 
 MODE = GeometryModes("open shape", {"shape": np.ones((1, 1))})
-NONE = ConsideredGeometry(
+NONE = NuisanceGeometry(
     shape_mm=0, annulus_mm=0, tips_mm=0, insertions_mm=0, thickness=0, fibre_degrees=0
 )
 MODULI = ("E_f.anterior", "E_f.posterior")
@@ -252,9 +252,7 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
     monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
     for errors in (None, settings().errors):
         known = personalise(case, settings(errors=errors))
-        doubtful = personalise(
-            case, settings(errors=errors, considered_geometry=ConsideredGeometry())
-        )
+        doubtful = personalise(case, settings(errors=errors, nuisance_geometry=NuisanceGeometry()))
         anterior = doubtful.result.parameters.index("E_f.anterior")
         assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
         shares = {row.source: row.share for row in doubtful.known.shares[::2]}
@@ -366,7 +364,7 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
             case,
             settings(
                 *free,
-                considered_geometry=ConsideredGeometry(renewals=renewals),
+                nuisance_geometry=NuisanceGeometry(renewals=renewals),
                 tolerance=1e-9,
                 correspondence=True,
             ),
@@ -401,7 +399,7 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
         case,
         settings(
             *unknowns(fixed=True, **known),
-            considered_geometry=ConsideredGeometry(renewals=6),
+            nuisance_geometry=NuisanceGeometry(renewals=6),
             tolerance=1e-9,
         ),
     )
@@ -423,7 +421,7 @@ def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
     given = settings(
         replace(unknowns()[2], std=0.3),
         *others,
-        considered_geometry=ConsideredGeometry(renewals=6),
+        nuisance_geometry=NuisanceGeometry(renewals=6),
         tolerance=1e-9,
     )
     rough = personalise(case, given).result.filtered.transformed
@@ -517,7 +515,7 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     monkeypatch.setattr("mvest.personalisation.model.RestGeometry", Torn)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     plain, torn = (
-        personalise(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))
+        personalise(case, settings(nuisance_geometry=NuisanceGeometry(renewals=renewals)))
         for renewals in (0, 2)
     )
     np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
@@ -545,7 +543,7 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
             case,
             settings(
                 *unknowns(fixed=True, **known),
-                considered_geometry=ConsideredGeometry(renewals=renewals),
+                nuisance_geometry=NuisanceGeometry(renewals=renewals),
             ),
         )
         for renewals in (0, 2)
@@ -563,8 +561,8 @@ def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
         case,
         settings(
             *unknowns(fixed=True, **known),
-            considered_geometry=ConsideredGeometry(renewals=2),
-            considered_law={"anterior": ExponentialTissue(0.06, 4.325, 1446.5)},
+            nuisance_geometry=NuisanceGeometry(renewals=2),
+            nuisance_law={"anterior": ExponentialTissue(0.06, 4.325, 1446.5)},
         ),
     )
     assert fit.unaccounted == ("no law",)
@@ -584,4 +582,4 @@ def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
 )
 def test_what_is_no_standard_deviation_is_refused(setting, value):
     with pytest.raises(InputError, match=f"considered geometry {setting} = "):
-        ConsideredGeometry(**{setting: value})
+        NuisanceGeometry(**{setting: value})

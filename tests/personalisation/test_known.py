@@ -9,7 +9,7 @@ from mvest.cases.case import Role
 from mvest.estimation.transform import to_filter
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import personalise
-from mvest.personalisation.geometry import ConsideredGeometry, GeometryModes
+from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
 from mvest.personalisation.known import EXACTLY, PRESSURE_MMHG, SINGLE
 from mvest.valve.measure.strain import mean_strains
 from tests.made_up_closure import (
@@ -37,7 +37,7 @@ def fitted(monkeypatch, *given, noise=2, errors=None):
     monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", lambda *_: (source,))
     return personalise(
         made_up_case(STD, noise=np.random.default_rng(noise)),
-        settings(*given, considered_geometry=ConsideredGeometry(), errors=errors),
+        settings(*given, nuisance_geometry=NuisanceGeometry(), errors=errors),
     )
 
 

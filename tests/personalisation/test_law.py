@@ -105,7 +105,7 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
         lambda *_: (error_source(column),),
     )
     known = personalise(case, settings(moduli_only=True))
-    doubtful = personalise(case, settings(moduli_only=True, considered_law=STIFFENING))
+    doubtful = personalise(case, settings(moduli_only=True, nuisance_law=STIFFENING))
     anterior = doubtful.result.parameters.index("E_f.anterior")
     assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
     shares = {row.source: row.share for row in doubtful.known.shares[::2]}
@@ -121,7 +121,9 @@ def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
     monkeypatch.setattr(
         "mvest.personalisation.errors.law_and_mesh_sources", lambda *_: "it did not close"
     )
-    fit = personalise(case, settings(considered_law=STIFFENING))
+    fit = personalise(case, settings(nuisance_law=STIFFENING))
     assert fit.unaccounted == ("it did not close",)
-    grounds = [g.text for g in judge(diagnostics_of(fit)).grounds if g.check == "errors left out"]
-    assert any(text.endswith("is not in the intervals: it did not close") for text in grounds)
+    failed_checks = [
+        g.text for g in judge(diagnostics_of(fit)).failed_checks if g.check == "errors left out"
+    ]
+    assert any(text.endswith("is not in the intervals: it did not close") for text in failed_checks)

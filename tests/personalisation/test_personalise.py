@@ -534,7 +534,7 @@ def test_a_law_that_is_not_known_is_not_averaged_away_beside_error_samples(monke
     )
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
     law = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
-    given = settings(*right_nuisances(), considered_law=law)
+    given = settings(*right_nuisances(), nuisance_law=law)
     told = personalise(case, given)
     known = personalise(case, settings(*right_nuisances()))
     assert told.result.std[0] > 1.05 * known.result.std[0]

@@ -110,10 +110,10 @@ def test_gate_and_images_speak_in_the_verdict(fit, record):
     assert ONE_STATE in record.verdict.missing
     assert ONE_STATE in record_of_case(fit, gate=True).verdict.passed
     failed = record_of_case(fit, gate=False).verdict
-    assert [ground.check for ground in failed.grounds if ground.check == ONE_STATE]
+    assert [failed.check for failed in failed.failed_checks if failed.check == ONE_STATE]
     step = {"image_step": ({"unlike": "the volume is unlike those of training"},)}
     unlike = record_of_case(fit, images=step)
-    assert any("unlike those of training" in ground.text for ground in unlike.verdict.grounds)
+    assert any("unlike those of training" in failed.text for failed in unlike.verdict.failed_checks)
     assert unlike.details["image_step"] == step["image_step"]
 
 

@@ -15,7 +15,9 @@ from mvest.problem.verdict import (
     texts,
 )
 
-ALWAYS = dict.fromkeys(("failed", "unfinished", "mistakes", "doubts", "unlike", "unaccounted"), ())
+ALWAYS = dict.fromkeys(
+    ("failed", "unfinished", "mistakes", "implausible", "unlike", "unaccounted"), ()
+)
 """Without a finding, of every estimate."""
 
 
@@ -57,7 +59,7 @@ GOOD = ALWAYS | {
 def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
     verdict = judge(GOOD)
     assert verdict.trust == TRUSTWORTHY
-    assert verdict.grounds == ()
+    assert verdict.failed_checks == ()
     assert len(verdict.passed) == 14
     assert verdict.missing == ()
     assert str(verdict) == "trustworthy: 14 checks passed"
@@ -73,8 +75,8 @@ CASES = [
     ("unaccounted", texts("no law"), DOUBTFUL, "not in the intervals: no law"),
     ("mistakes", texts("units: is it in cm?"), NONE, "is it in cm?"),
     ("unlike", texts("seen with 0.7"), NONE, "seen with 0.7"),
-    ("doubts", texts("thickness: 4 mm"), DOUBTFUL, "thickness: 4 mm"),
-    ("doubts", texts("thick", "wide")[1:], DOUBTFUL, "wide"),
+    ("implausible", texts("thickness: 4 mm"), DOUBTFUL, "thickness: 4 mm"),
+    ("implausible", texts("thick", "wide")[1:], DOUBTFUL, "wide"),
     ("innovation", innovation(1.02), DOUBTFUL, "1.03 times"),
     ("innovation", innovation(1.51), NONE, "times what its errors"),
     ("alike", one(0.28, alike=-0.28), DOUBTFUL, "correlation -0.28"),
@@ -93,11 +95,11 @@ CASES = [
 def test_each_ground_counts_and_says_its_number(key, found, trust, words):
     verdict = judge(GOOD | {key: found})
     assert verdict.trust == trust
-    (ground,) = verdict.grounds
-    assert words in ground.text
-    assert ground.advice
-    assert ground.check == CHECKS[key].name
-    assert ground.check not in verdict.passed
+    (failed,) = verdict.failed_checks
+    assert words in failed.text
+    assert failed.advice
+    assert failed.check == CHECKS[key].name
+    assert failed.check not in verdict.passed
 
 
 @pytest.mark.parametrize("key", [key for key, check in CHECKS.items() if check.limits[0]])
@@ -110,16 +112,18 @@ def test_limits_themselves_are_admitted(key):
 def test_the_worst_ground_decides_and_stands_first():
     verdict = judge(GOOD | {"alike": one(0.5, alike=0.5), "gate": one(1.0), "closure": leak(121)})
     assert verdict.trust == NONE
-    assert [ground.trust for ground in verdict.grounds] == [NONE, DOUBTFUL, DOUBTFUL]
+    assert [failed.trust for failed in verdict.failed_checks] == [NONE, DOUBTFUL, DOUBTFUL]
     assert str(verdict).startswith("none: the fitted valve leaves 121 mm²")
 
 
 def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
     verdict = judge(ALWAYS)
     assert len(verdict.missing) == 11
-    # Two of these are needed, and two grounds are one too many.
+    # Two of these are needed, and two failed_checks are one too many.
     assert verdict.trust == NONE
-    assert [ground.check for ground in verdict.grounds] == [CHECKS[key].name for key in NEEDED]
+    assert [failed.check for failed in verdict.failed_checks] == [
+        CHECKS[key].name for key in NEEDED
+    ]
     assert set(verdict.missing).isdisjoint(verdict.passed)
     assert "data against prior" in verdict.missing
     known = {key: found for key, found in GOOD.items() if key not in ("alike", "held_out", "gate")}
@@ -131,4 +135,4 @@ def test_two_doubtful_checks_are_none_and_two_grounds_of_one_are_doubtful():
     smooth = {"alike": one(0.5, alike=0.5)}
     assert judge(GOOD | smooth).trust == DOUBTFUL
     assert judge(GOOD | smooth | {"moved": one(1.0)}).trust == NONE
-    assert judge(GOOD | {"doubts": texts("thick", "wide")}).trust == DOUBTFUL
+    assert judge(GOOD | {"implausible": texts("thick", "wide")}).trust == DOUBTFUL

@@ -33,11 +33,11 @@ class Level:
     median_error: float
 
 
-def diagnostics(grounds: str) -> dict[str, Found]:
+def diagnostics(failed_checks: str) -> dict[str, Found]:
     """What was seen of an estimate, from what spoke against it."""
     names = "|".join(map(re.escape, (*{check.name for check in CHECKS.values()}, *OLD)))
     found: dict[str, list[str]] = {}
-    for part in re.split(rf"; (?=(?:{names}): )", grounds) if grounds else []:
+    for part in re.split(rf"; (?=(?:{names}): )", failed_checks) if failed_checks else []:
         check, _, text = part.partition(": ")
         found.setdefault(check, []).append(text)
     case = found.get("case", [])
@@ -47,7 +47,7 @@ def diagnostics(grounds: str) -> dict[str, Found]:
         "approximation": texts(*found.get("approximation", [])),
         "mistakes": (),
         "unlike": (),
-        "doubts": texts(*(text for text in case if LEFT_OUT not in text)),
+        "implausible": texts(*(text for text in case if LEFT_OUT not in text)),
         "unaccounted": texts(*(text for text in case if LEFT_OUT in text)),
         "innovation": (),
         "stretch": [(3.0, {"what": "prior"})] if "what was known beforehand" in found else (),
@@ -66,12 +66,12 @@ def judged():
     """Seed, verdict, error of the logarithm and whether the interval missed, of each modulus."""
     table = pd.read_csv(FILE, comment="#")
     table = table[table["estimate"].notna()]
-    grounds = table["grounds"].fillna("")
-    verdicts = {text: judge(diagnostics(text)).trust for text in grounds.unique()}
+    failed_checks = table["failed_checks"].fillna("")
+    verdicts = {text: judge(diagnostics(text)).trust for text in failed_checks.unique()}
     return pd.DataFrame(
         {
             "seed": table["seed"],
-            "level": grounds.map(verdicts).map(LEVELS.index),
+            "level": failed_checks.map(verdicts).map(LEVELS.index),
             "error": np.abs(np.log(table["estimate"] / table["truth"])),
             "missed": ~table["inside"].astype(bool),
         }

@@ -28,27 +28,29 @@ def rng():
 
 
 def test_nothing_is_otherwise_by_default():
-    world, before = Misspecification(), rng()
+    misspecification, before = Misspecification(), rng()
     drawn = rng()
-    assert world.values({"pressure_scale": 1.1}, drawn) == {"pressure_scale": 1.1}
-    assert world.anatomy(Template().parameters, drawn) == Template().parameters
+    assert misspecification.values({"pressure_scale": 1.1}, drawn) == {"pressure_scale": 1.1}
+    assert misspecification.anatomy(Template().parameters, drawn) == Template().parameters
     settings = MechanicsSettings(LINEAR)
-    assert world.mechanics(settings, {}) is settings
-    np.testing.assert_array_equal(world.seen(POINTS, VALVE.surface, drawn), POINTS)
-    assert not world.open_moves(VALVE, drawn).any()
-    # Nothing was drawn, so the same seed is the same valve in every world.
+    assert misspecification.mechanics(settings, {}) is settings
+    np.testing.assert_array_equal(misspecification.seen(POINTS, VALVE.surface, drawn), POINTS)
+    assert not misspecification.open_moves(VALVE, drawn).any()
+    # Nothing was drawn, so the same seed is the same valve in every misspecification.
     assert drawn.bit_generator.state == before.bit_generator.state
-    annulus, tips = world.boundary(POINTS[VALVE.annulus], VALVE.papillary_tips, drawn)
+    annulus, tips = misspecification.boundary(POINTS[VALVE.annulus], VALVE.papillary_tips, drawn)
     assert not annulus.any()
     assert not tips.any()
 
 
 def test_pressure_and_thickness_are_off_up_and_down():
-    world, drawn = Misspecification(pressure_off=0.2, thickness_off=0.2), rng()
-    pressures = {world.values({"pressure_scale": 1.0}, drawn)["pressure_scale"] for _ in range(20)}
+    misspecification, drawn = Misspecification(pressure_off=0.2, thickness_off=0.2), rng()
+    pressures = {
+        misspecification.values({"pressure_scale": 1.0}, drawn)["pressure_scale"] for _ in range(20)
+    }
     before, factors = Template().parameters.leaflets, set()
     for _ in range(20):
-        after = world.anatomy(Template().parameters, drawn).leaflets
+        after = misspecification.anatomy(Template().parameters, drawn).leaflets
         factor = after.anterior.thickness / before.anterior.thickness
         assert after.posterior.thickness / before.posterior.thickness == pytest.approx(factor)
         factors.add(round(factor, 9))
@@ -69,8 +71,8 @@ def test_pressure_and_thickness_are_off_up_and_down():
 def test_errors_are_as_alike_as_their_kernel_says(kernel, length, expected):
     line = np.zeros((2, 3))
     line[1, 0] = 10.0
-    world = Misspecification(kernel=kernel, length_factor=length / 10.0)
-    noise = world.noise(0.5, line, 10.0)
+    misspecification = Misspecification(kernel=kernel, length_factor=length / 10.0)
+    noise = misspecification.noise(0.5, line, 10.0)
     zero = np.zeros((4000, 2, 3))
     errors = noise(zero, zero, rng())
     # 12000 pairs: the correlation's standard deviation is below 0.01.
@@ -80,9 +82,9 @@ def test_errors_are_as_alike_as_their_kernel_says(kernel, length, expected):
 
 
 def test_annulus_and_tips_are_off_by_their_size():
-    world, annulus = Misspecification(annulus_mm=1.0, tips_mm=2.0), POINTS[VALVE.annulus]
+    misspecification, annulus = Misspecification(annulus_mm=1.0, tips_mm=2.0), POINTS[VALVE.annulus]
     drawn = rng()
-    made = [world.boundary(annulus, VALVE.papillary_tips, drawn) for _ in range(300)]
+    made = [misspecification.boundary(annulus, VALVE.papillary_tips, drawn) for _ in range(300)]
     off = np.array([one for one, _ in made])
     assert off.std() == pytest.approx(1.0, rel=0.1)
     assert np.array([tips for _, tips in made]).std() == pytest.approx(2.0, rel=0.1)
@@ -115,7 +117,10 @@ def test_what_is_missing_is_filled_in_without_its_detail():
 def open_case(**scales):
     """A case whose closed leaflets are seen all but without an error."""
     simulation = PatientSimulation(
-        std_mm=1e-7, held_pressure_mmHg=(), held_relaxation=(), world=Misspecification(**scales)
+        std_mm=1e-7,
+        held_pressure_mmHg=(),
+        held_relaxation=(),
+        misspecification=Misspecification(**scales),
     )
     true = {"closed": POINTS + 1.0}
     case = virtual_patient._case(
@@ -146,8 +151,10 @@ def test_one_open_leaflet_is_too_large():
     np.testing.assert_allclose(other, 1.0, atol=1e-12)
     np.testing.assert_allclose(ratio[[0, 16]], 1.02)
     # Both leaflets are drawn.
-    drawn, world = rng(), Misspecification(leaflet_scale=0.04)
-    middles = [world.open_moves(VALVE, drawn)[[8 * 32 + 8, 8 * 32 + 24]] for _ in range(40)]
+    drawn, misspecification = rng(), Misspecification(leaflet_scale=0.04)
+    middles = [
+        misspecification.open_moves(VALVE, drawn)[[8 * 32 + 8, 8 * 32 + 24]] for _ in range(40)
+    ]
     assert 10 < np.count_nonzero(np.any(middles, axis=2)[:, 0]) < 30
 
 
@@ -164,9 +171,9 @@ def test_the_open_frame_is_too_large():
 
 def test_exponential_tissue_is_as_stiff_as_its_modulus_where_leaflets_are_closed():
     settings = MechanicsSettings(LINEAR)
-    world = Misspecification(exponential=TISSUE)
+    misspecification = Misspecification(exponential=TISSUE)
     values = {"E_f.anterior": 8.0, "E_f.posterior": 2.0}
-    own = world.mechanics(settings, values)
+    own = misspecification.mechanics(settings, values)
     at = np.array([CLOSED_STRETCHES])
     for region, linear in LINEAR.items():
         tissue = own.tissue[region].exponential
@@ -179,7 +186,9 @@ def test_exponential_tissue_is_as_stiff_as_its_modulus_where_leaflets_are_closed
         softer = biaxial_stress(ExponentialLaw.of([tissue]), less).mean()
         assert softer < 0.97 * biaxial_stress(law, less).mean()
     with pytest.raises(InputError, match="exponential tissue of anterior, expected of"):
-        replace(world, exponential={"anterior": TISSUE["anterior"]}).mechanics(settings, values)
+        replace(misspecification, exponential={"anterior": TISSUE["anterior"]}).mechanics(
+            settings, values
+        )
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ COLUMNS = {
 """Units of what `mvest.scenarios.measures.measure_steps` measures."""
 
 
-def ask_gate(values: Values) -> GateReport:
+def gate_report(values: Values) -> GateReport:
     """Close the configured anatomy with its true moduli under variations that must not matter.
 
     Each result is printed to standard error as soon as it is known.

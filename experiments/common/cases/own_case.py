@@ -29,7 +29,7 @@ from mvest.cases.from_images.detected import (
     read_for_case,
 )
 from mvest.cases.from_images.settings import ImagedSettings
-from mvest.cases.plausibility import doubts
+from mvest.cases.plausibility import implausible_values
 from mvest.cases.schema import files_of_case
 from mvest.errors import ConfigurationError
 from mvest.exchange.volumes import files_of_volume
@@ -130,7 +130,7 @@ def run_case(
     """Personalise a case; ``gate`` is the verdict of the gate on its anatomy."""
     for sentence in () if images else case.derived:
         print(f"derived: {sentence}", file=sys.stderr)
-    for value in doubts(case):
+    for value in implausible_values(case):
         print(f"implausible: {value}", file=sys.stderr)
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
@@ -258,7 +258,7 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     lines = _described(case)
     if gate:
         lines += gate_lines(gate_case(case, settings, mesh_store(values)))
-    strange = doubts(case)
+    strange = implausible_values(case)
     lines += [f"{'MISTAKE?' if one.mistake else 'implausible'}: {one}" for one in strange]
     lines.append(
         f"Implausible values: {len(strange)}; look at them before anything is estimated "

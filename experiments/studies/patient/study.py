@@ -126,7 +126,7 @@ def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, see
     estimate = blind.with_truth(hidden["values"]).model_copy(update=about)
     numbers: dict[str, Number] = {
         "anatomies_drawn": hidden["anatomies_drawn"],
-        "scenario": patient.world or REFERENCE,
+        "scenario": patient.misspecification or REFERENCE,
         "unknowns": len(estimate.parameters),
         "nees": _nees(estimate),
     }
@@ -362,14 +362,14 @@ def _estimates(patients: Patients) -> Table:
     """A row for each patient, way to estimate and unknown: the tidy table for programs."""
     rows = []
     for record, estimate in patients:
-        grounds = () if estimate.verdict is None else estimate.verdict.grounds
+        failed_checks = () if estimate.verdict is None else estimate.verdict.failed_checks
         whole = {
             "case": estimate.case,
             "seed": record.provenance.seed,
             "scenario": _scenario(record),
             "verdict": trust_of(estimate),
             "NEES": record.numbers.get("nees"),
-            "grounds": "; ".join(f"{one.check}: {one.text}" for one in grounds),
+            "failed_checks": "; ".join(f"{one.check}: {one.text}" for one in failed_checks),
         }
         for name, way in _ways(estimate).items():
             rows += [

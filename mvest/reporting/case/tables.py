@@ -130,7 +130,7 @@ def estimate_text(record: EstimateRecord) -> str:
     lines = [f"{name}: {record.reason}"]
     if verdict is not None:
         lines = [f"{name}: {verdict.trust.upper()} ({len(verdict.passed)} checks passed)"]
-        lines += [f"  {ended(one.text)} Next: {ended(one.advice)}" for one in verdict.grounds]
+        lines += [f"  {ended(one.text)} Next: {ended(one.advice)}" for one in verdict.failed_checks]
         no_number = "No modulus is stated; the run ended" if verdict.trust == NONE else "The run"
         lines.append(f"{no_number}: {record.reason}")
     if record.is_stated:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.studies.imported import import_heart
 from mvest.cases.folder import read_case, write_case
-from mvest.cases.plausibility import doubts
+from mvest.cases.plausibility import implausible_values
 from mvest.errors import GeometryError, InputError
 from mvest.exchange.importing.leaflets import LeafletsOptions, import_leaflets
 from mvest.valve.geometry.proximity import closest_points
@@ -76,7 +76,7 @@ def test_the_valve_that_was_thickened_comes_back(folder):
 
 def test_it_is_an_anatomy_that_is_in_order_and_says_what_is_assumed(case, tmp_path):
     assert case.closed is None
-    assert not doubts(case)
+    assert not implausible_values(case)
     back = read_case(write_case(tmp_path / "case", case))
     np.testing.assert_array_equal(back.surface.vertices, case.surface.vertices)
     assert back.source == "whose heart"
@@ -130,7 +130,7 @@ def test_the_heart_itself_is_a_plausible_valve():
     if not (HEART / PARTS[0]).is_file():
         pytest.skip("needs the reference heart (conf/experiment); name its folder in MVEST_HRA")
     case = imported(HEART)
-    assert not doubts(case)
+    assert not implausible_values(case)
     tips = case.frames[0].papillary_tips
     assert np.linalg.norm(tips[0] - tips[1]) == pytest.approx(24.1, abs=0.5)
     assert len(case.chordae) == 34

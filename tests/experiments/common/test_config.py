@@ -15,8 +15,8 @@ HAVING = {
     "personal": "own_valve",
     "patient": "patients",
     "imaging": "imaging",
-    "world": "calibration",
-    "door": "surfaces",
+    "misspecification": "calibration",
+    "arrival": "surfaces",
 }
 """Group that only some studies have -> an experiment of one that has it."""
 
@@ -167,7 +167,7 @@ def test_the_default_observation_has_3248_vertices() -> None:
 def test_a_population_is_drawn_from_what_its_estimator_states() -> None:
     config = plain(composed("experiment=population"))
     known, patient = config["personal"], config["patient"]
-    geometry = known["considered_geometry"]
+    geometry = known["nuisance_geometry"]
     choices = "shape_length_mm", "annulus_length_mm", "factor", "share", "renewals"
     assert {value for name, value in geometry.items() if name not in choices} == {0.0}
     for name in ("pressure", "chord_stiffness", "chord_rest_length"):
@@ -181,10 +181,10 @@ def test_a_population_is_drawn_from_what_its_estimator_states() -> None:
 @pytest.mark.parametrize("name", ["own_valve", "patients", "calibration"])
 def test_what_is_not_known_is_carried_by_default(name: str) -> None:
     personal = plain(composed(f"experiment={name}"))["personal"]
-    assert personal["considered_geometry"]["thickness"] == 0.2
-    assert set(personal["considered_law"]) == {"anterior", "posterior"}
+    assert personal["nuisance_geometry"]["thickness"] == 0.2
+    assert set(personal["nuisance_law"]) == {"anterior", "posterior"}
     assert personal["unknowns"]["pressure_scale"]["std"] == 0.15
-    assert personal["considered_geometry"]["renewals"] > 0
+    assert personal["nuisance_geometry"]["renewals"] > 0
     known = plain(composed(f"experiment={name}", "personal=nuisances"))["personal"]
-    assert known["considered_geometry"] is None
-    assert known["considered_law"] == {}
+    assert known["nuisance_geometry"] is None
+    assert known["nuisance_law"] == {}

@@ -30,8 +30,8 @@ HAVING = {
     "personal": "own_valve",
     "patient": "patients",
     "imaging": "imaging",
-    "world": "calibration",
-    "door": "surfaces",
+    "misspecification": "calibration",
+    "arrival": "surfaces",
 }
 
 

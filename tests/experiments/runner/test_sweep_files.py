@@ -208,24 +208,24 @@ def test_a_wrong_setting_is_refused_before_anything_runs(configuration, override
 
 
 def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> None:
-    worlds = sorted(path.stem for path in (CONF / "world").glob("*.yaml"))
+    misspecifications = sorted(path.stem for path in (CONF / "misspecification").glob("*.yaml"))
     config = compose("config", ["sweep=calibration"], return_hydra_config=True)
     planned = expand(config, [], GlobalHydra.instance().config_loader())
-    assert len(planned) == 20 * len(worlds)
-    # A seed is a valve in all worlds, so that a sweep that is not at its end has all of them.
-    assert {line.partition("=")[2] for job in planned[: len(worlds)] for line in job
-            if line.startswith("world=")} == set(worlds)  # fmt: skip
-    assert all("seed=2001" in job for job in planned[: len(worlds)])
-    alone = composed("sweep=calibration", "world=reference", "row=r")[1]
+    assert len(planned) == 20 * len(misspecifications)
+    # A seed is one valve with every misspecification, so an unfinished sweep has all of them.
+    assert {line.partition("=")[2] for job in planned[: len(misspecifications)] for line in job
+            if line.startswith("misspecification=")} == set(misspecifications)  # fmt: skip
+    assert all("seed=2001" in job for job in planned[: len(misspecifications)])
+    alone = composed("sweep=calibration", "misspecification=reference", "row=r")[1]
     made, labels = [], set()
-    for world in worlds:
-        config = composed("sweep=calibration", f"world={world}", "row=r")[1]
+    for misspecification in misspecifications:
+        config = composed("sweep=calibration", f"misspecification={misspecification}", "row=r")[1]
         require_in_range(config)
         made.append(build(PatientSettings, config["patient"]))
-        labels.add(made[-1].world)
+        labels.add(made[-1].misspecification)
         # All else, and with it what the estimator is given, is the same.
         assert {key: value for key, value in config.items() if key not in SECRET} == {
             key: value for key, value in alone.items() if key not in SECRET
         }
     simulations = {repr(one.simulation) for one in made}
-    assert len(simulations) == len(labels) == len(worlds)
+    assert len(simulations) == len(labels) == len(misspecifications)

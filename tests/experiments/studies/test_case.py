@@ -197,27 +197,27 @@ def stiffening() -> dict[str, Any]:
 
 def test_tissue_whose_stiffening_is_unknown_is_on_its_way_to_the_law_that_is_considered() -> None:
     settings = personalising(stiffening())
-    assert settings.considered_law == {}
+    assert settings.nuisance_law == {}
     for region, tissue in settings.mechanics.tissue.items():
         assert tissue.law == "stiffening"
         assert tissue.exponential is not None
         assert f"stiffening.{region}" in [u.name for u in settings.unknowns]
     known = personalising(plain(composed(*OWN, "personal=renewed")))
     assert {tissue.law for tissue in known.mechanics.tissue.values()} == {"biot"}
-    assert known.considered_law == {
+    assert known.nuisance_law == {
         region: tissue.exponential for region, tissue in settings.mechanics.tissue.items()
     }
     values = stiffening()
     del values["personal"]["unknowns"]["stiffening.posterior"]
     one = personalising(values)
-    assert list(one.considered_law) == ["posterior"]
+    assert list(one.nuisance_law) == ["posterior"]
     assert one.mechanics.tissue["posterior"].law == "biot"
 
 
 def test_stiffening_of_what_cannot_stiffen_is_refused() -> None:
     values = stiffening()
-    del values["personal"]["considered_law"]["anterior"]
-    with pytest.raises(InputError, match=r"considered_law\.anterior is missing"):
+    del values["personal"]["nuisance_law"]["anterior"]
+    with pytest.raises(InputError, match=r"nuisance_law\.anterior is missing"):
         personalising(values)
     values = stiffening()
     unknowns = values["personal"]["unknowns"]

@@ -149,7 +149,7 @@ def run_heart(monkeypatch, *arguments):
 
 @pytest.mark.slow
 def test_the_shape_is_meshed_and_closed(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.studies.imported.ask_gate", gate_of_made_up)
+    monkeypatch.setattr("experiments.studies.imported.gate_report", gate_of_made_up)
     monkeypatch.setattr("experiments.studies.imported._twin", twin_of_made_up)
     monkeypatch.setenv("MVEST_HRA", str(heart(tmp_path / "heart")))
     monkeypatch.chdir(tmp_path)

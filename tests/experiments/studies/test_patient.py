@@ -213,7 +213,7 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     result = run(config_of(tmp_path), out)
     (estimate,) = result.estimates
     assert result.gate == "NOT passed on 54 x 6 hex18"
-    assert ONE_STATE in [ground.check for ground in estimate.verdict.grounds]
+    assert ONE_STATE in [failed.check for failed in estimate.verdict.failed_checks]
     assert (result.status, estimate.seed) == ("converged", 1)
     assert result.numbers["anatomies_drawn"] == 1
     for row in estimate.parameters:

@@ -21,7 +21,7 @@ from mvest.cases.case import Role
 from mvest.errors import InputError
 from mvest.problem.fields import case_fields
 from mvest.problem.record import Unknown
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
 from tests.experiments.studies.made_up import SOURCE
 from tests.experiments.studies.made_up_patients import (
     alone,
@@ -127,7 +127,9 @@ def test_a_patient_without_an_estimate_is_in_the_tables():
 
 def test_moduli_whose_verdict_is_none_are_not_stated():
     # Both truths lie in its intervals; it is no less without an estimate.
-    refused = patient("prolapse", verdict=Verdict(NONE, (Ground("gate", NONE, "open", "wait"),)))
+    refused = patient(
+        "prolapse", verdict=Verdict(NONE, (FailedCheck("gate", NONE, "open", "wait"),))
+    )
     records = [patient(verdict=Verdict(TRUSTWORTHY)), refused]
     denied = rows(records, "table_2")[2]
     assert (denied["patient"], denied["verdict"], denied["estimate"]) == ("prolapse", NONE, None)
@@ -326,13 +328,13 @@ def run(
     trust: Any = TRUSTWORTHY,
     correlation: float = 0.0,
 ) -> Record:
-    grounds = () if trust == TRUSTWORTHY else (Ground("distance", trust, "it is far"),)
+    failed_checks = () if trust == TRUSTWORTHY else (FailedCheck("distance", trust, "it is far"),)
     record = patient(
         f"drawn_{seed}",
         "calibration",
         unknowns=(modulus("E_f.anterior", z[0]), modulus("E_f.posterior", z[1])),
         correlation=((1.0, correlation), (correlation, 1.0)),
-        verdict=Verdict(trust, grounds),
+        verdict=Verdict(trust, failed_checks),
         alternatives={},
     )
     numbers = {"scenario": scenario, "nees": study._nees(record.estimates[0]), "unknowns": 2}
@@ -370,7 +372,9 @@ def test_a_scenario_says_what_its_verdicts_are_worth(runs):
     # Guessing 6 for 5 is off by 20 %; the prior's logarithm has an SD of 0.5, the estimate's 0.1.
     assert as_assumed["generic guess"] == pytest.approx(20.0)
     assert as_assumed["width over prior"] == pytest.approx(0.2)
-    assert [row["grounds"] for row in rows(runs, "estimates")].count("distance: it is far") == 4
+    assert [row["failed_checks"] for row in rows(runs, "estimates")].count(
+        "distance: it is far"
+    ) == 4
     verdicts = {row["verdict"]: (row["inside"], row["n"]) for row in rows(runs, "verdicts")}
     assert verdicts == {TRUSTWORTHY: (4, 6), DOUBTFUL: (2, 2), NONE: (0, 2)}
 

@@ -22,8 +22,8 @@ from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.problem.record import EstimateRecord
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
-from mvest.simulation.arrival import DoorSettings, arrive
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
+from mvest.simulation.arrival import ArrivalSettings, arrive
 from mvest.simulation.virtual_patient import VirtualPatient
 from tests.cases.folders import template_case
 from tests.experiments.configured import composed, plain
@@ -37,31 +37,31 @@ OFF = np.array([0.3, 0.0, 0.0])
 """mm, errors of the closed frame of the patient's case."""
 REGISTRATION = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 """The leaflets of the closed frame are seen 1 mm towards +y of where tips are said to be."""
-DOORS = {
-    "vertices": DoorSettings(kind="vertices", label="vertices"),
-    "surfaces": DoorSettings(kind="surfaces", label="surfaces"),
-    "with errors": DoorSettings(kind="surfaces", label="with errors", seen_with_errors=True),
-    "slicerheart": DoorSettings(kind="slicerheart", label="SlicerHeart"),
-    "labels": DoorSettings(kind="labels", label="labels", voxel_mm=0.8),
-    "closed": DoorSettings(kind="labels", label="closed", voxel_mm=0.8, closed=True),
+ARRIVALS = {
+    "vertices": ArrivalSettings(kind="vertices", label="vertices"),
+    "surfaces": ArrivalSettings(kind="surfaces", label="surfaces"),
+    "with errors": ArrivalSettings(kind="surfaces", label="with errors", seen_with_errors=True),
+    "slicerheart": ArrivalSettings(kind="slicerheart", label="SlicerHeart"),
+    "labels": ArrivalSettings(kind="labels", label="labels", voxel_mm=0.8),
+    "closed": ArrivalSettings(kind="labels", label="closed", voxel_mm=0.8, closed=True),
 }
 
 
-def through(door, folder):
+def through(kind, folder):
     """The template with errors in its closed frame, as it arrives."""
     seen = replace(CLOSED, vertices=CLOSED.vertices + OFF)
     case = replace(PATIENT, frames=(PATIENT.frame(Role.REFERENCE), seen))
-    return arrive(case, CLOSED.vertices, REGISTRATION, DOORS[door], folder)
+    return arrive(case, CLOSED.vertices, REGISTRATION, ARRIVALS[kind], folder)
 
 
-def laid_out_by(door):
+def laid_out_by(kind):
     """Whether nothing but surfaces and tips goes through."""
-    return door in ("slicerheart", "labels", "closed")
+    return kind in ("slicerheart", "labels", "closed")
 
 
 # Half a thickness is 0.6 mm, the shift to LPS 144 mm; 0.3 mm to one side are less off a surface.
 @pytest.mark.parametrize(
-    ("door", "corresponds", "opened_mm", "closed_mm"),
+    ("kind", "corresponds", "opened_mm", "closed_mm"),
     [
         ("vertices", True, (0.0, 1e-9), (0.05, 0.3)),
         ("surfaces", False, (0.0, 1e-9), (0.0, 1e-9)),
@@ -71,10 +71,10 @@ def laid_out_by(door):
         pytest.param("closed", False, (0.02, 0.2), (0.02, 0.2), marks=pytest.mark.slow),
     ],
 )
-def test_surfaces_arrive_where_they_are(door, corresponds, opened_mm, closed_mm, tmp_path):
-    if door == "slicerheart":
+def test_surfaces_arrive_where_they_are(kind, corresponds, opened_mm, closed_mm, tmp_path):
+    if kind == "slicerheart":
         pytest.importorskip("pyvista", reason="needs VTK, which comes with the extra viz")
-    arrived = through(door, tmp_path)
+    arrived = through(kind, tmp_path)
     case = arrived.case
     assert case.frame(Role.CLOSED).corresponds is corresponds
     assert case.frame(Role.CLOSED).pressure_mmHg == CLOSED.pressure_mmHg
@@ -93,21 +93,25 @@ def test_surfaces_arrive_where_they_are(door, corresponds, opened_mm, closed_mm,
     # Of what is imported the tips are where they are in the image that shows the leaflets.
     tips = case.frame(Role.CLOSED).papillary_tips
     moved = np.linalg.norm(tips - arrived.closed.papillary_tips, axis=1)
-    assert moved == pytest.approx(1.0 if laid_out_by(door) else 0.0, abs=1e-2)
+    assert moved == pytest.approx(1.0 if laid_out_by(kind) else 0.0, abs=1e-2)
     assert abs(thickness_error(arrived, PATIENT.surface.thickness)) < 0.1
     laid_out = any("laid out" in sentence for sentence in case.derived)
-    assert laid_out is laid_out_by(door)
+    assert laid_out is laid_out_by(kind)
 
 
 def test_a_door_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(
-        ConfigurationError, match=r"door\.kind = 'window', expected one of vertices"
+        ConfigurationError, match=r"arrival\.kind = 'window', expected one of vertices"
     ):
         arrive(
-            PATIENT, CLOSED.vertices, REGISTRATION, DoorSettings(kind="window", label=""), tmp_path
+            PATIENT,
+            CLOSED.vertices,
+            REGISTRATION,
+            ArrivalSettings(kind="window", label=""),
+            tmp_path,
         )
-    no_voxels = replace(DOORS["labels"], voxel_mm=None)
-    with pytest.raises(ConfigurationError, match=r"door\.voxel_mm is not given"):
+    no_voxels = replace(ARRIVALS["labels"], voxel_mm=None)
+    with pytest.raises(ConfigurationError, match=r"arrival\.voxel_mm is not given"):
         arrive(PATIENT, CLOSED.vertices, REGISTRATION, no_voxels, tmp_path)
 
 
@@ -122,7 +126,7 @@ def job(tmp_path, monkeypatch):
 
     monkeypatch.setattr(patient_store, "simulate_patient", simulate)
     values = plain(
-        composed("experiment=surfaces", "door=surfaces", "seed=1", f"paths.outputs={tmp_path}")
+        composed("experiment=surfaces", "arrival=surfaces", "seed=1", f"paths.outputs={tmp_path}")
     )
     folder = tmp_path / "job"
     folder.mkdir()
@@ -176,13 +180,15 @@ def record_of(name, kind, trust, estimates):
         else own
         for own in moduli(*estimates)
     )
-    grounds = () if trust == TRUSTWORTHY else (Ground("approximation", trust, "bent", "sample"),)
+    failed_checks = (
+        () if trust == TRUSTWORTHY else (FailedCheck("approximation", trust, "bent", "sample"),)
+    )
     done = estimates[0] is not None
     estimate = EstimateRecord(
         case=name,
         status="converged" if done else "failed",
         reason="converged" if done else "does not close",
-        verdict=Verdict(trust, grounds),
+        verdict=Verdict(trust, failed_checks),
         unknowns=rows,
     )
     off = {"open_back_mm": 0.05, "closed_back_mm": 0.05, "thickness_mean_mm": 0.0}
@@ -192,7 +198,7 @@ def record_of(name, kind, trust, estimates):
         table="surfaces",
         reason=estimate.reason,
         estimates=(estimate,),
-        numbers={"kind": kind, "geometry": DOORS[kind].label} | off,
+        numbers={"kind": kind, "geometry": ARRIVALS[kind].label} | off,
     )
 
 
@@ -223,7 +229,7 @@ def test_the_table_has_every_modulus_of_every_run_by_patient_and_way():
     assert [row["truth"] for row in rows] == [6.0, 2.0] * 4
     assert [row["stated"] for row in rows] == [6.3, 2.1, 9.0, 2.0, None, None, None, None]
     assert rows[4]["estimate"] == 9.0
-    assert sum("bent" in row["grounds"] for row in rows) == 6
+    assert sum("bent" in row["failed_checks"] for row in rows) == 6
     shown = summary(RESULTS)[""].readable()[2]
     assert shown["estimate (MPa)"] == "9 (8.1 to 9.9) ✗"
     assert [text.get_text() for text in STUDY.figure(RESULTS).axes[0].texts] == ["no estimate"]

@@ -8,7 +8,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, FailedCheck, Verdict
 from mvest.reporting.case.report import report
 from mvest.reporting.case.tables import estimate_text, report_tables
 from tests.reporting.case.made_up_case import (
@@ -270,8 +270,8 @@ def test_an_unusable_place_or_file_is_one_clear_error(case, tmp_path) -> None:
 
 # --- what is to be believed ---------------------------------------------------------------------
 
-LEAKS = Ground("closure", NONE, "the fitted valve leaves 121 mm² free", "check the chordae")
-WIDE = Ground("data against prior", DOUBTFUL, "the data narrow it to 80 %", "add a frame")
+LEAKS = FailedCheck("closure", NONE, "the fitted valve leaves 121 mm² free", "check the chordae")
+WIDE = FailedCheck("data against prior", DOUBTFUL, "the data narrow it to 80 %", "add a frame")
 
 
 def judged(case, folder, *arguments) -> tuple[str, str]:

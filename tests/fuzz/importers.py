@@ -1,4 +1,4 @@
-"""All public doors for files that a user brings, by name."""
+"""All public importers for files that a user brings, by name."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def by_slicerheart(path: Path) -> object:
         return fault
 
 
-DOORS: dict[str, tuple[Enter, Makers]] = {
+IMPORTERS: dict[str, tuple[Enter, Makers]] = {
     "case": (
         lambda path: read_case(path.parent),
         beside(case, "case.yaml", "chordae.csv", "pressure.csv", "errors.npz", "open.vtp"),

@@ -1,11 +1,11 @@
-"""Some damaged files at every door, and all that once failed."""
+"""Some damaged files at every importer, and all that once failed."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.fuzz.doors import DOORS
+from tests.fuzz.importers import IMPORTERS
 from tests.fuzz.trial import FAULTS, Bench
 from tests.places import ROOT
 
@@ -16,9 +16,9 @@ INPUTS = 20
 """For each valid file, the same ones every time: what is new is found by `make fuzz`."""
 
 
-@pytest.mark.parametrize("name", DOORS)
+@pytest.mark.parametrize("name", IMPORTERS)
 def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    bench = Bench(*DOORS[name], tmp_path)
+    bench = Bench(*IMPORTERS[name], tmp_path)
     assert bench.whole == [("read", "")] * len(bench.paths)
     for seed in range(INPUTS * len(bench.paths)):
         number, content = bench.damaged(seed)
@@ -28,7 +28,7 @@ def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted({path.parent.name for path in STORED.glob("*/*")}))
 def test_what_once_failed_is_read_or_refused(name: str, tmp_path: Path) -> None:
-    bench = Bench(*DOORS[name], tmp_path)
+    bench = Bench(*IMPORTERS[name], tmp_path)
     for stored in sorted((STORED / name).iterdir()):
         kinds = ["".join(path.suffixes) for path in bench.paths]
         kind, words = bench.tried(stored.read_bytes(), kinds.index("".join(stored.suffixes)))
