@@ -91,7 +91,7 @@ class SolveBar:
         before = self._before if number else None
         self._before = m, objective
         change = "" if before is None else f" ({objective - before[1]:+.2g})"
-        values, names = [], self._names
+        values, names = [], list(self._names)
         if len(names) != len(m):
             # A part of an estimation is of the moduli alone.
             names = [name for name in names if name.startswith("E_f.")]

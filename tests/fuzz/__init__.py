@@ -9,7 +9,7 @@ several lines, of more than 300 characters, or without the name of a file; if th
 for more than 5 s or needs more than 1 GiB. Libraries work in a child whose limits are its own; how
 often they were met is counted as *stopped*.
 
-`make test` tries some inputs at each importer, and every file of ``stored/IMPORTER``, each of which
-failed once. `make fuzz` tries for an hour, or ``python -m tests.fuzz --seconds 60 --importer
-volume``, and leaves what failed in ``outputs/fuzz`` to be stored.
+`make test` tries some inputs at each importer, and every file of ``stored/IMPORTER``: each of them
+failed once. `make fuzz` tries for an hour and leaves what failed in ``outputs/fuzz`` to be stored;
+``python -m tests.fuzz --seconds 60 --importer volume`` tries one importer.
 """
