@@ -12,7 +12,6 @@ from mvest.imaging.detection.trained_model import default_model
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.valve_sequence import LANDMARKS, landmarks
 from mvest.observation.surfaces import surface_distance
 from tests.made_up_sequence import descending_valve
 
@@ -71,13 +70,3 @@ def test_a_blank_frame_is_refused(model, seen):
     blank = replace(volume, frames=np.zeros_like(volume.frames), source="blank")
     with pytest.raises(InputError, match="blank, frame 0: all voxels are 0"):
         detect_valve(blank, model)
-
-
-def test_landmarks_placed_by_hand_stay_and_lead(model, seen):
-    volume, true = seen
-    placed = {0: landmarks(true, 0), 1: landmarks(true, 1)}
-    found = detect_valve(volume, model, landmarks=placed)
-    for k in range(2):
-        own = landmarks(found, k)
-        gap = [np.linalg.norm(own[name] - placed[k][name]) for name in LANDMARKS]
-        assert max(gap) < 0.1

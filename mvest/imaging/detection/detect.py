@@ -14,15 +14,11 @@ from mvest.imaging.detection.pose_search import MODES, refined, search_poses, st
 from mvest.imaging.detection.shape_model import Pulls, fit_shape, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import LANDMARKS, ValveSequence, landmark_vertices
-from mvest.typing import FloatArray, IntArray
+from mvest.imaging.valve_sequence import ValveSequence, landmark_vertices
+from mvest.typing import FloatArray
 
 LANDMARK_STD_MM, RIM_STD_MM = 1.2, 0.8
 """mm, least standard deviation of a landmark's and a rim's pull; the spread of votes adds to it."""
-
-HAND_STD_MM = (0.2, 0.03)
-"""mm, standard deviation of landmarks placed by hand, in the fit of the shape and in the free
-displacement at the end."""
 
 ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
 """Largest number of modes in each round of the fit, and the distance (mm) along normals within
@@ -146,16 +142,11 @@ def fit_frame(
     *,
     coefficients: FloatArray | None = None,
     tips: FloatArray | None = None,
-    fixed: FloatArray | None = None,
 ) -> FrameValve:
     """Fit the valve from a pose (one).
 
-    Parameters
-    ----------
-    coefficients, tips : (K,), (2, 3) mm, optional
-        To start from; otherwise regressed at the pose.
-    fixed : (L, 3) mm, optional
-        World positions of landmarks placed by hand, which stay; NaN where none was.
+    The fit starts from ``coefficients (K,)`` and ``tips (2, 3)`` mm, or from those regressed at the
+    pose.
     """
     shape, layout = model.shape, model.shape.layout
     start, found_tips = starting_shape(frame, model.boosters, pose, shape)
@@ -164,45 +155,25 @@ def fit_frame(
     tips = found_tips[0] if tips is None else tips
     vertices = pose.world(shape.shape(b[None]))[0]
     at = np.array(list(landmark_vertices(layout).values()))
-    points, spread = np.concatenate([vertices[at], tips]), np.zeros(len(LANDMARKS))
-    by_hand = np.zeros(len(points), dtype=np.bool_)
-    if fixed is not None:
-        by_hand = np.isfinite(fixed[:, 0])
-        points[by_hand] = fixed[by_hand]
-    free = np.flatnonzero(~by_hand)
-    points[free], spread[free] = find_landmarks(frame, model.boosters, pose, points[free], free)
-    on_leaflets, tips = points[: len(at)], points[len(at) :]
-    manual = np.flatnonzero(by_hand[: len(at)])
-    std = np.full(len(at), LANDMARK_STD_MM)
-    std[manual] = HAND_STD_MM[0]
-    std = np.hypot(std, spread[: len(at)])
-    pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], on_leaflets, std))
-    hand = at[manual], on_leaflets[manual]
+    points = np.concatenate([vertices[at], tips])
+    points, spread = find_landmarks(frame, model.boosters, pose, points)
+    std = np.hypot(LANDMARK_STD_MM, spread[: len(at)])
+    pulls = Pulls.to_points(at, vertices[at], points[: len(at)], std)
+    pose, b = fit_shape(shape, pose, b, pulls)
     for modes, reach in ROUNDS:
         b = np.concatenate([b, np.zeros(max(0, min(modes, len(shape.std)) - len(b)))])
-        _, pulls, _ = _seen(frame, model, pose, b, reach, hand, HAND_STD_MM[0])
-        pose, b = fit_shape(shape, pose, b, pulls)
-    vertices, pulls, confidence = _seen(frame, model, pose, b, reach, hand, HAND_STD_MM[1])
+        pose, b = fit_shape(shape, pose, b, _seen(frame, model, pose, b, reach)[1])
+    vertices, pulls, confidence = _seen(frame, model, pose, b, reach)
     vertices = relax(vertices, layout, pulls, STIFFNESS, HOLD)
     sure = _confidence(frame, model, pose, b, confidence)
-    return FrameValve(pose, b, vertices, tips, sure, confidence)
+    return FrameValve(pose, b, vertices, points[len(at) :], sure, confidence)
 
 
 def _seen(
-    frame: StandardFrame,
-    model: DetectionModel,
-    pose: Poses,
-    b: FloatArray,
-    reach: float,
-    by_hand: tuple[IntArray, FloatArray],
-    hand_std: float,
+    frame: StandardFrame, model: DetectionModel, pose: Poses, b: FloatArray, reach: float
 ) -> tuple[FloatArray, Pulls, FloatArray]:
-    """A shape ``(n, 3)`` mm, the pulls on it, and each vertex' confidence ``(n,)``.
-
-    Leaflets and rims pull, and vertices placed ``by_hand``: their numbers and positions, with the
-    standard deviation ``hand_std``.
-    """
-    layout, boosters, (hand, points) = model.shape.layout, model.boosters, by_hand
+    """A shape ``(n, 3)`` mm, the pulls of leaflets and rims, and vertex confidences ``(n,)``."""
+    layout, boosters = model.shape.layout, model.boosters
     vertices = pose.world(model.shape.shape(b[None]))[0]
     normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
     parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(CORRELATED) * std)]
@@ -213,5 +184,4 @@ def _seen(
         # Errors of neighbouring columns are correlated as those of rows are.
         wide = np.sqrt(np.sqrt(CORRELATED)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
-    parts.append(Pulls.to_points(hand, vertices[hand], points, np.full(len(hand), hand_std)))
     return vertices, Pulls.joined(parts), confidence

@@ -86,24 +86,22 @@ def landmark_samples(seen: LabelledFrame, which: int, count: int) -> Examples:
 
 
 def find_landmarks(
-    frame: StandardFrame, boosters: Trees, pose: Poses, points: FloatArray, which: IntArray
+    frame: StandardFrame, boosters: Trees, pose: Poses, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Landmarks ``(L, 3)`` mm of numbers ``which (L,)``, and the spread of their votes ``(L,)`` mm.
+    """All landmarks ``(L, 3)`` mm and the spread of their votes ``(L,)`` mm.
 
-    They are looked for about guesses ``points (L, 3)``. The three outputs of the trees say where a
-    landmark lies from a candidate, mm in the axes of the ``pose`` (one).
+    The search starts at ``points (L, 3)``. The three outputs of the trees say where a landmark lies
+    from a candidate, mm in the axes of the ``pose`` (one).
     """
     refined, spread = np.array(points), np.zeros(len(points))
     for step in LANDMARK_STEPS_MM:
         grid = _candidates(step, 3)
         axes = np.broadcast_to(pose.axes, (len(grid), 3, 3))
-        for k, number in enumerate(which):
+        for k in range(len(points)):
             candidates = refined[k] + grid @ pose.rotation[0].T
             values = features(frame, LANDMARK_PATTERN, candidates, axes)
-            gap = boosters[f"landmark_{number}"](values)
-            votes = candidates + gap @ pose.rotation[0].T
-            point, width = consensus(votes[None])
-            refined[k], spread[k] = point[0], width[0]
+            votes = candidates + boosters[f"landmark_{k}"](values) @ pose.rotation[0].T
+            (refined[k],), (spread[k],) = consensus(votes[None])
     return refined, spread
 
 

@@ -1,13 +1,10 @@
 """Bands of measures over time, from errors whose effect on a measure is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mvest.cases.from_images.detector_errors import BANDED, valve_axes, with_bands
 from mvest.cases.from_images.measures import measure_sequence
-from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from tests import made_up_sequence
@@ -71,11 +68,3 @@ def test_a_frame_without_a_valve_has_no_band():
     rows = measure_sequence(valve, 1.0)
     empty = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))[1]
     assert {empty[f"{name}_{end}"] for name in BANDED for end in ("low", "high")} == {None}
-
-
-def test_errors_of_one_valve_and_of_another_layout_are_refused(valve, rows):
-    one, two = (swollen(valve, np.zeros((count, 2))) for count in (1, 2))
-    with pytest.raises(InputError, match="two samples or more"):
-        with_bands(valve, rows, one)
-    with pytest.raises(InputError, match="expected"):
-        with_bands(valve, rows, replace(two, samples=two.samples[:, :, 1:]))

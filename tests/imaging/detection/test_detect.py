@@ -5,10 +5,9 @@ import pytest
 
 from mvest.imaging.detection import detect
 from mvest.imaging.detection.detect import fit_frame
-from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
+from mvest.imaging.detection.leaflets import leaflet_axes
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.pose_search import search_poses
-from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (
     LAYOUT,
     NumberedFrame,
@@ -22,13 +21,6 @@ from tests.imaging.detection.made_up import (
 )
 
 MISSED = np.array([[2.0, -1.5, 1.0, 0.1, -0.08, 0.1, 0.04]])
-
-
-def by_hand_at(points):
-    fixed = np.full((len(LANDMARKS), 3), np.nan)
-    for number, point in points.items():
-        fixed[number] = point
-    return fixed
 
 
 def mean_gap(a, b):
@@ -99,30 +91,6 @@ def test_a_given_start_is_begun_with(shape, true):
     for model in (oracle_model(shape, [true]), blind):
         found = fit_frame(NumberedFrame(), model, true.pose, coefficients=b, tips=true.tips)
         assert mean_gap(found.vertices, true.vertices) < 0.3
-
-
-@pytest.mark.parametrize("name", ["annulus_anterior", "free_edge_posterior", "commissure_180"])
-def test_a_landmark_placed_by_hand_stays_where_it_was_put(shape, true, name):
-    # Trees see the valve elsewhere: the hand is believed, also by the free displacement at the end.
-    number = LANDMARKS.index(name)
-    vertex = landmark_vertices(LAYOUT)[name]
-    by_hand = true.vertices[vertex] + 3.0 * true.pose.rotation[0][:, 2]
-    found = fitted(shape, true, fixed=by_hand_at({number: by_hand}))
-    assert np.linalg.norm(found.vertices[vertex] - by_hand) < 0.5
-    far = np.linalg.norm(true.vertices - true.vertices[vertex], axis=1) > 15
-    assert mean_gap(found.vertices[far], true.vertices[far]) < 1.0
-
-
-def test_a_tip_placed_by_hand_is_the_tip(shape, true):
-    by_hand = true.tips[1] + np.array([2.0, -1.0, 0.5])
-    found = fitted(shape, true, fixed=by_hand_at({LANDMARKS.index("tip_180"): by_hand}))
-    np.testing.assert_array_equal(found.tips[1], by_hand)
-    np.testing.assert_allclose(found.tips[0], true.tips[0], atol=1e-3)
-    # With all landmarks by hand none is looked for.
-    points = landmark_points(true.vertices, true.tips, LAYOUT)
-    found = fitted(shape, true, true.pose.moved(MISSED), fixed=points)
-    np.testing.assert_array_equal(found.tips, true.tips)
-    assert mean_gap(found.vertices, true.vertices) < 0.3
 
 
 def test_the_confidence_is_what_is_seen_of_leaflets_and_part_of_the_pose_rating(shape, true):

@@ -10,12 +10,10 @@ import pytest
 
 from mvest.imaging.detection import pose_search, tracking
 from mvest.imaging.detection.detect import NoValveError, fit_frame
-from mvest.imaging.detection.leaflets import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
-from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from tests.imaging.detection.made_up import (
     LAYOUT,
@@ -32,7 +30,6 @@ from tests.imaging.detection.made_up import (
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
 FRAMES = [NumberedFrame(k) for k in range(4)]
 STEPS = [f"pose_refine_{k}" for k in range(3)]
-NO_HANDS = np.full((len(TIMES), len(LANDMARKS), 3), np.nan)
 
 
 @pytest.fixture
@@ -61,12 +58,10 @@ def volume(count=4):
     return VolumeSequence(grey, np.ones(3), np.eye(3), np.zeros(3), times, source="made up.nrrd")
 
 
-def detected(shape, truths, frames=4, *, landmarks=None, min_confidence=0.7, progress=None, **of):
+def detected(shape, truths, frames=4, *, min_confidence=0.7, progress=None, **of):
     """What oracles make of a volume."""
     model = oracle_model(shape, truths, **of)
-    return detect_valve(
-        volume(frames), model, min_confidence=min_confidence, landmarks=landmarks, progress=progress
-    )
+    return detect_valve(volume(frames), model, min_confidence=min_confidence, progress=progress)
 
 
 # --- whole sequences ----------------------------------------------------------------------------
@@ -123,14 +118,9 @@ def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
         away = valves[k].pose.moved(np.array([[30.0, 0, 0, 0, 0, 0, 0]]))
         x = valves[k].vertices + 30.0
         valves[k] = replace(valves[k], pose=away, vertices=x, confidence=0.4)
-    again = tracking._found_again(FRAMES, valves, model, NO_HANDS)
+    tracking._refit_lost_frames(FRAMES, valves, model)
     for k, true in enumerate(truths):
-        assert np.linalg.norm(again[k].vertices - true.vertices, axis=1).mean() < 0.6
-    # Hands that placed a frame are not overruled.
-    placed = NO_HANDS.copy()
-    placed[1:3, 0] = 0.0
-    kept = tracking._found_again(FRAMES, valves, model, placed)
-    assert [a is b for a, b in zip(kept, valves, strict=True)] == [True] * 4
+        assert np.linalg.norm(valves[k].vertices - true.vertices, axis=1).mean() < 0.6
 
 
 def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
@@ -144,82 +134,10 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     detected(shape, truths, min_confidence=0.01, best=0.05, seen=0.05)
 
 
-# --- by hand ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("landmarks", "message"),
-    [
-        ({4: {"tip_0": np.zeros(3)}}, "frame 4.*frames 0 to 3"),
-        ({-1: {"tip_0": np.zeros(3)}}, "frame -1"),
-        ({1: {"tip_0": np.zeros(3), "apex": np.zeros(3)}}, "frame 1.*apex.*commissure_0"),
-        ({1: {"tip_0": np.array([0.0, np.nan, 0.0])}}, "frame 1.*tip_0"),
-        ({1: {"tip_0": np.zeros(2)}}, "frame 1.*tip_0"),
-        # All at one place, or on one line: any turn about it would do.
-        ({2: dict.fromkeys(LANDMARKS[:5], np.ones(3))}, "frame 2 lie within .* of one line"),
-        (
-            {2: {name: np.array([5.0 * k, 0.1, 3.0]) for k, name in enumerate(LANDMARKS[:5])}},
-            "frame 2 lie within .* of one line",
-        ),
-    ],
-)
-def test_landmarks_by_hand_are_checked(shape, truths, landmarks, message):
-    with pytest.raises(tracking.InputError, match=message) as told:
-        detected(shape, truths, landmarks=landmarks)
-    assert "\n" not in str(told.value)
-
-
-def test_four_landmarks_by_hand_lay_the_mean_valve_on_them(shape, truths):
-    # The pose is a similarity: a shear, a mirror image, or scale left out miss the points.
-    model = oracle_model(shape, truths)
-    pose = poses(1, 9, 40.0)
-    at = list(landmark_vertices(LAYOUT).values())
-    points = pose.world(np.concatenate([shape.mean[at], shape.tips]))[0]
-
-    def by_hand(*numbers):
-        return np.where(np.isin(np.arange(len(points)), numbers)[:, None], points, np.nan)
-
-    found = tracking._pose_by_hand(by_hand(11, 3, 0, 6, 9), model)
-    np.testing.assert_allclose(found.centre, pose.centre, atol=1e-6)
-    np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-8)
-    np.testing.assert_allclose(found.log_scale, pose.log_scale, atol=1e-9)
-    assert tracking._pose_by_hand(by_hand(11, 3, 0), model) is None
-    assert tracking._pose_by_hand(by_hand(), model) is None
-
-
-def test_a_tip_by_hand_stays_while_the_others_are_smoothed(shape, truths, monkeypatch):
-    # Smoothing in time would take it back to what the trees saw before and after.
-    by_hand = truths[1].tips[0] + np.array([3.0, 0, 0])
-    found = detected(shape, truths, landmarks={1: {"tip_0": by_hand}})
-    np.testing.assert_allclose(found.tips[1, 0], by_hand, atol=1e-9)
-    assert np.linalg.norm(found.tips[1, 1] - truths[1].tips[1]) < 0.5
-    # Frames without any place to look at show no valve.
+def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch):
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
     with pytest.raises(NoValveError, match="no valve found"):
         detected(shape, truths)
-
-
-def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths, unsmoothed):
-    # The trees rate highest a valve that lies elsewhere; hands in every frame decide otherwise.
-    elsewhere = [
-        placed(shape, t.pose.moved(np.array([[25.0, 0, 0, 0.6, 0, 0, 0]])), np.zeros(4))
-        for t in truths
-    ]
-    model = oracle_model(shape, truths)
-    astray = oracle_model(shape, elsewhere)
-    for name in ("position", "pose_coarse", "pose_fine", *STEPS):
-        model.boosters[name] = astray.boosters[name]
-    lost = tracking._trajectory(FRAMES, TIMES, model, NO_HANDS)
-    expected = np.concatenate([t.pose.centre for t in truths])
-    assert np.linalg.norm(lost.centre - expected, axis=1).min() > 15.0
-    points = [landmark_points(t.vertices, t.tips, LAYOUT) for t in truths]
-    led = tracking._trajectory(FRAMES, TIMES, model, np.stack(points))
-    assert np.linalg.norm(led.centre - expected, axis=1).max() < 3.0
-    by_hand = {k: dict(zip(LANDMARKS, points[k], strict=True)) for k in range(4)}
-    found = detect_valve(volume(), model, min_confidence=0.0, landmarks=by_hand)
-    np.testing.assert_allclose(found.tips, np.stack([t.tips for t in truths]), atol=1e-9)
-    gap = np.linalg.norm(found.vertices - np.stack([t.vertices for t in truths]), axis=2)
-    assert gap.mean() < 0.5
 
 
 # --- the path -----------------------------------------------------------------------------------
@@ -258,7 +176,7 @@ def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, tru
     model.boosters["position"] = position_oracle([*truths[:2], far, truths[3]])
     alone = search_poses(FRAMES[2], model.boosters, 1)[0]
     assert np.linalg.norm(alone.centre - far.pose.centre) < 6
-    found = tracking._trajectory(FRAMES, TIMES, model, NO_HANDS)
+    found = tracking._trajectory(FRAMES, TIMES, model)
     expected = np.concatenate([t.pose.centre for t in truths])
     assert np.linalg.norm(found.centre - expected, axis=1).max() < 10.0
 
