@@ -126,5 +126,5 @@ def test_a_case_with_an_ear_is_read_and_says_so(tmp_path):
     bad, ear = with_an_ear(valve.surface.triangles, valve.annulus[4:7])
     save_frames(tmp_path, bad)
     case = read_case(save(tmp_path, document))
-    assert any(f"inner edge turned of triangles [{ear}]" in text for text in case.derived)
+    assert any(f"inner edge flipped of triangles [{ear}]" in text for text in case.derived)
     assert case.frames[1].corresponds

@@ -40,8 +40,8 @@ class CaseFrames:
 
     open: int
     closed: int
-    pressure_mmHg: float  # transmitral, in the closed frame
-    derived: tuple[str, ...] = ()  # how frames were chosen that were not given
+    pressure_mmHg: float  #: transmitral, in the closed frame
+    derived: tuple[str, ...] = ()  #: how frames were chosen that were not given
 
     def __post_init__(self) -> None:
         if self.open == self.closed:

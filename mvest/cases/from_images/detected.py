@@ -61,16 +61,16 @@ NO_PRESSURE = (
 class ImagedSettings:
     """What a case needs that the file of a volume does not state."""
 
-    model: str | None = None  # file of the detection model; None: the package's, for ultrasound
-    modality: str | None = None  # ultrasound, ct or mr, if the file does not state it
-    frame_interval_s: BeatTime | None = None  # if the file states no times
-    time_unit: str | None = None  # s or ms, if the file states times without a unit
-    open_frame: Count | None = None  # None: the frame with the largest orifice
-    closed_frame: Count | None = None  # None: the frame whose leaflets touch most
-    pressure_mmHg: Pressure | None = None  # transmitral, in the closed frame
-    pressure_curve: str | None = None  # .csv of time,pressure (s, mmHg; the volume's clock) instead
-    thickness_mm: tuple[Thickness, ...] = ()  # of the LEAFLETS; empty: generic
-    min_confidence: Share = MIN_CONFIDENCE  # of the best frame, and of the frames that are chosen
+    model: str | None = None  #: file of the detection model; None: the package's, for ultrasound
+    modality: str | None = None  #: ultrasound, ct or mr, if the file does not state it
+    frame_interval_s: BeatTime | None = None  #: if the file states no times
+    time_unit: str | None = None  #: s or ms, if the file states times without a unit
+    open_frame: Count | None = None  #: None: the frame with the largest orifice
+    closed_frame: Count | None = None  #: None: the frame whose leaflets touch most
+    pressure_mmHg: Pressure | None = None  #: transmitral, in the closed frame
+    pressure_curve: str | None = None  #: .csv of time,pressure (s, mmHg) instead
+    thickness_mm: tuple[Thickness, ...] = ()  #: of the LEAFLETS; empty: generic
+    min_confidence: Share = MIN_CONFIDENCE  #: of the best frame, and of the frames that are chosen
     error_samples: Count = (
         200  # largest number taken from held-out volumes; mirrored ones are added
     )
@@ -80,7 +80,7 @@ class ImagedSettings:
     description: str = ""
     source: str = ""
     licence: str = ""
-    simulated: bool = False  # the volume comes from a simulation
+    simulated: bool = False  #: the volume comes from a simulation
 
     def __post_init__(self) -> None:
         known = [modality.value for modality in Modality]
@@ -111,12 +111,12 @@ class DetectedValve:
 
     volume: VolumeSequence
     valve: ValveSequence
-    rows: list[Row]  # measures of every frame
-    frames: CaseFrames  # of the case
-    case: ValveCase  # with a stand-in for the pressure if none is given
+    rows: list[Row]  #: measures of every frame
+    frames: CaseFrames  #: of the case
+    case: ValveCase  #: with a stand-in for the pressure if none is given
     settings: ImagedSettings
     model: DetectionModel
-    unlike: str  # how the volume is unlike those of training; empty if it is not
+    unlike: str  #: how the volume is unlike those of training; empty if it is not
 
     @property
     def sentences(self) -> tuple[str, ...]:

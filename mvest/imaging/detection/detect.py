@@ -18,23 +18,22 @@ from mvest.imaging.valve_sequence import ValveSequence, landmark_vertices
 from mvest.typing import FloatArray
 
 LANDMARK_STD_MM, RIM_STD_MM = 1.2, 0.8
-"""mm, least standard deviation of a landmark's and a rim's pull; the spread of votes adds to it."""
+"""mm, smallest standard deviation of the pull of a landmark and a rim; votes add their spread."""
 
 ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
-"""Largest number of modes in each round of the fit, and the distance (mm) along normals within
-which leaflets are looked for."""
+"""Largest number of modes in each round of the fit, and the search distance (mm) along normals."""
 
 CORRELATED = 8.0
 """Divides the number of vertices in the fit, as errors of neighbouring vertices are correlated."""
 
 STIFFNESS, HOLD = 4.0, 0.3
-"""Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`."""
+"""Of the free displacement at the end (:func:`mvest.imaging.detection.shape_model.relax`)."""
 
 CANDIDATES = 40
 """Poses that a search returns, many of them similar."""
 
 SURE, TRIED = 0.6, 14
-"""If the best rating is lower, so many poses are tried. Fewer often miss the right one."""
+"""If the best rating is below SURE, TRIED poses are fitted. Fewer often miss the right one."""
 
 RATING_SHARE = 0.3
 """Weight of a pose's rating in the confidence. In simulated volumes unlike those of training, the
@@ -49,10 +48,7 @@ front to back, a shape has a distance of 1.5 to 4."""
 class NoValveError(InputError):
     """A volume shows no valve of sufficient confidence.
 
-    Attributes
-    ----------
-    candidate : ValveSequence or None
-        The best one, which was not accepted; None without a field of view.
+    ``candidate`` is the best one, which was not accepted; None without a field of view.
     """
 
     def __init__(self, message: str, candidate: ValveSequence | None = None) -> None:
@@ -62,34 +58,21 @@ class NoValveError(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameValve:
-    """A valve in one frame; positions in world mm.
+    """A valve in one frame; positions in world mm."""
 
-    Attributes
-    ----------
-    pose : Poses
-        One.
-    coefficients : (K,)
-        Of the shape model.
-    vertices : (n, 3)
-    tips : (2, 3)
-    confidence : float
-        0 (no valve) to 1.
-    vertex_confidence : (n,)
-    """
-
-    pose: Poses
-    coefficients: FloatArray
-    vertices: FloatArray
-    tips: FloatArray
-    confidence: float
-    vertex_confidence: FloatArray
+    pose: Poses  #: one
+    coefficients: FloatArray  #: (K,) of the shape model
+    vertices: FloatArray  #: (n, 3)
+    tips: FloatArray  #: (2, 3)
+    confidence: float  #: 0 (no valve) to 1
+    vertex_confidence: FloatArray  #: (n,)
 
 
 def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
     """Search one frame and fit the valve in it; NoValveError without a field of view."""
     poses, rating = search_poses(frame, model.boosters, CANDIDATES)
     if not len(poses):
-        raise NoValveError("no place to look for a valve at: no field of view")
+        raise NoValveError("no valve found: no field of view")
     if rating[0] < SURE:
         poses = poses[poses.apart(rating, TRIED)]
         best = int(np.argmax(merits(frame, model, poses)))
@@ -98,10 +81,10 @@ def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
 
 
 def merits(frame: StandardFrame, model: DetectionModel, poses: Poses) -> FloatArray:
-    """Confidence ``(P,)`` in valves at some poses, fitted roughly to every second row and column.
+    """Confidence ``(P,)`` of valves at some poses, fitted roughly to every second row and column.
 
-    In images unlike those of training a wrong pose may be rated best. Its leaflets then lie off the
-    detected boundary, or have an unusual shape.
+    In images unlike those of training a wrong pose may be rated best. Its leaflets are then away
+    from the detected boundary, or have an unusual shape.
     """
     return np.array([_merit(frame, model, poses[k : k + 1]) for k in range(len(poses))])
 
@@ -127,8 +110,8 @@ def _confidence(
 ) -> float:
     """Confidence that there is a valve, 0 to 1, by its leaflets, pose and shape.
 
-    In volumes with walls and no valve, leaflets (on a wall) may look right where the pose does not,
-    or the other way round, and the shape is mostly unusual.
+    In volumes of walls without a valve, either the leaflets (on a wall) or the pose may look right,
+    but rarely both, and the shape is mostly unusual.
     """
     rating = float(np.clip(refined(frame, model.boosters, pose)[1][0], 0.0, 1.0))
     strange = max(0.0, float(((b / model.shape.std[: len(b)]) ** 2).mean()) - 1.0)

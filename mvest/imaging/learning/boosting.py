@@ -29,9 +29,9 @@ class BoostSettings:
 
     trees: Count = 80
     leaves: Count = 24
-    rate: Share = 0.12  # learning rate
+    rate: Share = 0.12  #: learning rate
     min_leaf_samples: Count = 40
-    share_features: Share = 0.25  # share of the features drawn for every tree
+    share_features: Share = 0.25  #: share of the features drawn for every tree
 
 
 SHARE_ROWS = 0.7
@@ -57,11 +57,11 @@ IS_PROBABILITY: Final = {"regression": False, "cross_entropy": True}
 class _Trees(NamedTuple):
     """Trees of one output: T trees with N nodes and L leaves in all."""
 
-    roots: IntArray  # (T,), node at which each tree begins
-    feature: IntArray  # (N,)
-    threshold: FloatArray  # (N,)
-    children: IntArray  # (N, 2), for features up to the threshold and above; leaf k is -1 - k
-    values: FloatArray  # (L,)
+    roots: IntArray  #: (T,), node at which each tree begins
+    feature: IntArray  #: (N,)
+    threshold: FloatArray  #: (N,)
+    children: IntArray  #: (N, 2), for features up to the threshold and above; leaf k is -1 - k
+    values: FloatArray  #: (L,)
 
 
 class Boosters:
