@@ -201,21 +201,10 @@ def match_annulus(
 ) -> FloatArray:
     """Positions ``(k, 3)`` mm of the reference's annulus vertices on the annulus of another frame.
 
-    Between two commissures a vertex keeps its share of the arc length.
-
-    Parameters
-    ----------
-    reference, seen
-        Vertices ``(n, 3)`` mm, triangles and regions of the two frames.
-    reference_annulus, seen_annulus
-        The annulus loops. The result has the order of the first.
-
-    Raises
-    ------
-    InputError
-        The regions follow each other differently along the two loops.
-    GeometryError
-        There are no commissures.
+    Between two commissures a vertex keeps its share of the arc length. Frames are vertices
+    ``(n, 3)`` mm, triangles and regions. The result has the order of ``reference_annulus``.
+    InputError if the regions follow each other differently along the two loops, GeometryError if
+    there are no commissures.
     """
     vertices, triangles, region = reference
     loop = directed(reference_annulus, triangles)

@@ -191,12 +191,12 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
         yield field, "the pressure on the closed valve", pressure, "closing_pressure", hint
     surface, chordae, field = case.surface, case.chordae, f"frames.{closed.name}.surface"
     for number, (name, own) in enumerate(_leaflets(case).items()):
-        before = _area(surface.vertices, own)
-        after = _area(closed.vertices, closed.triangles[closed.region == number])
+        before = areas(surface.vertices, own).sum()
+        after = areas(closed.vertices, closed.triangles[closed.region == number]).sum()
         if before <= 0 or after <= 0:
             continue
         what = f"area of the {name} leaflet, closed over open,"
-        yield field, what, after / before, "area_change", ""
+        yield field, what, float(after / before), "area_change", ""
         what = (
             f"the distance of points of the {name} leaflet {0.7 * REACH_MM:.1f} to {REACH_MM:g} mm "
             "apart, closed over open,"
@@ -271,10 +271,6 @@ def _anterior_share(case: ValveCase) -> float:
     return length["anterior"] / max(sum(length.values()), 1e-12)
 
 
-def _area(vertices: FloatArray, triangles: IntArray) -> float:
-    return float(areas(vertices, triangles).sum())
-
-
 def _rise_with_pressure(case: ValveCase, closed: Frame, other: Frame) -> float:
     """Motion of the leaflets (mm) towards the atrium by the larger pressure; 0 if insignificant."""
     heights = []
@@ -286,7 +282,7 @@ def _rise_with_pressure(case: ValveCase, closed: Frame, other: Frame) -> float:
     rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
     seen = case.uncertainty
     correlated = 2.0 * np.pi * seen.correlation_length_mm**2
-    whole = _area(closed.vertices, closed.triangles)
+    whole = float(areas(closed.vertices, closed.triangles).sum())
     independent = len(closed.vertices) if correlated == 0.0 else max(whole / correlated, 1.0)
     significant = abs(rise) > ORDER_STDS * seen.typical_mm * np.sqrt(2.0 / independent)
     return float(rise) if significant else 0.0

@@ -314,29 +314,14 @@ def lay_out_chordae(
     closed_tips: FloatArray,
     layout: ChordLayout,
 ) -> Chordae:
-    """Place the chordae of a layout on a valve.
+    """Place the chordae of a layout on a valve with two papillary tips ``(2, 3)`` mm.
 
     Every chord starts at the nearer of the two tips in the reference frame. Its rest length is
     ``slack`` times its length in the closed frame, and at least ``open_slack`` times that in the
-    open one, as in the template.
-
-    Parameters
-    ----------
-    open_valve
-        The reference frame.
-    open_tips, closed_tips
-        ``(2, 3)`` mm.
-    closed_valve
-        The closed frame: positions ``(n, 3)`` mm of the reference's vertices, or its own
-        coordinates if its vertices do not correspond.
-    layout
-        The template's for an intended closed frame (`assumed_closure`); for an observed one
-        `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are bands.
-
-    Raises
-    ------
-    InputError
-        There are not two papillary tips.
+    open one, as in the template. The closed frame has positions ``(n, 3)`` mm of the reference's
+    vertices, or its own coordinates if its vertices do not correspond. The layout is the template's
+    for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
+    `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")

@@ -77,24 +77,12 @@ def arrive(
     arrival: ArrivalSettings,
     folder: Path,
 ) -> Arrived:
-    """Export a virtual patient's geometry and import it again.
+    """Export the geometry of a virtual patient's case and import it again.
 
-    Parameters
-    ----------
-    case : ValveCase
-        Of the patient, whose vertices correspond.
-    positions : (n, 3) mm
-        True positions of these in the closed frame.
-    registration : (6,)
-        Their displacement against the annulus and the tips that the case states.
-    arrival : ArrivalSettings
-    folder : Path
-        Empty; exported and imported files are left there.
-
-    Raises
-    ------
-    MvestError
-        The kind is unknown, or the importer refuses the export.
+    ``positions (n, 3)`` mm are the true ones of its vertices in the closed frame, ``registration
+    (6,)`` their displacement against the annulus and the tips that the case states. Exported and
+    imported files are left in the folder, which must be empty. MvestError if the kind is unknown,
+    or the importer refuses the export.
     """
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
     patient = Arrived(case, opened, replace(closed, vertices=positions))

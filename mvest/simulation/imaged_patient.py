@@ -44,27 +44,13 @@ class EchoSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagedPatient:
-    """A virtual patient in motion.
+    """A virtual patient in motion."""
 
-    Attributes
-    ----------
-    valve : MovingValve
-        True positions in the open frame, those of closing, the closed one, and those held.
-    closed : int
-        Number of the closed frame.
-    pressure_mmHg : float
-        Stated of the closed frame.
-    stated : Valve
-        In the layout, with the chordae as they would be stated.
-    values : mapping
-        Parameter -> true value, as in `VirtualPatient`.
-    """
-
-    valve: MovingValve
-    closed: int
-    pressure_mmHg: float
-    stated: Valve
-    values: Mapping[str, float]
+    valve: MovingValve  #: true, in the open frame, those of closing, the closed one, and those held
+    closed: int  #: number of the closed frame
+    pressure_mmHg: float  #: stated of the closed frame
+    stated: Valve  #: in the layout, with the chordae as they would be stated
+    values: Mapping[str, float]  #: parameter -> true value, as in `VirtualPatient`
 
     def chord_ratios(self) -> dict[str, FloatArray]:
         """Family -> true rest lengths of its chordae over the distance of their ends, closed.
@@ -87,22 +73,10 @@ def simulate_imaged_patient(
 ) -> ImagedPatient:
     """Close a valve as a patient's.
 
-    Parameters
-    ----------
-    drawn : DrawnValve
-        With the values of :func:`mvest.simulation.virtual_patient.draw_patient_values`; their
-        displacement is not used.
-    simulation : PatientSimulation
-        Of the open, closed and held frames.
-    settings : MotionSettings
-        Layout, duration and limits; mesh and number of the frames of closing.
-
-    Raises
-    ------
-    GeometryError
-        The valve does not close, or not as a valve does.
-    InputError
-        Its mechanics do not end in an equilibrium.
+    The displacement in its values (`draw_patient_values`) is not used. ``simulation`` applies to
+    the open, closed and held frames; ``settings`` give layout, duration, limits, and mesh and
+    number of the frames of closing. GeometryError if the valve does not close, or not as a valve
+    does; InputError if its mechanics do not end in an equilibrium.
     """
     values = {name: value for name, value in drawn.values.items() if name not in REGISTRATION}
     drawn, protocol = replace(drawn, values=values), drawn.mechanics.protocol

@@ -159,25 +159,15 @@ class MotionSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnValve:
-    """A valve before it is closed.
-
-    Attributes
-    ----------
-    name : str
-    template : Template
-    values : mapping
-        Parameter -> true value: the moduli ``E_f.REGION`` in MPa, and any of the factors
-        ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
-    mechanics : MechanicsSettings
-        Its pressure is the stated one.
-    tip_motion : (2, 3) mm
-        Displacement of the papillary tips from the closed to the open valve.
-    """
+    """A valve before it is closed."""
 
     name: str
     template: Template
+    #: Parameter -> true value: the moduli ``E_f.REGION`` in MPa, and any of the factors
+    #: ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
     values: Mapping[str, float]
-    mechanics: MechanicsSettings
+    mechanics: MechanicsSettings  #: with the stated pressure
+    #: (2, 3) mm, displacement of the papillary tips from the closed to the open valve.
     tip_motion: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
 
     def __post_init__(self) -> None:

@@ -67,20 +67,9 @@ def draw_population(
 ) -> Iterator[MovingValve]:
     """Draw and close valves, returned in their order.
 
-    Parameters
-    ----------
-    count, seed : int
-    bases : mapping
-        Name -> median anatomy. Each is used equally often, in a random order.
-    settings : PopulationSettings
-    mechanics : MechanicsSettings
-    processes : int
-        1 computes in this process.
-
-    Raises
-    ------
-    InputError
-        No valve is requested or no anatomy given, or a valve is refused `MAX_DRAWS` times.
+    The median anatomies (``bases``, by name) are used equally often, in a random order. A single
+    process is this one. InputError if no valve is requested or no anatomy given, GeometryError if a
+    valve is refused `MAX_DRAWS` times.
     """
     if count < 1 or processes < 1 or not bases:
         raise InputError(

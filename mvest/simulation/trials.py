@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -29,7 +29,6 @@ from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area
 
-Row = Mapping[str, Any]
 Shape = tuple[FloatArray, FloatArray]
 """Vertices ``(n, 3)`` and papillary tips ``(2, 3)`` of a valve, mm."""
 
@@ -151,6 +150,10 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
     shapes = (list(zip(one.vertices, one.tips, strict=True)) for one in (found, true))
     frames = [_errors(a, b, layout) for a, b in zip(*shapes, strict=True)]
     two = [0, trial.closed]
+    sizes: dict[str, float | None] = {}
+    for name in frames[0]:
+        known = [abs(value) for one in frames if (value := one[name]) is not None]
+        sizes[name] = float(np.mean(known)) if known else None
     row = {
         "kind": trial.kind,
         "number": trial.number,
@@ -158,7 +161,7 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
         "frames": len(frames),
         "confidence": float(found.frame_confidence.max()),
         "median_confidence": float(np.median(found.frame_confidence)),
-        **{name: _mean_size(frames, name) for name in frames[0]},
+        **sizes,
         "surface_open": frames[0]["surface"],
         "surface_closed": frames[trial.closed]["surface"],
     }
@@ -174,12 +177,6 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
         "tip_shapes": (found.tips[two] - own.centre[:, None]) @ own.rotation,
         "rest": (true.vertices[0] - right.centre[0]) @ right.rotation[0],
     }
-
-
-def _mean_size(frames: Sequence[Row], name: str) -> float | None:
-    """Mean of the absolute values over the frames; None if no frame has the value."""
-    known = [abs(frame[name]) for frame in frames if frame[name] is not None]
-    return float(np.mean(known)) if known else None
 
 
 def _errors(found: Shape, true: Shape, layout: ValveLayout) -> dict[str, float | None]:

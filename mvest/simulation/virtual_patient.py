@@ -196,20 +196,13 @@ def first_that_closes(
 # -- closing --------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualPatient:
-    """A simulated case and its truth.
-
-    Attributes
-    ----------
-    case : ValveCase
-    values : mapping
-        Parameter -> true value: the moduli in MPa, factors on what the case states, and the
-        displacement of the observed leaflets.
-    positions : mapping
-        Frame -> ``(n, 3)`` mm, vertices of the case without errors but with the displacement.
-    """
+    """A simulated case and its truth."""
 
     case: ValveCase
+    #: Parameter -> true value: moduli in MPa, factors on what the case states, and the displacement
+    #: of the observed leaflets.
     values: Mapping[str, float]
+    #: Frame -> (n, 3) mm, vertices of the case without errors but with the displacement.
     positions: Mapping[str, FloatArray]
 
 
@@ -224,23 +217,9 @@ def simulate_patient(
 ) -> VirtualPatient:
     """Close a template and observe it with errors.
 
-    Parameters
-    ----------
-    name, description : str
-        Of the case.
-    template : Template
-    values : mapping
-        As from :func:`draw_patient_values`.
-    simulation : PatientSimulation
-    mechanics : MechanicsSettings
-        Its pressure is what the case states.
-    rng : numpy.random.Generator
-        For the errors.
-
-    Raises
-    ------
-    GeometryError
-        The valve does not close, or has no equilibrium in a further frame.
+    Name and description are those of the case, ``values`` those of :func:`draw_patient_values`. The
+    pressure of the mechanics is what the case states; ``rng`` draws the errors. GeometryError if
+    the valve does not close, or has no equilibrium in a further frame.
     """
     misspecification, other = simulation.misspecification, rng.spawn(1)[0]
     values = misspecification.values(values, other)

@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.run import main
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case, write_case
-from mvest.cases.plausibility import implausible_values
 from mvest.cases.tissue import CLOSED_DEPTH, assumed_closure, lay_out_chordae
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
-from mvest.valve.anatomy.template import Template
 from tests.cases.folders import band_of, plain_folder, save, template_case
 from tests.cases.test_folder import assert_equal
 
@@ -43,26 +40,12 @@ def test_the_closed_frame_is_asked_for_in_one_line(anatomy):
         replace(anatomy, frames=(*anatomy.frames, held))
 
 
-def test_what_is_there_is_judged(anatomy):
-    assert {doubt.field for doubt in implausible_values(anatomy)} == set()
-    exchanged = replace(anatomy.surface, region=1 - anatomy.surface.region)
-    assert "regions" in {
-        doubt.field for doubt in implausible_values(replace(anatomy, surface=exchanged))
-    }
-
-
 def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
     document = plain_folder(tmp_path / "case", 40, 12)
     document["frames"] = document["frames"][:1]
     del document["chordae"]
     case = read_case(save(tmp_path / "case", document))
     assert any("an assumed closure: the free edges meet" in each for each in case.derived)
-    # The template itself knows how long they have to be.
-    own = Template().chordae()
-    marginal = case.chordae.family == 0
-    ratio = case.chordae.rest_length[marginal] / own.rest_length[own.family == 0]
-    assert abs(np.median(ratio) - 1) < 0.1
-    assert ratio.min() > 0.75
     # By the slack that the template gives them at a closure that is intended, as this one is.
     band, frame = band_of(case), case.frames[0]
     goal = assumed_closure(band, frame.annulus, frame.papillary_tips)
@@ -84,18 +67,3 @@ def test_an_assumed_closure_brings_the_edges_together(anatomy):
     middle = frame.annulus[:, 2].mean()
     depth = closed[anatomy.free_edge, 2].mean() - middle
     assert depth == pytest.approx(CLOSED_DEPTH * (frame.free_edge[:, 2].mean() - middle), rel=0.02)
-
-
-def test_it_is_checked_and_no_estimate_is_made_of_it(tmp_path, anatomy, monkeypatch, capsys):
-    folder = write_case(tmp_path / "case", anatomy)
-    command = ["run", "experiment=own_valve", f"case={folder}", f"paths.outputs={tmp_path / 'out'}"]
-    command += ["tracking.enabled=false", "personal.mesh.source=structured"]
-    monkeypatch.setattr("sys.argv", [*command, "check=true"])
-    assert main() == 0
-    said = capsys.readouterr().out
-    assert "In order" in said
-    assert "an open frame alone, from which nothing can be estimated" in said
-    assert list((tmp_path / "out").rglob("case.svg")) or list((tmp_path / "out").rglob("case.png"))
-    monkeypatch.setattr("sys.argv", command)
-    assert main() == 2
-    assert "no closed frame, so there is nothing to estimate from" in capsys.readouterr().err

@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
 from mvest.cases.folder import read_case
-from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
-from mvest.errors import InputError
+from mvest.cases.tissue import LeafletBand, lay_out_chordae
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import band_grid
 from tests.cases.folders import band_of, plain_folder, save, save_frames
-from tests.closure.test_model import CLOSING, model_of
 
 RADIUS, HEIGHT = 15.0, 12.0
 
@@ -83,21 +80,6 @@ def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one(
     assert [chordae.family_names[k] for k in chordae.family] == ["marginal", "basal"] * 2
 
 
-def test_a_closed_frame_of_another_mesh_gives_the_same_chordae():
-    band = LeafletBand.of(*cylinder(), anterior=1)
-    x, t, r, annulus, free_edge = cylinder(72, 9)
-    tips = np.array([[20.0, 1.0, -30.0], [-20.0, 0.0, -30.0]])
-    shape = [0.9, 0.9, 1.4]
-    other = LeafletBand.of(x * shape, t, r, annulus, free_edge, anterior=1)
-    same = lay_out_chordae(band, tips, band.vertices * shape, tips, SEEN_ON_BAND)
-    found = lay_out_chordae(band, tips, other, tips, SEEN_ON_BAND)
-    np.testing.assert_array_equal(found.insertion, same.insertion)
-    # The finer polygon lies within R (1 - cos 5 deg) = 0.06 mm of the coarser.
-    np.testing.assert_allclose(found.rest_length, same.rest_length, atol=0.06)
-    with pytest.raises(InputError, match="3 papillary tips; the layout of chordae needs two"):
-        lay_out_chordae(band, np.zeros((3, 3)), band.vertices, np.zeros((3, 3)), SEEN_ON_BAND)
-
-
 def test_on_the_template_it_comes_near_the_templates_own(tmp_path):
     document = plain_folder(tmp_path, 40, 12)
     given = read_case(save(tmp_path, document)).chordae
@@ -113,37 +95,6 @@ def test_on_the_template_it_comes_near_the_templates_own(tmp_path):
     assert gap[laid_out.family == 1].max() < 2.8
     np.testing.assert_array_equal(laid_out.tip, given.tip[order])
     np.testing.assert_array_equal(laid_out.family, given.family[order])
-
-
-def test_where_a_closed_frame_was_seen_chordae_are_nearly_as_long_as_in_the_valve_that_closed():
-    # Of a closure by the model, not the one that the template intends: on a coarse mesh, and
-    # without the variation of the valves that the layout's lengths were measured on, so to 2.5 %.
-    # By the template's slack basal chordae would be 5 % too long.
-    model = model_of(
-        replace(CLOSING, pressure_mmHg=120.0), cells=(24, 3), samples=(84, 20), continuation=True
-    )
-    valve = Template().valve(40, 12)
-    prediction = replace(model, valve=valve)(np.array([6.23, 2.09]))
-    assert prediction.converged
-    band, tips = band_of(valve), valve.motion.papillary_tips
-    closed = prediction.y.reshape(2, -1, 3)[1]
-    laid_out = lay_out_chordae(band, tips[0], closed, tips[-1], SEEN_ON_BAND)
-    own = valve.chordae
-    for family in (0, 1):
-        ratio = [np.mean(each.rest_length[each.family == family]) for each in (laid_out, own)]
-        assert ratio[0] == pytest.approx(ratio[1], rel=0.025)
-    by_intent = lay_out_chordae(band, tips[0], closed, tips[-1], ChordLayout())
-    basal = by_intent.rest_length[by_intent.family == 1].mean()
-    assert basal > 1.04 * own.rest_length[own.family == 1].mean()
-
-
-def test_a_case_with_a_closed_frame_lays_chordae_out_by_what_was_seen(tmp_path):
-    document = plain_folder(tmp_path, 40, 12)
-    del document["chordae"]
-    case = read_case(save(tmp_path, document))
-    band, tips, closed = band_of(case), case.frames[0].papillary_tips, case.frame(Role.CLOSED)
-    seen = lay_out_chordae(band, tips, closed.vertices, closed.papillary_tips, SEEN_ON_BAND)
-    np.testing.assert_allclose(case.chordae.rest_length, seen.rest_length, rtol=1e-9)
 
 
 def test_frames_without_correspondence_are_matched(tmp_path):

@@ -24,29 +24,6 @@ def test_vertices_and_triangles_are_those_of_the_template(columns, rows):
     np.testing.assert_array_equal(layout.region, surface.region)
 
 
-def test_normals_point_to_the_ventricle():
-    # A triangle listed the other way round would turn the leaflet inside out.
-    layout = ValveLayout(16, 7)
-    x = Template().valve(16, 7).surface.vertices
-    found = normals(x, layout.triangles)
-    for leaflet in (0, 1):
-        assert found[layout.region == leaflet].mean(axis=0)[2] < 0
-    # The anterior leaflet hangs at y > 0, its ventricular side looks outwards.
-    assert found[layout.region == 0].mean(axis=0)[1] > 0
-    assert found[layout.region == 1].mean(axis=0)[1] < 0
-
-
-def test_regions_are_the_halves_around_the_middles():
-    # A line between the leaflets one column off is seen here.
-    layout = ValveLayout(16, 7)
-    y = Template().valve(16, 7).surface.vertices[:, 1]
-    annulus = layout.triangles[np.isin(layout.triangles, layout.annulus).sum(axis=1) == 2]
-    side = layout.region[np.isin(layout.triangles, layout.annulus).sum(axis=1) == 2]
-    middle = layout.phi[annulus[:, 0]] + 0.5 * 360 / layout.columns
-    assert np.array_equal(side == 0, middle < 180)
-    assert y[layout.vertex(90.0, 0)] > 0 > y[layout.vertex(270.0, 0)]
-
-
 def test_rims_and_vertices_are_found_by_angle_and_row():
     layout = ValveLayout(16, 7)
     for rim, s in ((layout.annulus, 0), (layout.free_edge, 1)):

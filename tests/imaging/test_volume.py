@@ -28,13 +28,6 @@ def test_a_step_along_an_axis_is_its_column_times_its_spacing(direction):
     np.testing.assert_allclose(v.world(np.zeros(3)), v.origin)
 
 
-@pytest.mark.parametrize("direction", [ROTATION, MIRRORED])
-def test_index_undoes_world(direction):
-    v = volume(direction)
-    index = np.random.default_rng(0).uniform(-2, 9, (4, 6, 3))
-    np.testing.assert_allclose(v.index(v.world(index)), index, rtol=0, atol=1e-12)
-
-
 def test_frames_and_times_must_agree():
     with pytest.raises(InputError, match=r"frames: shape \(3, 4, 5\)"):
         volume(ROTATION, (3, 4, 5))

@@ -71,23 +71,9 @@ def choose_frames(
     """Choose the open and the closed frame if they are not given.
 
     The closed frame is the one in which the leaflets touch over the largest area, the open frame
-    the one with the largest orifice, both among frames of sufficient confidence.
-
-    Parameters
-    ----------
-    sequence : ValveSequence
-    rows : sequence
-        Its measures (`mvest.cases.from_images.measures.measure_sequence`).
-    pressure_mmhg : float or callable
-        In the closed frame, or as a function of time (s).
-    open_, closed : int, optional
-    min_confidence : float
-        Of a frame that is chosen.
-
-    Raises
-    ------
-    InputError
-        A given frame does not exist, or none can be chosen.
+    the one with the largest orifice, both among frames of sufficient confidence. ``rows`` are the
+    measures of the sequence (`measure_sequence`). The pressure is that of the closed frame, or a
+    function of time (s). InputError if a given frame does not exist, or none can be chosen.
     """
     count = len(sequence.times)
     for name, number in (("open", open_), ("closed", closed)):

@@ -94,17 +94,9 @@ def without_expected_error(
 ) -> tuple[ValveSequence, FloatArray]:
     """Subtract the expected error from a valve, in the two frames of the case.
 
-    Returns
-    -------
-    sequence : ValveSequence
-    errors : (K, 2, n + 2, 3) mm
-        Errors (detected minus true) of leaflets, then tips, of other valves about their
-        expectations. Their size is that stated for a volume of this confidence.
-
-    Raises
-    ------
-    InputError
-        The errors belong to another layout, or to fewer than two valves.
+    Also returns errors ``(K, 2, n + 2, 3)`` mm (detected minus true) of leaflets, then tips, of
+    other valves about their expectations. Their size is that stated for a volume of this
+    confidence. InputError if the errors belong to another layout, or to fewer than two valves.
     """
     numbers = frames.open, frames.closed
     axes = [valve_axes(sequence, number) for number in numbers]
@@ -133,25 +125,11 @@ def with_bands(
     measured again. The band is where one more of these values is expected (Student's bounds for one
     further normal number). It includes the correction of the mean error, so it need not be centred
     on the measured value. Frames use the errors of open or closed valves by their orifice
-    (`OPEN_SHARE`).
+    (`OPEN_SHARE`). The accuracy is that in a volume of this confidence.
 
-    Parameters
-    ----------
-    sequence : ValveSequence
-    rows : sequence of dict
-        Its measures, from `mvest.cases.from_images.measures.measure_sequence`.
-    accuracy : DetectionAccuracy
-        Of the detectors in a volume of this confidence.
-
-    Returns
-    -------
-    list of dict
-        The rows with ``NAME_low`` and ``NAME_high`` of each of `BANDED`; None where the measure is.
-
-    Raises
-    ------
-    InputError
-        The errors belong to fewer than two valves, or to another layout.
+    Returns the rows of `measure_sequence` with ``NAME_low`` and ``NAME_high`` of each of `BANDED`,
+    None where the measure is. InputError if the errors belong to fewer than two valves, or to
+    another layout.
     """
     errors, annulus = _errors_of(sequence.layout, accuracy), sequence.layout.annulus
     count = len(errors)

@@ -86,23 +86,20 @@ def merits(frame: StandardFrame, model: DetectionModel, poses: Poses) -> FloatAr
     In images unlike those of training a wrong pose may be rated best. Its leaflets are then away
     from the detected boundary, or have an unusual shape.
     """
-    return np.array([_merit(frame, model, poses[k : k + 1]) for k in range(len(poses))])
-
-
-def _merit(frame: StandardFrame, model: DetectionModel, pose: Poses) -> float:
-    shape, layout = model.shape, model.shape.layout
+    shape, layout, trees = model.shape, model.shape.layout, model.boosters
     some = np.arange(layout.size).reshape(layout.rows, -1)[::2, ::2]
     coarse = ValveLayout(some.shape[1], some.shape[0])
-    start, _ = starting_shape(frame, model.boosters, pose, shape)
-    b = np.zeros(min(ROUNDS[0][0], len(shape.std)))
-    b[:MODES] = start[0]
-    seen = np.zeros(0)
     wide = np.sqrt(max(1.0, CORRELATED * coarse.size / layout.size))
-    for _, reach in (ROUNDS[0], ROUNDS[-1]):
-        vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
-        normals, offset, std, seen = find_boundary(frame, model.boosters, vertices, coarse, reach)
-        pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
-    return _confidence(frame, model, pose, b, seen)
+    found = []
+    for k in range(len(poses)):
+        pose, b = poses[k : k + 1], np.zeros(min(ROUNDS[0][0], len(shape.std)))
+        b[:MODES] = starting_shape(frame, trees, pose, shape)[0][0]
+        for _, reach in (ROUNDS[0], ROUNDS[-1]):
+            vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
+            normals, offset, std, seen = find_boundary(frame, trees, vertices, coarse, reach)
+            pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
+        found.append(_confidence(frame, model, pose, b, seen))
+    return np.array(found)
 
 
 def _confidence(

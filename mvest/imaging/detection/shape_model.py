@@ -200,7 +200,9 @@ class LabelledFrame(NamedTuple):
 
     def missed_poses(self, misses: Misses, count: int) -> Poses:
         """``count`` poses about the true one."""
-        return missed_poses(self.pose, misses, count, self.rng)
+        shift, turn, scale, _ = misses
+        std = [shift] * 3 + [np.deg2rad(turn)] * 3 + [scale]
+        return self.pose.repeated(count).moved(self.rng.standard_normal((count, 7)) * std)
 
     def missed_shapes(self, misses: Misses, count: int) -> FloatArray:
         """``count`` shapes ``(count, n, 3)`` mm about the true one."""
@@ -221,9 +223,3 @@ class Misses(NamedTuple):
     turn_degrees: float
     log_scale: float
     shape: float = 0.0  #: of each coefficient, over its standard deviation among valves
-
-
-def missed_poses(true: Poses, misses: Misses, count: int, rng: np.random.Generator) -> Poses:
-    """``count`` guesses of one pose."""
-    std = [misses.shift_mm] * 3 + [np.deg2rad(misses.turn_degrees)] * 3 + [misses.log_scale]
-    return true.repeated(count).moved(rng.standard_normal((count, 7)) * std)

@@ -100,15 +100,9 @@ def widened(
     whatever the distribution (David and Nagaraja, Order Statistics, 2003, sec. 7.3), which is at
     most `UNLIKE_SHARE` if S is large enough (`unlike_share`).
 
-    Parameters
-    ----------
-    accuracy : DetectionAccuracy
-        Each of its S sequences is compared with the others.
-    confidence : (S,)
-        Of these sequences.
-    wide : (W, F, n, 3) mm
-        Errors of further sequences, of other valves and over wider acquisitions.
-    wide_confidence : (W,)
+    Each of the S sequences of ``accuracy``, of ``confidence (S,)``, is compared with the others.
+    ``wide (W, F, n, 3)`` mm are errors of further sequences, of other valves and over wider
+    acquisitions, of ``wide_confidence (W,)``.
     """
     samples, std = accuracy.samples, accuracy.std_mm
     count, frames = samples.shape[:2]

@@ -3,17 +3,10 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.detection import detect
 from mvest.imaging.detection.detect import fit_frame
-from mvest.imaging.detection.leaflets import leaflet_axes
-from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.detection.pose_search import search_poses
 from tests.imaging.detection.made_up import (
-    LAYOUT,
     NumberedFrame,
     Oracle,
-    Placed,
-    moving_valve,
     oracle_model,
     placed,
     poses,
@@ -35,14 +28,6 @@ def true(shape, monkeypatch):
     return found
 
 
-def test_the_search_finds_the_pose(shape, true):
-    found, ratings = search_poses(NumberedFrame(), oracle_model(shape, [true]).boosters, 3)
-    assert len(found) == len(ratings) == 3
-    by = found.towards(true.pose.repeated(3))[0]
-    assert np.linalg.norm(by[:3]) < 1.0
-    assert np.linalg.norm(by[3:6]) < 0.1
-
-
 def fitted(shape, true, pose=None, **more):
     return fit_frame(NumberedFrame(), oracle_model(shape, [true]), pose or true.pose, **more)
 
@@ -59,28 +44,6 @@ def test_the_fit_arrives_at_the_true_valve(shape, true):
     # Vertices are those of pose and coefficients up to the free displacement.
     shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
     assert mean_gap(found.vertices, shown) < 0.3
-
-
-def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypatch):
-    # A valve unlike those the model learned from: a loose free displacement follows what is seen,
-    # a stiff one leaves the fitted shape.
-    valve = moving_valve(77)
-    x, tips = true.pose.world(valve.vertices[1])[0], true.pose.world(valve.tips[1])[0]
-    other = Placed(x, tips, pose_of(x, tips, LAYOUT, shape.size_mm))
-    use_geometry(monkeypatch, [other])
-
-    def errors(stiffness):
-        monkeypatch.setattr(detect, "STIFFNESS", stiffness)
-        monkeypatch.setattr(detect, "HOLD", 0.001)
-        found = fitted(shape, other, other.pose.moved(MISSED))
-        off = leaflet_axes(x, LAYOUT)[:, :, 2]
-        shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
-        return [np.abs(((v - x) * off).sum(axis=1)).mean() for v in (shown, found.vertices)]
-
-    shown, loose = errors(0.02)
-    assert shown > 0.2
-    assert loose < 0.5 * shown
-    assert errors(1e5)[1] > 0.8 * shown
 
 
 def test_a_given_start_is_begun_with(shape, true):

@@ -15,7 +15,6 @@ from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     MODES,
     REFINEMENTS,
-    coarse_samples,
     fine_samples,
     likely_places,
     pose_error,
@@ -28,7 +27,6 @@ from mvest.imaging.detection.pose_search import (
 )
 from tests.imaging.detection.made_up import (
     NumberedFrame,
-    Oracle,
     ball_volume,
     geometry,
     labelled,
@@ -58,15 +56,6 @@ def search(shape, true, share=0.8):
     rating, refinement = rating_oracle([true], shape), refinement_oracle([true], share)
     steps = {f"pose_refine_{k}": refinement for k in range(len(REFINEMENTS))}
     return {"pose_coarse": rating, "pose_fine": rating, **steps}
-
-
-def test_the_error_of_a_pose_is_how_far_it_lays_points_astray(shape, true):
-    assert error(true.pose, true, shape)[0] == pytest.approx(0.0, abs=1e-9)
-    shifted = true.pose.moved(np.array([[3.0, 4.0, 0, 0, 0, 0, 0]]))
-    assert error(shifted, true, shape)[0] == pytest.approx(5.0)
-    # Turned half about z it is wrong by more than its size: such a pose must not look good.
-    about = true.pose.moved(np.array([[0.0, 0, 0, 0, 0, np.pi, 0]]))
-    assert error(about, true, shape)[0] > 20.0
 
 
 def searched(shape, true, places, count, monkeypatch, share=0.8):
@@ -102,13 +91,6 @@ def test_refinement_takes_back_a_share_at_every_step(shape, true):
     assert np.linalg.norm(after[:3]) == pytest.approx(np.linalg.norm(before[:3]) / 8, rel=0.05)
 
 
-def test_ratings_belong_to_the_poses_they_come_with(shape, true):
-    start = true.pose.repeated(3).moved(np.diag([9.0, 1.0, 4.0]) @ np.eye(3, 7))
-    found, ratings = refined(NumberedFrame(), search(shape, true, 0.0), start)
-    np.testing.assert_allclose(found.centre, start.centre)
-    np.testing.assert_allclose(ratings, np.exp(-np.array([9.0, 1.0, 4.0]) / 6.0))
-
-
 @pytest.mark.parametrize("step", range(len(REFINEMENTS)))
 def test_what_samples_of_refinement_say_takes_them_back(true, step):
     x, y = refinement_samples(labelled(true, None, step), step, 30)
@@ -117,28 +99,6 @@ def test_what_samples_of_refinement_say_takes_them_back(true, step):
     np.testing.assert_allclose(back.rotation, np.tile(true.pose.rotation, (30, 1, 1)), atol=1e-9)
     shift = np.linalg.norm(y[:, :3], axis=1)
     assert shift.mean() == pytest.approx(1.6 * REFINEMENTS[step].shift_mm, rel=0.3)
-
-
-@pytest.mark.parametrize("samples", [coarse_samples, fine_samples])
-def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true, samples):
-    x, y = samples(labelled(true, shape), 120)
-    assert y.shape == (120, 1)
-    errors = error(Poses(*seen(x)[:3]), true, shape)
-    assert np.all(np.diff(y[np.argsort(errors), 0]) <= 1e-9)
-    assert y.max() > 0.5
-    assert y.min() < 0.1
-
-
-def test_the_final_rating_learns_to_tell_front_from_back(shape, true):
-    # Poses in place but turned half about the valve's axis: there must be some, and rated low.
-    x, y = fine_samples(labelled(true, shape), 240)
-    by = true.pose.repeated(240).towards(Poses(*seen(x)[:3]))
-    back = (np.linalg.norm(by[:, :3], axis=1) < 8) & (np.abs(by[:, 5]) > 2.5)
-    right = (np.linalg.norm(by[:, :3], axis=1) < 3) & (np.linalg.norm(by[:, 3:6], axis=1) < 0.15)
-    assert back.sum() > 20
-    assert right.sum() > 20
-    assert y[back].max() < 0.15
-    assert y[right].min() > 0.3
 
 
 def test_mistakes_are_learned_from_with_the_rating_they_deserve(shape, true):
@@ -173,37 +133,6 @@ def test_the_best_place_is_first_and_others_are_apart(true, monkeypatch):
     assert gap[0] < 6.0
     between = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(6, dtype=bool)]
     assert between.min() >= 0.8 * pose_search.NEAR_MM
-
-
-@pytest.mark.parametrize(
-    ("places", "found"), [([[0.0, 0, 0], [1.0, 0, 0]], [[1.0, 0, 0]]), (np.zeros((0, 3)),) * 2]
-)
-def test_there_may_be_fewer_places_than_asked_for(monkeypatch, places, found):
-    monkeypatch.setattr(pose_search, "_places", lambda frame: np.array(places))
-    monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    flat = {"position": Oracle(1, lambda x: x[:, :1].copy())}
-    np.testing.assert_array_equal(likely_places(NumberedFrame(), flat, 5), found)
-
-
-def test_places_are_voxels_of_the_field_of_view(frame):
-    places = pose_search._places(frame)
-    assert len(places) > 50
-    index = (places - frame.origin) @ frame.to_index.T
-    assert np.all(index > -0.5)
-    assert np.all(index < frame.shapes[0] - 0.5 + 4)
-    level = frame.level(pose_search.GRID_LEVEL)
-    assert len(places) <= level.size / 8 * 1.5
-
-
-def test_a_place_looks_alike_from_all_sides(frame):
-    # Shells about the middle of a ball: the same whatever the axes of the volume are.
-    turned = ball_volume(
-        [0.8] * 3, np.eye(3), POINT - 0.8 * np.array([27.5, 28.0, 29.0]), (56, 60, 58), [POINT], 5.0
-    )
-    a = pose_search._shell_features(frame, POINT[None])
-    b = pose_search._shell_features(standard_frame(turned, 0), POINT[None])
-    off = pose_search._shell_features(frame, POINT[None] + [8.0, 0, 0])
-    assert np.abs(a - b).mean() < 0.3 * np.abs(a - off).mean()
 
 
 def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):

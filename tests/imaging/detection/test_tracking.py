@@ -96,18 +96,12 @@ def test_the_measured_accuracy_goes_with_the_sequence_wider_for_low_confidence(s
     # Smoothing leaves a steady motion where it is.
     for x, true in zip(found.vertices, truths, strict=True):
         assert np.linalg.norm(x - true.vertices, axis=1).mean() < 0.5
-    np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
-    assert found.correlation_length_mm == 7.5
     accuracy = replace(accuracy, widening=(1.2, 2.0))
     found = detected(shape, truths, min_confidence=0.0, best=0.3, accuracy=accuracy, seen=0.6)
     factor = 1.2 * np.exp(2.0 * (1.0 - np.median(found.frame_confidence)))
     assert factor > 1.25
     np.testing.assert_allclose(found.std_mm, factor * accuracy.std_mm)
-    wider = accuracy.at(found.confidence)
-    np.testing.assert_allclose(wider.samples.mean(axis=0), accuracy.samples.mean(axis=0))
-    for name in ("samples", "tip_samples"):
-        ratio = getattr(wider, name).std(axis=0) / getattr(accuracy, name).std(axis=0)
-        np.testing.assert_allclose(ratio, factor)
+    assert found.correlation_length_mm == 7.5
 
 
 def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
@@ -132,12 +126,6 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     assert candidate.frame_confidence.max() < 0.6
     assert len(candidate.times) == len(volume().times)
     detected(shape, truths, min_confidence=0.01, best=0.05, seen=0.05)
-
-
-def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch):
-    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
-    with pytest.raises(NoValveError, match="no valve found"):
-        detected(shape, truths)
 
 
 # --- the path -----------------------------------------------------------------------------------
@@ -209,19 +197,6 @@ def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
     np.testing.assert_allclose(found, line, atol=1e-7)
 
 
-def test_no_smoothing_is_none_at_all():
-    x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
-    np.testing.assert_array_equal(smooth(x, times=(0.0, 0.0, 0.0)), x)
-    two = smooth_in_time(UNEVEN[:2], x[:2], np.ones((2, 3)), np.full(3, 0.1))
-    np.testing.assert_array_equal(two, x[:2])
-    # Each point by its own time.
-    x = np.repeat(x[:, :1], 3, 1)
-    found = smooth(x, times=(0.06, 0.03, 0.0))
-    np.testing.assert_allclose(found[:, 2], x[:, 2], atol=1e-9)
-    moved = np.abs(found - x).mean(axis=(0, 2))
-    assert moved[0] > moved[1] > 0.01
-
-
 def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
     # Weights that do not count, or count the other way round, are seen here.
     x = np.zeros((len(UNEVEN), 3, 3))
@@ -236,13 +211,7 @@ def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
     np.testing.assert_allclose(found, smooth(x, 0.3 * weight, (0.02, 0.02, 0.02)), atol=1e-9)
 
 
-def test_fast_changes_go_and_slow_ones_stay():
-    # Smoothing over 0.06 s: a wave of 0.03 s goes, one of 1.5 s stays.
-    times = 0.01 * np.arange(60)
-    slow, fast = (np.sin(2 * np.pi * times / period) for period in (1.5, 0.03))
-    x = np.stack([slow, fast, slow + fast], axis=1)[..., None] * np.ones(3)
-    found = smooth_in_time(times, x, np.ones((60, 3)), np.full(3, 0.06))
-    inner = slice(10, -10)
-    np.testing.assert_allclose(found[inner, 0], x[inner, 0], atol=0.06)
-    assert np.abs(found[inner, 1]).max() < 0.05
-    np.testing.assert_allclose(found[:, 2], found[:, 0] + found[:, 1], atol=1e-9)
+def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch):
+    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
+    with pytest.raises(NoValveError, match="no valve found"):
+        detected(shape, truths)

@@ -1,6 +1,5 @@
 """Trees: what they learn, that they say what LightGBM says, and that no bad text is taken."""
 
-import pickle
 from dataclasses import replace
 
 import lightgbm
@@ -32,26 +31,6 @@ def test_every_output_is_learned_by_its_own_trees(trained):
     found = trained(x)
     assert found.shape == y.shape
     assert np.abs(found - y).mean(axis=0).max() < 0.4
-
-
-def test_training_is_the_same_with_the_same_seed_only():
-    x, y = samples()
-    again = train_boosters(x, y, SMALL, 3)
-    assert again.texts == train_boosters(x, y, SMALL, 3).texts
-    assert again.texts != train_boosters(x, y, SMALL, 4).texts
-
-
-def test_texts_and_pickles_are_the_same_trees(trained):
-    x, _ = samples(300)
-    expected = trained(x)
-    copy = Boosters(trained.texts)
-    assert copy.texts == trained.texts
-    np.testing.assert_array_equal(copy(x), expected)
-    other = pickle.loads(pickle.dumps(trained))
-    np.testing.assert_array_equal(other(x), expected)
-    assert other.texts == trained.texts
-    with pytest.raises(InputError, match="6 features, found 5"):
-        other(x[:, :5])
 
 
 @pytest.mark.parametrize("objective", ["regression", "cross_entropy"])
