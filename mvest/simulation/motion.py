@@ -231,8 +231,9 @@ def closing_frames(
         drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows
     )
     mechanics, ramp = drawn.mechanics, drawn.mechanics.protocol.ramp
-    times = {"dt": ramp / settings.steps, "growth": 3.0, "end": 1.4 * ramp}
-    protocol = replace(mechanics.protocol, equilibrium=True, **times)
+    protocol = replace(
+        mechanics.protocol, dt=ramp / settings.steps, growth=3.0, end=1.4 * ramp, equilibrium=True
+    )
     newton = replace(mechanics.newton, tolerance=settings.tolerance, **GIVE_UP)
     seen = drawn.sampled(settings.columns, settings.rows)
     model = ClosureModel(

@@ -1,4 +1,4 @@
-"""Measures of every frame, and the files of a valve from images, read back."""
+"""Measures of every frame with their bands, and the files of a valve from images."""
 
 import csv
 import dataclasses
@@ -7,6 +7,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from mvest.cases.from_images.detector_errors import BANDED, valve_axes, with_bands
 from mvest.cases.from_images.measures import (
     closed_frame,
     measure_sequence,
@@ -17,6 +18,7 @@ from mvest.cases.from_images.measures import (
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import LANDMARKS
 from tests import made_up_sequence
@@ -123,3 +125,54 @@ def test_landmarks_are_read_back_in_place(tmp_path):
     np.testing.assert_allclose(lists["free edge"].points, valve.free_edge[1])
     with pytest.raises(InputError, match="frame 2, expected 0 to 1"):
         write_landmarks(tmp_path / "other.mrk.json", valve, 2)
+
+
+CLOSED, OPEN = 0, 1
+LENGTHS = ("ap_diameter_mm", "commissural_diameter_mm", "annulus_height_mm", "tip_separation_mm",
+           "tip_depth_mm")  # fmt: skip
+
+
+def swollen(valve, shares):
+    """Errors of detectors that see a valve larger, all of it alike, by these shares (K, 2) of it.
+
+    Of each sample in the open and in the closed frame.
+    """
+    errors = np.zeros((len(shares), 2, SMALL.size, 3))
+    tips = np.zeros((len(shares), 2, 2, 3))
+    for which, frame in enumerate((OPEN, CLOSED)):
+        axes, centre = valve_axes(valve, frame), valve.annulus[frame].mean(axis=0)
+        share = np.asarray(shares)[:, which, None, None]
+        errors[:, which] = share * ((valve.vertices[frame] - centre) @ axes)
+        tips[:, which] = share * ((valve.tips[frame] - centre) @ axes)
+    return DetectionAccuracy(np.ones(SMALL.size), 5.0, errors, tips)
+
+
+def test_a_valve_seen_larger_or_smaller_gives_lengths_a_band_of_that_share():
+    valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
+    rows = measure_sequence(valve, 1.0)
+    shares = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
+    banded = with_bands(valve, rows, swollen(valve, np.stack([shares, 0 * shares], axis=1)))
+    # Student's bound of four degrees of freedom, for one further number (any table of it).
+    half = 2.776 * np.std(shares, ddof=1) * np.sqrt(1 + 1 / 5)
+    for name in LENGTHS:
+        seen = rows[OPEN][name]
+        assert banded[OPEN][f"{name}_low"] == pytest.approx(seen * (1 - half), rel=1e-4), name
+        assert banded[OPEN][f"{name}_high"] == pytest.approx(seen * (1 + half), rel=1e-4), name
+        # In closed frames there is no error.
+        assert banded[CLOSED][f"{name}_low"] == pytest.approx(rows[CLOSED][name])
+        assert banded[CLOSED][f"{name}_high"] == pytest.approx(rows[CLOSED][name])
+    assert [{name: row[name] for name in rows[0]} for row in banded] == rows
+    # Without the mean error, where the valve is.
+    centred = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))
+    for row, own in zip(rows, centred, strict=True):
+        for end in ("low", "high"):
+            found = own[f"annulus_area_mm2_{end}"]
+            assert found == pytest.approx(0.9**2 * row["annulus_area_mm2"])
+
+
+def test_a_frame_without_a_valve_has_no_band():
+    valve = made_up_sequence.sequence((1.0, 1.0), SMALL)
+    valve.frame_confidence[1] = 0.0
+    rows = measure_sequence(valve, 1.0)
+    empty = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))[1]
+    assert {empty[f"{name}_{end}"] for name in BANDED for end in ("low", "high")} == {None}
