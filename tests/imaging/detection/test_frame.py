@@ -92,14 +92,13 @@ def test_what_is_no_image_is_refused(to, message):
 
 GRIDS = [
     ((0.8, 0.8, 0.8), (38, 43, 41)),
-    ((0.75, 0.85, 0.8), (37, 40, 45)),  # within a fifth: left as it is
     ((0.5, 0.9, 1.4), (61, 35, 27)),  # resampled finer and coarser
     ((1.7, 0.4, 0.8), (21, 83, 40)),
 ]
 
 
 @pytest.mark.parametrize(("spacing", "shape"), GRIDS)
-@pytest.mark.parametrize("direction", [np.eye(3), ROTATION, MIRRORED])
+@pytest.mark.parametrize("direction", [ROTATION, MIRRORED])
 def test_a_bright_ball_is_at_its_place_in_every_level(spacing, shape, direction):
     # Half a voxel of some level, of the old or the new grid, or transposed axes, are seen here.
     frame = standard_frame(cube(spacing, direction, shape, 2.5), 0)

@@ -12,55 +12,29 @@ from scipy.spatial.transform import Rotation
 from mvest.imaging.detection import pose_search
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import (
-    MODES,
-    REFINEMENTS,
-    fine_samples,
-    likely_places,
-    pose_error,
-    position_samples,
-    refined,
-    refinement_samples,
-    search_poses,
-    shape_start_samples,
-    starting_shape,
-)
-from tests.imaging.detection.made_up import (
-    NumberedFrame,
-    ball_volume,
-    geometry,
-    labelled,
-    placed,
-    poses,
-    position_oracle,
-    rating_oracle,
-    refinement_oracle,
-    seen,
-    start_oracle,
-    use_geometry,
-)
+from tests.imaging.detection import made_up as made
 
 
 @pytest.fixture
 def true(shape, monkeypatch):
-    monkeypatch.setattr(pose_search, "features", geometry)
-    b = np.random.default_rng(0).standard_normal(MODES) * shape.std[:MODES]
-    return placed(shape, poses(1, 2), b)
+    monkeypatch.setattr(pose_search, "features", made.geometry)
+    b = np.random.default_rng(0).standard_normal(pose_search.MODES) * shape.std[: pose_search.MODES]
+    return made.placed(shape, made.poses(1, 2), b)
 
 
 def error(found, true, shape):
-    return pose_error(found, true.pose, shape)
+    return pose_search.pose_error(found, true.pose, shape)
 
 
 def search(shape, true, share=0.8):
-    rating, refinement = rating_oracle([true], shape), refinement_oracle([true], share)
-    steps = {f"pose_refine_{k}": refinement for k in range(len(REFINEMENTS))}
+    rating, refinement = made.rating_oracle([true], shape), made.refinement_oracle([true], share)
+    steps = {f"pose_refine_{k}": refinement for k in range(len(pose_search.REFINEMENTS))}
     return {"pose_coarse": rating, "pose_fine": rating, **steps}
 
 
 def searched(shape, true, places, count, monkeypatch, share=0.8):
     monkeypatch.setattr(pose_search, "likely_places", lambda frame, trees, count: places)
-    return search_poses(NumberedFrame(), search(shape, true, share), count)
+    return pose_search.search_poses(made.NumberedFrame(), search(shape, true, share), count)
 
 
 def test_the_search_finds_the_pose_from_places_nearby(shape, true, monkeypatch):
@@ -85,20 +59,20 @@ def test_refinement_takes_back_a_share_at_every_step(shape, true):
     # One step skipped, or a step applied in world axes, leaves more than this.
     start = true.pose.moved(np.array([[6.0, -4.0, 3.0, 0.3, -0.2, 0.3, 0.1]]))
     before = start.towards(true.pose)[0]
-    found, _ = refined(NumberedFrame(), search(shape, true, 0.5), start)
+    found, _ = pose_search.refined(made.NumberedFrame(), search(shape, true, 0.5), start)
     after = found.towards(true.pose)[0]
     np.testing.assert_allclose(after[6], before[6] / 8, atol=1e-9)
     assert np.linalg.norm(after[:3]) == pytest.approx(np.linalg.norm(before[:3]) / 8, rel=0.05)
 
 
-@pytest.mark.parametrize("step", range(len(REFINEMENTS)))
+@pytest.mark.parametrize("step", range(len(pose_search.REFINEMENTS)))
 def test_what_samples_of_refinement_say_takes_them_back(true, step):
-    x, y = refinement_samples(labelled(true, None, step), step, 30)
-    back = Poses(*seen(x)[:3]).moved(y)
+    x, y = pose_search.refinement_samples(made.labelled(true, None, step), step, 30)
+    back = Poses(*made.seen(x)[:3]).moved(y)
     np.testing.assert_allclose(back.centre, np.tile(true.pose.centre, (30, 1)), atol=1e-9)
     np.testing.assert_allclose(back.rotation, np.tile(true.pose.rotation, (30, 1, 1)), atol=1e-9)
     shift = np.linalg.norm(y[:, :3], axis=1)
-    assert shift.mean() == pytest.approx(1.6 * REFINEMENTS[step].shift_mm, rel=0.3)
+    assert shift.mean() == pytest.approx(1.6 * pose_search.REFINEMENTS[step].shift_mm, rel=0.3)
 
 
 def test_mistakes_are_learned_from_with_the_rating_they_deserve(shape, true):
@@ -106,9 +80,9 @@ def test_mistakes_are_learned_from_with_the_rating_they_deserve(shape, true):
     away = np.zeros((3, 7))
     away[:, 0] = [0.0, 6.0, 60.0]
     mistaken = true.pose.repeated(3).moved(away)
-    x, y = fine_samples(labelled(true, shape), 60, mistaken)
+    x, y = pose_search.fine_samples(made.labelled(true, shape), 60, mistaken)
     assert len(x) == len(y) == 63
-    np.testing.assert_allclose(seen(x)[0][-3:], mistaken.centre)
+    np.testing.assert_allclose(made.seen(x)[0][-3:], mistaken.centre)
     np.testing.assert_allclose(y[-3:, 0], np.exp(-np.array([0.0, 6.0, 60.0]) / 6.0), atol=1e-9)
 
 
@@ -120,13 +94,15 @@ def frame():
     direction = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     shape = (56, 60, 58)
     origin = POINT - direction @ (0.8 * np.array([26.0, 31.0, 28.0]))
-    return standard_frame(ball_volume([0.8] * 3, direction, origin, shape, [POINT], 5.0), 0)
+    return standard_frame(made.ball_volume([0.8] * 3, direction, origin, shape, [POINT], 5.0), 0)
 
 
 def test_the_best_place_is_first_and_others_are_apart(true, monkeypatch):
     # Without suppression all places crowd about the first.
-    use_geometry(monkeypatch, [true])
-    places = likely_places(NumberedFrame(), {"position": position_oracle([true])}, 6)
+    made.use_geometry(monkeypatch, [true])
+    places = pose_search.likely_places(
+        made.NumberedFrame(), {"position": made.position_oracle([true])}, 6
+    )
     assert places.shape == (6, 3)
     gap = np.linalg.norm(places - true.pose.centre, axis=1)
     assert np.argmin(gap) == 0
@@ -138,7 +114,7 @@ def test_the_best_place_is_first_and_others_are_apart(true, monkeypatch):
 def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):
     centred = true._replace(pose=replace(true.pose, centre=POINT[None]))
     monkeypatch.setattr(pose_search, "_shell_features", lambda frame, points: points)
-    points, y = position_samples(labelled(centred, shape, frame=frame), 100)
+    points, y = pose_search.position_samples(made.labelled(centred, shape, frame=frame), 100)
     assert y.shape == (100, 1)
     gap = np.linalg.norm(points - POINT, axis=1)
     order = np.argsort(gap)
@@ -150,17 +126,21 @@ def test_samples_are_rated_by_their_distance(shape, true, frame, monkeypatch):
 
 def test_coefficients_and_tips_come_back_as_they_were_learned(shape, true):
     # What samples divide by the deviation or subtract is multiplied and added again.
-    b = shape.coefficients(true.pose.local(true.vertices[None]))[0, :MODES]
-    trees = {"shape": start_oracle([true], shape, MODES)}
-    found, tips = starting_shape(NumberedFrame(), trees, true.pose.repeated(2), shape)
-    assert found.shape == (2, MODES)
+    b = shape.coefficients(true.pose.local(true.vertices[None]))[0, : pose_search.MODES]
+    trees = {"shape": made.start_oracle([true], shape)}
+    found, tips = pose_search.starting_shape(
+        made.NumberedFrame(), trees, true.pose.repeated(2), shape
+    )
+    assert found.shape == (2, pose_search.MODES)
     np.testing.assert_allclose(found[1], b, atol=1e-9)
     np.testing.assert_allclose(tips[1], true.tips, atol=1e-9)
     # Seen from the true pose instead, all samples would say the same.
-    x, y = shape_start_samples(labelled(true, shape, 1), 25)
-    assert y.shape == (25, MODES + 6)
-    here = Poses(*seen(x)[:3])
-    tips = here.world(shape.tips + y[:, MODES:].reshape(-1, 2, 3))
+    x, y = pose_search.shape_start_samples(made.labelled(true, shape, 1), 25)
+    assert y.shape == (25, pose_search.MODES + 6)
+    here = Poses(*made.seen(x)[:3])
+    tips = here.world(shape.tips + y[:, pose_search.MODES :].reshape(-1, 2, 3))
     np.testing.assert_allclose(tips, np.tile(true.tips, (25, 1, 1)), atol=1e-9)
-    assert np.std(y[:, MODES:], axis=0).min() > 0.3
-    np.testing.assert_allclose(y[:, :MODES].mean(axis=0), b / shape.std[:MODES], atol=1.5)
+    assert np.std(y[:, pose_search.MODES :], axis=0).min() > 0.3
+    np.testing.assert_allclose(
+        y[:, : pose_search.MODES].mean(axis=0), b / shape.std[: pose_search.MODES], atol=1.5
+    )

@@ -15,20 +15,10 @@ from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.volume import VolumeSequence
-from tests.imaging.detection.made_up import (
-    LAYOUT,
-    NumberedFrame,
-    Oracle,
-    oracle_model,
-    placed,
-    poses,
-    position_oracle,
-    rating_oracle,
-    use_geometry,
-)
+from tests.imaging.detection import made_up as made
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
-FRAMES = [NumberedFrame(k) for k in range(4)]
+FRAMES = [made.NumberedFrame(k) for k in range(4)]
 STEPS = [f"pose_refine_{k}" for k in range(3)]
 
 
@@ -41,15 +31,15 @@ def unsmoothed(monkeypatch):
 def truths(shape, monkeypatch):
     """A valve that moves and closes a little over four frames, which oracles know."""
     rng = np.random.default_rng(3)
-    pose, b = poses(1, 2), rng.standard_normal(8) * 0.5 * shape.std[:8]
+    pose, b = made.poses(1, 2), rng.standard_normal(8) * 0.5 * shape.std[:8]
     found = []
     for k in range(len(TIMES)):
         moved = pose.moved(np.array([[0.4 * k, -0.3 * k, 0.5 * k, 0, 0.01 * k, 0, 0.0]]))
         b = b.copy()
         b[0] = (0.3 * k - 0.4) * shape.std[0]
-        found.append(placed(shape, moved, b))
-    use_geometry(monkeypatch, found)
-    monkeypatch.setattr(tracking, "standard_frame", lambda volume, k: NumberedFrame(k))
+        found.append(made.placed(shape, moved, b))
+    made.use_geometry(monkeypatch, found)
+    monkeypatch.setattr(tracking, "standard_frame", lambda volume, k: made.NumberedFrame(k))
     return found
 
 
@@ -60,7 +50,7 @@ def volume(count=4):
 
 def detected(shape, truths, frames=4, *, min_confidence=0.7, progress=None, **of):
     """What oracles make of a volume."""
-    model = oracle_model(shape, truths, **of)
+    model = made.oracle_model(shape, truths, **of)
     return detect_valve(volume(frames), model, min_confidence=min_confidence, progress=progress)
 
 
@@ -78,7 +68,7 @@ def test_the_valve_is_found_in_every_frame(shape, truths, unsmoothed):
         np.testing.assert_allclose(found.tips[k], true.tips, atol=0.05)
     np.testing.assert_array_equal(found.times, TIMES)
     assert np.all(found.frame_confidence > 0.9)
-    assert found.vertex_confidence.shape == (4, LAYOUT.size)
+    assert found.vertex_confidence.shape == (4, made.LAYOUT.size)
     assert told == [(k + 1, 4) for k in range(4)]
     assert np.all(np.isnan(found.std_mm))
     assert np.isnan(found.correlation_length_mm)
@@ -88,7 +78,7 @@ def test_the_valve_is_found_in_every_frame(shape, truths, unsmoothed):
 
 
 def test_the_measured_accuracy_goes_with_the_sequence_wider_for_low_confidence(shape, truths):
-    n = LAYOUT.size
+    n = made.LAYOUT.size
     rng = np.random.default_rng(0)
     samples, tips = rng.standard_normal((3, 2, n, 3)), rng.standard_normal((3, 2, 2, 3))
     accuracy = DetectionAccuracy(np.linspace(1, 2, n), 7.5, samples, tips)
@@ -106,7 +96,7 @@ def test_the_measured_accuracy_goes_with_the_sequence_wider_for_low_confidence(s
 
 def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
     # Its own search ended elsewhere; two frames in a row are found one after the other.
-    model = oracle_model(shape, truths)
+    model = made.oracle_model(shape, truths)
     valves = [fit_frame(FRAMES[k], model, truths[k].pose) for k in range(4)]
     for k in (1, 2):
         away = valves[k].pose.moved(np.array([[30.0, 0, 0, 0, 0, 0, 0]]))
@@ -138,7 +128,7 @@ def hypotheses(centres, ratings):
 
 def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_higher(shape, truths):
     # Each frame by itself would jump 20 mm away and back.
-    model = oracle_model(shape, truths)
+    model = made.oracle_model(shape, truths)
     both = [0.0, 0, 0], [20.0, 0, 0]
     frames = [hypotheses(both, ratings) for ratings in ([0.9, 0.5], [0.6, 0.8], [0.9, 0.5])]
     times = np.array([0.0, 0.02, 0.04])
@@ -154,14 +144,16 @@ def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_highe
 
 def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, truths):
     # Every frame by itself, or without the hypotheses of the others, would lose one of them.
-    far = placed(shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2))
-    right = rating_oracle(truths, shape, 0.6)
-    wrong = rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
-    rating = Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
-    model = oracle_model(shape, truths)
-    still = Oracle(7, lambda x: np.zeros((len(x), 7)))
+    far = made.placed(
+        shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2)
+    )
+    right = made.rating_oracle(truths, shape, 0.6)
+    wrong = made.rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
+    rating = made.Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
+    model = made.oracle_model(shape, truths)
+    still = made.Oracle(7, lambda x: np.zeros((len(x), 7)))
     model.boosters.update(dict.fromkeys(STEPS, still), pose_coarse=rating, pose_fine=rating)
-    model.boosters["position"] = position_oracle([*truths[:2], far, truths[3]])
+    model.boosters["position"] = made.position_oracle([*truths[:2], far, truths[3]])
     alone = search_poses(FRAMES[2], model.boosters, 1)[0]
     assert np.linalg.norm(alone.centre - far.pose.centre) < 6
     found = tracking._trajectory(FRAMES, TIMES, model)
@@ -170,7 +162,7 @@ def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, tru
 
 
 def test_hypotheses_that_are_about_the_same_count_once():
-    base = poses(1, 3)
+    base = made.poses(1, 3)
     by = np.zeros((5, 7))
     by[1, 0], by[2, 3], by[3, 5], by[4, 1] = 1.0, 0.05, 1.0, 12.0
     some = base.repeated(5).moved(by)
