@@ -1,6 +1,5 @@
 """Measures of a closing valve, against the same quantities computed by hand."""
 
-
 import numpy as np
 import pytest
 
