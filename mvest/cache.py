@@ -12,14 +12,16 @@ from __future__ import annotations
 import functools
 import hashlib
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
-from mvest.errors import cannot_write
+import numpy as np
+
+from mvest.errors import InputError, cannot_write
 from mvest.files import remove_parts, sha256_of, write_atomically
 
 T = TypeVar("T")
@@ -172,3 +174,40 @@ def source_key(*made_by: Any) -> str:
     packages = sorted({"mvest", *(str(name).partition(".")[0] for name in names)})
     folders = (Path(str(sys.modules[package].__file__)).parent for package in packages)
     return hashlib.sha256(" ".join(map(code_digest, folders)).encode()).hexdigest()
+
+
+def content_digest(*values: Any) -> str:
+    """SHA-256 of the content of arrays, dataclasses, mappings, sequences, numbers and texts.
+
+    Raises
+    ------
+    InputError
+        If something is none of these.
+    """
+    digest = hashlib.sha256()
+    for value in values:
+        _feed(digest, value)
+    return digest.hexdigest()
+
+
+def _feed(digest: hashlib._Hash, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(f"array {value.dtype.str} {value.shape} ".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__}(".encode())
+        for each in fields(value):
+            digest.update(f"{each.name}=".encode())
+            _feed(digest, getattr(value, each.name))
+        digest.update(b")")
+    elif isinstance(value, Mapping):
+        _feed(digest, sorted(value.items()))
+    elif isinstance(value, tuple | list):
+        digest.update(f"sequence {len(value)} ".encode())
+        for item in value:
+            _feed(digest, item)
+    elif value is None or isinstance(value, str | bool | int | float | np.generic):
+        plain = value.item() if isinstance(value, np.generic) else value
+        digest.update(f"{plain!r};".encode())
+    else:
+        raise InputError(f"no digest of a {type(value).__name__}")

@@ -7,11 +7,12 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from filelock import FileLock
 
 from experiments.common.building import closure
-from mvest.cache import Entry, code_digest, get_or_make, source_key
+from mvest.cache import Entry, code_digest, content_digest, get_or_make, source_key
 from mvest.errors import InputError, MeshingError
 from mvest.simulation.population import draw_population
 
@@ -298,3 +299,15 @@ def test_a_key_covers_mvest_and_the_package_of_the_maker():
     assert source_key(draw_population) == source_key()
     assert source_key(closure.closure_model) == source_key(closure, draw_population)
     assert source_key(closure) != source_key()
+
+
+def test_a_digest_tells_values_apart_and_nothing_else():
+    a = np.arange(6.0)
+    values = [a, a.reshape(2, 3), a.astype(np.float32), list(a), ("ab", ""), ("a", "b")]
+    values += [{"a": 1}, {"a": 1.0}, {"b": 1}, None, True, "True"]
+    assert len({content_digest(v) for v in values}) == len(values)
+    assert content_digest(a) == content_digest(a.copy())
+    assert content_digest({"a": 1, "b": 2}) == content_digest({"b": 2, "a": 1})
+    assert content_digest(np.float64(1.5)) == content_digest(1.5)
+    with pytest.raises(InputError, match="no digest of a function"):
+        content_digest(content_digest)
