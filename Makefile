@@ -76,14 +76,11 @@ bench: $(DEVELOP) ## how fast: kernels, closures, Table 1, other libraries (BENC
 	$(BENCH) --benchmark-timer=time.process_time -k "not batch and ($(BENCH_OF))" \
 		--benchmark-json=outputs/benchmark.json
 	$(BENCH) -k "batch" --benchmark-json=outputs/benchmark_batch.json
-	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "25k and test_factorisation" \
+	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "25k and factorisation" \
 		--benchmark-json=outputs/benchmark_2_threads.json
 	$(BIN)/python -m tests.benchmark.peers outputs/peers.json
-	$(BIN)/python -m tests.benchmark.profile outputs/profile.json
-	$(BIN)/python -m tests.benchmark.startup outputs/startup.json
 	$(BIN)/python -m tests.benchmark.report outputs/benchmark.json outputs/benchmark_batch.json \
-		outputs/benchmark_2_threads.json outputs/peers.json outputs/profile.json \
-		outputs/startup.json
+		outputs/benchmark_2_threads.json outputs/peers.json
 
 lint: $(DEVELOP) ## style and types
 	$(BIN)/ruff check .
