@@ -54,8 +54,8 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.remesh import layered_wedges
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from mvest.valve.mesh.structured import layered_wedges
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -203,11 +203,11 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
         raise ConfigurationError(
             f"parameters = {config['parameters']}, expected one modulus for each leaflet: {unknown}"
         )
-    places, coarse = recording.remeshed(donor.vertices)
+    kept, coarse = recording.remeshed(donor.vertices)
     _, contact = recording.remeshed(donor.contact_vertices)
     layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
     mesh = layered_wedges(coarse.surface, recording.valve.surface, **layers)
-    seen = recording.positions(places.triangle, places.weights, -1)
+    seen = recording.frames[-1][kept]
     return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
 
 
