@@ -40,7 +40,7 @@ def test_modes_are_orthonormal_and_coefficients_undo_shapes(shape):
 
 
 def test_deviations_are_those_of_the_coefficients():
-    # Singular values over the number of vertices, or not over that of shapes, are seen here.
+    # Singular values over the number of vertices, or not over that of shapes, fail here.
     valves = [moving_valve(k, 3) for k in range(5)]
     model = fit_shape_model(valves, 4)
     found = []
