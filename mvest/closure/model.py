@@ -164,7 +164,7 @@ class ClosureModel:
         return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
 
     def damping(self, m: FloatArray) -> Damping:
-        """The damping with parameters ``m (p,)``, of which it may be one."""
+        """The damping with parameters ``m (p,)``; it may be one of them."""
         own = self.settings.damping
         return replace(own, beta=self._values(m).get("damping", own.beta))
 
@@ -197,7 +197,7 @@ class ClosureModel:
         """Forget everything but ``closed``, from which the next closure may be continued.
 
         Later results depend on ``closed`` alone, to the last bit: the sparsity pattern and the
-        order of elimination, which follow the contact so far, begin anew.
+        order of elimination, which depend on contact so far, are reset.
         """
         self._closed = None if closed is None else replace(closed, guide=None)
         if self._system is not None:
@@ -374,8 +374,8 @@ class ClosureModel:
     ) -> Simulation:
         """Equilibrium under constant loads from nodal positions ``start (n, 3)``.
 
-        It is sought at once, or, if that fails or ``damped``, after some steps of time: damping
-        helps leaflets to slide over each other.
+        It is solved at once, or, if that fails or ``damped``, after some time steps: damping helps
+        leaflets to slide over each other.
         """
         assert self._system is not None
         end = self.settings.protocol.end

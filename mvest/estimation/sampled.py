@@ -65,8 +65,7 @@ class SampledErrors:
     ----------
     base : ObservationNoise
         R of n observations.
-    samples : (n, K)
-        In units of the observation.
+    samples : (n, K) in units of the observation
     source : (K,) or None
         Samples with the same number are not independent; K₋ₖ leaves all of them out, and Student's
         distribution has one degree of freedom for each source. None: all are independent.

@@ -126,17 +126,3 @@ def test_frames_converge_with_the_first_order_in_the_time_step():
     assert [one["change"] for one in found] == pytest.approx([*changes, None])
     assert found[0]["order"] == pytest.approx(np.log2(changes[0] / changes[1]))
     assert [one["unevenness"] for one in found] == [1.0] * 3
-
-
-def test_a_time_step_that_cannot_be_followed_is_said(monkeypatch):
-    def frames(self, m):
-        if m[0] < 2:
-            raise InputError("no cycle with the parameters")
-        return np.full((1, 1, 3), m[0])
-
-    monkeypatch.setattr(CycleModel, "frames", frames)
-    path = np.array([[3.0], [2.5], [1.0], [0.5]])
-    found = compare_time_steps(model_of(), (0.05, 0.025), path)
-    assert [one["reason"] for one in found] == ["no cycle with the parameters"] * 2
-    assert [one["unevenness"] for one in found] == [None, None]
-    assert found[0]["change"] == 0.0

@@ -24,9 +24,9 @@ from tests.closure.test_model import (
     SMALL,
     TINY,
     TISSUE,
-    check_closed_derivatives,
-    check_moving_derivatives,
+    continued,
     model_of,
+    step_study,
 )
 
 
@@ -47,6 +47,41 @@ def with_tissue(tissue, protocol, names=STIFF_NAMES, **changes):
     model = model_of(protocol, names, **changes)
     model.settings = replace(model.settings, tissue=tissue)
     return model
+
+
+def check_closed_derivatives(model, at, step=3.2e-3, least=0.1):
+    """Derivatives of the valve closed in contact against equilibria beside it."""
+    simulation = model.close(at).simulation
+    assert simulation.converged
+    assert simulation.records[-1].active_contacts > 100
+    start = simulation.frames[-1]
+    for k, name in enumerate(model.names):
+        exact = simulation.sensitivities[-1][k]
+        assert np.linalg.norm(exact) * at[k] > least, name
+        coarse, fine, best = step_study(
+            exact, lambda m: continued(model, start, m).frames[-1], at, k, step
+        )
+        assert coarse / fine == pytest.approx(16, rel=0.1) or coarse < 1e-6, name
+        assert best < 1e-6, name
+
+
+def check_moving_derivatives(model, at, steps):
+    """Derivatives of a moving valve, in which the history of strain is, against differences."""
+    simulation = model.close(at).simulation
+    assert simulation.converged
+    exact = simulation.sensitivities[-1]
+
+    def run(values):
+        result = model.close(values, sensitivities=False).simulation
+        assert result.converged
+        return result.frames[-1]
+
+    for k, name in enumerate(model.names):
+        assert np.linalg.norm(exact[k]) * at[k] > 1e-3, name
+        coarse, fine, best = step_study(exact[k], run, at, k, steps[k])
+        # Second order, unless the error is round-off already.
+        assert coarse / fine == pytest.approx(16, rel=0.2) or coarse < 1e-5, name
+        assert best < 1e-6, name
 
 
 def test_derivatives_of_a_moving_valve_agree_with_differences_for_each_coefficient():
