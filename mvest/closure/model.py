@@ -291,11 +291,15 @@ class ClosureModel:
                 )
                 if simulation.converged:
                     break
-        if straight and self.guide is not None and unsettled(simulation):
-            guided = self._guided(self.guide, m)
-            if guided is not None:
-                resting = _resting(end, steps[-1].time)
-                simulation = run(resting, initial_positions=guided, initial_time=end)
+        guide = self.guide if straight and unsettled(simulation) else None
+        if guide is not None and self._in_guide is not None:
+            coarse = guide.close(m, sensitivities=False).simulation
+            if coarse.converged:
+                simulation = run(
+                    _resting(end, steps[-1].time),
+                    initial_positions=self._in_guide(coarse.frames[-1]),
+                    initial_time=end,
+                )
         if simulation is None or unsettled(simulation):
             start = None if self.perturbation is None else self.mesh.nodes + self.perturbation
             simulation = run(steps, initial_positions=start)
@@ -313,13 +317,6 @@ class ClosureModel:
             return embed(self.guide.mesh, self.mesh.nodes)
         except GeometryError:
             return None
-
-    def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
-        """The guide's closed state at this mesh's nodes ``(n, 3)``; None without one."""
-        if self._in_guide is None:
-            return None
-        simulation = guide.close(m, sensitivities=False).simulation
-        return self._in_guide(simulation.frames[-1]) if simulation.converged else None
 
     def rests(
         self,

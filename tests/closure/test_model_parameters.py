@@ -17,7 +17,6 @@ from tests.closure.test_model import (
     CLOSING,
     MODULI,
     OPEN,
-    SMALL,
     TINY,
     continued,
     model_of,
