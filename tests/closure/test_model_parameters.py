@@ -17,6 +17,7 @@ from tests.closure.test_model import (
     CLOSING,
     MODULI,
     OPEN,
+    SMALL,
     TINY,
     continued,
     model_of,
