@@ -6,11 +6,11 @@ collision detection (Li et al. 2020, ACM Trans. Graph. 39(4):49; IPC toolkit).
 
 The proof: if an edge of length a meets one of length b, or a point meets a triangle with edges up
 to a, the weighted mean of the squared distances between their ends is at most
-:math:`(a^2 + b^2)/4` or :math:`a^2/3`. So two points are at least that close. Edge lengths are convex along a step, so their
-values at both ends bound them. Listed pairs are tested one by one; pairs that the search left out
-are farther apart than its skin, less the moves since. Neighbours within the sheet are always too
-close for the proof. No time step is accepted if triangles intersect: it is repeated with detection
-throughout.
+:math:`(a^2 + b^2)/4` or :math:`a^2/3`. So two points are at least that close. Edge lengths are
+convex along a step, so their values at both ends bound them. Listed pairs are tested one by one;
+pairs that the search left out are farther apart than its skin, less the moves since. Neighbours
+within the sheet are always too close for the proof. No time step is accepted if triangles
+intersect: it is repeated with detection throughout.
 """
 
 from __future__ import annotations
