@@ -215,9 +215,7 @@ def _outside_change(
         add_forces_at(out, system.hinge.points, force)
     if system.cables is not None:
         cables, factors = system.cables, system.factors
-        pull, stiffness, _, by_length = cables.forces(
-            x, loads.tips, factors.chord_stiffness, factors.chord_rest_length
-        )
+        pull, stiffness, _, by_length = cables.forces(x, loads.tips, *factors.chordae)
         force = np.zeros((len(stiffness), 3))
         if variation.tips is not None:
             force -= np.einsum("cij,cj->ci", stiffness, variation.tips[k][cables.tip])

@@ -131,14 +131,6 @@ class Simulation:
     records: tuple[StepRecord, ...]
     solver: str = ""
 
-    def __str__(self) -> str:
-        n, p = self.frames.shape[1], self.sensitivities.shape[1]
-        return (
-            f"{self.reason.value} at t = {self.times[-1]:.4g} s: {len(self.frames)} frames of "
-            f"{n} nodes, {p} sensitivities; {len(self.records)} steps, {self.iterations} Newton "
-            f"iterations{', solved by ' + self.solver if self.solver else ''}"
-        )
-
     @property
     def converged(self) -> bool:
         """Whether all steps were completed."""

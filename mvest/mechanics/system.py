@@ -74,6 +74,11 @@ class Factors:
     chord_stiffness: float | FloatArray = 1.0
     chord_rest_length: float | FloatArray = 1.0
 
+    @property
+    def chordae(self) -> tuple[float | FloatArray, float | FloatArray]:
+        """Factors on stiffness and rest length."""
+        return self.chord_stiffness, self.chord_rest_length
+
 
 @dataclass(slots=True, eq=False)
 class Evaluation:
@@ -263,19 +268,12 @@ class System:
     ) -> Iterator[tuple[Embedding, FloatArray, FloatArray]]:
         """Points of cables, hinge and ties, with their internal forces N and stiffness N/mm."""
         if self.cables is not None:
-            force, stiffness, *_ = self._cable_forces(self.cables, x, loads)
+            force, stiffness, *_ = self.cables.forces(x, loads.tips, *self.factors.chordae)
             yield self.cables.patches, force, stiffness
         if self.hinge is not None:
             yield self.hinge.points, self.hinge.forces(x, loads.hinge), self.hinge.blocks
         if self.ties is not None and loads.tie_lengths is not None:
             yield self.ties.spans, *self.ties.forces(x, loads.tie_lengths)
-
-    def _cable_forces(
-        self, cables: Cables, x: FloatArray, loads: Loads
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        return cables.forces(
-            x, loads.tips, self.factors.chord_stiffness, self.factors.chord_rest_length
-        )
 
     def matrix(self, blocks: FloatArray, mass_factor: float) -> BlockMatrix:
         """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; held rows are identity.
@@ -316,11 +314,9 @@ class System:
         if parameter.kind == "pressure_scale" and self.pressure is not None:
             add_forces(out, self.pressure.faces, -loads.pressure * self.pressure.forces(x))
         elif parameter.kind in ("chord_stiffness", "chord_rest_length") and self.cables is not None:
-            _, _, by_stiffness, by_length = self._cable_forces(self.cables, x, loads)
-            stiffness = parameter.kind == "chord_stiffness"
-            force = by_stiffness if stiffness else by_length
-            factors = self.factors
-            own = factors.chord_stiffness if stiffness else factors.chord_rest_length
+            which = int(parameter.kind == "chord_rest_length")
+            own = self.factors.chordae[which]
+            force = self.cables.forces(x, loads.tips, *self.factors.chordae)[2 + which]
             # A chord's factor is a product: its derivative by one factor is the product over that.
             share = own * self.cables.members(parameter.part) / parameter.value
             patches = self.cables.patches
