@@ -84,7 +84,7 @@ def read_experiments(folder: Path) -> dict[str, list[Experiment]]:
     found: dict[str, list[Experiment]] = {}
     for name, (data, text) in contents.items():
         many = "-m " if data.get("hydra", {}).get("mode") == "MULTIRUN" else ""
-        command = f"python -m experiments.run {many}{folder.name}={name}"
+        command = f"mvest run {many}{folder.name}={name}"
         made = Experiment(name, inherited(name, "title"), comment_of(text), command)
         found.setdefault(inherited(name, "table") or name, []).append(made)
     return found
