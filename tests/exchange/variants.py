@@ -37,13 +37,19 @@ tests.exchange.variants`.
 
 
 def page() -> str:
-    """The page, a line for all variants of a format with the same number of options."""
+    """The page: a line for all variants of a format with the same number of options.
+
+    Formats with the same options share a line.
+    """
     rows: dict[tuple[str, int], list[Variant]] = {}
     for variant in (*SURFACES, *VOLUMES, *LABELS, *MARKUPS):
         rows.setdefault((variant.format, len(variant.options)), []).append(variant)
+    alike: dict[str, tuple[list[str], int]] = {}
+    for (form, _), variants in rows.items():
+        forms, count = alike.get(_options(variants), ([], 0))
+        alike[_options(variants)] = ([*forms, form], count + len(variants))
     lines = [
-        f"| {form} | {_options(variants)} | {len(variants)} |"
-        for (form, _), variants in rows.items()
+        f"| {', '.join(forms)} | {options} | {count} |" for options, (forms, count) in alike.items()
     ]
     return HEAD + "\n".join(lines) + "\n" + FOOT
 
