@@ -44,6 +44,6 @@ same_scale(panels[0], drawn[::2], ATRIUM)
 same_scale(panels[1], drawn, SIDE)
 
 # %%
-# Above: seen from the atrium, the anterior leaflet on top. Below: from the side, with the chordae from
-# the two papillary tips. The second valve has a wider annulus, the third a longer posterior leaflet,
-# which leaves a smaller orifice.
+# Above: seen from the atrium, the anterior leaflet on top. Below: from the side, with the chordae
+# from the two papillary tips. The second valve has a wider annulus, the third a longer posterior
+# leaflet, which leaves a smaller orifice.

@@ -2,8 +2,8 @@
 A valve closes
 ==============
 
-Pressure rises to 120 mmHg in 0.3 s while the annulus contracts; then the valve comes to rest. In every
-stored step inertia, tissue, chordae and contact are in equilibrium.
+Pressure rises to 120 mmHg in 0.3 s while the annulus contracts; then the valve comes to rest. In
+every stored step inertia, tissue, chordae and contact are in equilibrium.
 """
 
 import matplotlib.pyplot as plt

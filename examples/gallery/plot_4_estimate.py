@@ -41,5 +41,5 @@ axes.legend(frameon=False)
 print(estimate.mean.round(2), "±", estimate.std.round(2), "MPa;", estimate.reason.value)
 
 # %%
-# Observation and estimate use the same mesh, which tests the filter alone. With another mesh for the
-# truth the mesh error dominates, and the standard deviation does not contain it.
+# Observation and estimate use the same mesh, which tests the filter alone. With another mesh for
+# the truth the mesh error dominates, and the standard deviation does not contain it.

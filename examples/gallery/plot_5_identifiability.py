@@ -2,8 +2,8 @@
 Expected information before measuring
 =====================================
 
-The Cramér-Rao bound needs a model and a planned observation, but no data. One closure shows how well
-different plans determine two moduli.
+The Cramér-Rao bound needs a model and a planned observation, but no data. One closure shows how
+well different plans determine two moduli.
 """
 
 import matplotlib.pyplot as plt

@@ -42,5 +42,5 @@ axes.set(xlabel="stretch", ylabel="force (N)", ylim=(-0.1, 2.6))
 axes.legend(frameon=False, title=f"truth: {truth[0]:.3f} N, {truth[1]:.1f}", loc="upper left")
 
 # %%
-# Filters with one step miss the curve; those that relinearise do not. A program in any language can be
-# the model through files: see the page on own models.
+# Filters with one step miss the curve; those that relinearise do not. A program in any language can
+# be the model through files: see the page on own models.

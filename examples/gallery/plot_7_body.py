@@ -40,6 +40,6 @@ axes.set(xlabel="x (mm)", ylabel="z (mm)")
 axes.legend(frameon=False)
 
 # %%
-# Linear tetrahedra lock: they are many times too stiff in bending, however fine the mesh in the plane.
-# The solid-shell is within a few per cent of the converged answer. Leaflets bend as the valve closes,
-# so the element decides whether an estimated modulus is right.
+# Linear tetrahedra lock: they are many times too stiff in bending, however fine the mesh in the
+# plane. The solid-shell is within a few per cent of the converged answer. Leaflets bend as the
+# valve closes, so the element decides whether an estimated modulus is right.

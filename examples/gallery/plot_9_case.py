@@ -32,9 +32,9 @@ same_scale(panels, [frame.vertices for frame in case.frames], ATRIUM)
 
 # %%
 # The closed surface is uneven because of its simulated errors of 0.5 mm. By default
-# ``mvest.personalise(case)`` uses `mvest.default_settings`, which include the errors of geometry and
-# law and take some minutes. Here a coarse mesh without these errors takes seconds, and the intervals
-# are too narrow.
+# ``mvest.personalise(case)`` uses `mvest.default_settings`, which include the errors of geometry
+# and law and take some minutes. Here a coarse mesh without these errors takes seconds, and the
+# intervals are too narrow.
 
 settings = replace(
     mvest.default_settings(case),
