@@ -15,6 +15,7 @@ TEST_PROCESSES ?= 2
 
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+FILES := .venv/.files
 DEVELOP := .venv/.develop
 
 .PHONY: help install reproduce tables test test-all fuzz docs bench lint format dashboard screenshot slurm-check lock clean
@@ -34,11 +35,16 @@ $(INSTALLED): requirements.lock pyproject.toml
 	@$(UV) --no-deps --build-constraint requirements.lock -e .
 	@touch $@
 
-# What only developers need comes when a target asks for it.
-$(DEVELOP): $(INSTALLED)
+# What Table 1 does not need comes when a target asks for it.
+$(FILES): $(INSTALLED)
+	@echo "installing what reads surfaces, label maps and volumes ..."
+	@$(UV) --require-hashes --constraint requirements.lock -r pyproject.toml --extra files
+	@touch $@
+
+$(DEVELOP): $(FILES)
 	@echo "installing what tests, documentation and 3D pictures need ..."
 	@$(UV) --require-hashes --constraint requirements.lock -r pyproject.toml \
-		--extra dev --extra docs --extra viz --extra cluster
+		--extra files --extra dev --extra docs --extra viz --extra cluster
 	@touch $@
 
 install: $(DEVELOP) ## create .venv with all locked packages (every other target installs what it needs)
@@ -70,14 +76,11 @@ bench: $(DEVELOP) ## how fast: kernels, closures, Table 1, other libraries (BENC
 	$(BENCH) --benchmark-timer=time.process_time -k "not batch and ($(BENCH_OF))" \
 		--benchmark-json=outputs/benchmark.json
 	$(BENCH) -k "batch" --benchmark-json=outputs/benchmark_batch.json
-	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "25k and test_factorisation" \
+	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "25k and factorisation" \
 		--benchmark-json=outputs/benchmark_2_threads.json
 	$(BIN)/python -m tests.benchmark.peers outputs/peers.json
-	$(BIN)/python -m tests.benchmark.profile outputs/profile.json
-	$(BIN)/python -m tests.benchmark.startup outputs/startup.json
 	$(BIN)/python -m tests.benchmark.report outputs/benchmark.json outputs/benchmark_batch.json \
-		outputs/benchmark_2_threads.json outputs/peers.json outputs/profile.json \
-		outputs/startup.json
+		outputs/benchmark_2_threads.json outputs/peers.json
 
 lint: $(DEVELOP) ## style and types
 	$(BIN)/ruff check .
@@ -98,7 +101,7 @@ slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tes
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'
 
 lock: $(DEVELOP) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
-	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra docs --extra viz --extra cluster \
+	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra files --extra dev --extra docs --extra viz --extra cluster \
 		--generate-hashes --no-annotate --custom-compile-command "make lock" $(UPGRADE) \
 		--quiet --output-file requirements.lock
 

@@ -1,11 +1,10 @@
-"""Patient-specific mitral leaflet stiffness, estimated from how the valve is seen to move.
+"""Patient-specific stiffness of the mitral leaflets, estimated from their observed motion.
 
-The public names: what a user needs first, each loaded when it is asked for. What they are made of,
-and all the rest, is in the rooms.
+These are the public names, each loaded on first use. All others are in the subpackages.
 
 * A valve: `Template`, `TemplateParameters`, `Valve`; `structured_mesh` fills its leaflets.
 * A closed valve from moduli: `ClosureModel` with `MechanicsSettings`, `TissueSettings` and a
-  `ClosureProtocol`; `run_gate` asks whether it can be trusted.
+  `ClosureProtocol`; `run_gate` tests whether its closed state is unique.
 * Moduli from a closed valve: `simulate_observation`, `estimate` for a `Problem`; a filter
   (`PaperFilter`, `ExtendedFilter`, `IteratedFilter`, `UnscentedFilter`, `EnsembleFilter`,
   `ImportanceFilter`) from a `Gaussian` prior, in coordinates `Identity` or `Log`, for any model
@@ -15,12 +14,11 @@ and all the rest, is in the rooms.
 * Images: `detect_in_volume` with `ImagedSettings` makes a case of a volume; `read_volume` with its
   `Modality`, `detect_valve` with the `default_model`.
 * Mechanics without a valve: `simulate_body`, `TransverselyIsotropic`.
-* `MvestError`, the family of all errors that a user can cause; `units`.
+* `MvestError`, the base class of all errors that a user can cause; `units`.
 
-Data flows one way, and the packages are its stations: `imaging` turns volumes into a `valve`,
-`mechanics` moves the valve under pressure (`closure`), `estimation` finds the parameters whose
-motion is the observed one (`problem`, `personalise`), and `reporting` turns estimates into tables
-and figures.
+Data flow in one direction: `imaging` turns volumes into a `valve`, `mechanics` moves the valve
+under pressure (`closure`), `estimation` finds the parameters of the observed motion (`problem`,
+`personalise`), and `reporting` turns estimates into tables and figures.
 
 Inside the library lengths are mm, times s, masses tonne, forces N and stresses MPa.
 """

@@ -4,8 +4,8 @@ from . import units as units
 from .cases.case import ValveCase as ValveCase
 from .cases.folder import read_case as read_case
 from .cases.folder import write_case as write_case
+from .cases.from_images.detected import ImagedSettings as ImagedSettings
 from .cases.from_images.detected import detect_in_volume as detect_in_volume
-from .cases.from_images.settings import ImagedSettings as ImagedSettings
 from .closure.model import ClosureModel as ClosureModel
 from .closure.robustness import run_gate as run_gate
 from .errors import MvestError as MvestError

@@ -1,4 +1,4 @@
-"""The console command ``mvest``, and ``python -m mvest``: leads to the experiments beside this."""
+"""The console command ``mvest``, and ``python -m mvest``."""
 
 import sys
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 
 def main() -> int:
     """Run the command line; returns the exit status."""
-    # Of all packages called experiments, the one that was installed with this.
+    # Find the package experiments that was installed with this one.
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     from experiments.cli import main as command
 

@@ -1,4 +1,4 @@
-"""Where numba keeps what it has compiled."""
+"""The folder of numba's cache."""
 
 import os
 import stat
@@ -10,11 +10,11 @@ VARIABLE = "NUMBA_CACHE_DIR"
 
 
 def choose_cache() -> None:
-    """Name a folder to numba if it can write to none of those where it looks.
+    """Give numba a cache folder if it can write to none of its own.
 
-    numba looks at `VARIABLE`, beside its caller's code, and in the user's cache, and fails if all
-    are read-only, as in a container. The folder is then one for temporary files that only this
-    user can write to, because numba runs what it finds there.
+    numba tries `VARIABLE`, the folder of the code, and the user's cache, and fails if all are
+    read-only, as in a container. It executes what it finds there, so the replacement is a temporary
+    folder that only this user can write to.
     """
     cache = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
     given = os.environ.get(VARIABLE) or os.devnull
@@ -25,14 +25,14 @@ def choose_cache() -> None:
 
 
 def _writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, which need not exist yet."""
+    """Whether files can be created in a folder, which need not exist yet."""
     while not folder.exists():
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
 
 def _private_folder() -> Path:
-    import tempfile  # which takes longer than all else here, and is seldom needed
+    import tempfile  # slow to import, and seldom needed
 
     folder = Path(tempfile.gettempdir()) / f"mvest-numba-{os.getuid()}"
     with suppress(FileExistsError):

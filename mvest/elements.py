@@ -11,11 +11,10 @@ Conventions
   ``hex27`` in (-1, 0, 1). Wedges repeat the six-node triangle (corners 0, 1, 2, then the middles of
   01, 12, 20) for each ``zeta``. ``tet10`` has corners 0..3, then the middles of 01, 12, 02, 03, 13,
   23 (the order VTK uses for ``tetra10``).
-* ``enhanced`` returns the thickness-strain modes of a solid-shell: with two nodes through the
-  thickness the strain E33 is constant in ``zeta`` while bending makes Poisson's effect linear in it
-  (thickness locking). The enhanced modes ``zeta * p(xi, eta)`` remove that (Buechter, Ramm and
-  Roehl 1994, Int. J. Numer. Meth. Engng 37:2551, enhanced assumed strain of the thickness
-  direction).
+* ``enhanced`` returns the thickness-strain modes of a solid-shell. With two nodes through the
+  thickness the strain E33 is constant in ``zeta``, while bending makes Poisson's effect linear
+  there (thickness locking). The enhanced modes ``zeta * p(xi, eta)`` remove that (Buechter, Ramm
+  and Roehl 1994, Int. J. Numer. Meth. Engng 37:2551).
 """
 
 from __future__ import annotations
@@ -46,18 +45,15 @@ class Element:
     points, weights : ndarray
         Stiffness quadrature, ``(q, 3)`` and ``(q,)``; the weights sum to the reference volume.
     enhanced : callable
-        ``(q, 3) -> (q, n_modes)`` enhanced thickness-strain modes; ``n_modes`` is 0 for elements
-        that need none.
+        ``(q, 3) -> (q, n_modes)`` enhanced thickness-strain modes; ``n_modes`` may be 0.
     node_coordinates : ndarray
         ``(n_nodes, 3)`` reference coordinates of the nodes.
     outside : callable
-        ``(q, 3) -> (q,)`` distance (in reference coordinates) by which a point is outside; <= 0
-        inside.
+        ``(q, 3) -> (q,)`` distance of points outside, in reference coordinates; <= 0 inside.
     inside : callable
-        ``(q, 3) -> (q, 3)`` a point of the element near to each point; the point itself where it
-        is inside.
+        ``(q, 3) -> (q, 3)`` a nearby point of the element; an inner point is returned unchanged.
     face : str
-        Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
+        Name of the face element of the outer faces (the ``zeta`` faces of layered elements).
     centre : ndarray
         ``(1, 3)``.
     top_face : ndarray
@@ -128,7 +124,7 @@ Factors = tuple[FloatArray, ...]
 
 
 def _product(*factors: FloatArray) -> FloatArray:
-    """All products ``(q, k l ...)``, the numbers of the last factor fastest."""
+    """All products ``(q, k l ...)``, with the last factor fastest."""
     out = factors[0]
     for factor in factors[1:]:
         out = (out[:, :, None] * factor[:, None]).reshape(len(out), -1)
@@ -153,7 +149,7 @@ def _no_modes(xi: FloatArray) -> FloatArray:
 
 
 def _simplex(xi: FloatArray) -> FloatArray:
-    """Points ``(q, d)`` with coordinates >= 0 that sum to at most 1, near to any points."""
+    """Nearby points ``(q, d)`` of the unit simplex."""
     positive = np.maximum(xi, 0.0)
     total = positive.sum(axis=1, keepdims=True)
     return np.asarray(positive / np.maximum(total, 1.0))
@@ -180,19 +176,10 @@ def _quad9(x: FloatArray, y: FloatArray) -> tuple[Factors, Factors, Factors]:
 
 @dataclass(frozen=True, slots=True)
 class _Plane:
-    """What a layered element is in its plane; coordinates and points are ``(q, 2)``.
+    """The in-plane part of a layered element (see `Element` and `Face`); points are ``(q, 2)``.
 
-    Attributes
-    ----------
-    evaluate : callable
-        Both coordinates ``(q,)`` -> shape functions and their two derivatives.
-    points, weights, nodes, centre : ndarray
-    modes : callable
-        Polynomials ``(q, m)`` of the enhanced strain.
-    outside, inside : callable
-        As those of :class:`Element`.
-    corners : ndarray
-        As those of :class:`Face`.
+    ``evaluate`` returns the shape functions and their two derivatives, ``modes`` the polynomials
+    ``(q, m)`` of the enhanced strain.
     """
 
     evaluate: Callable[[FloatArray, FloatArray], tuple[Factors, Factors, Factors]]
@@ -300,10 +287,8 @@ def _tetrahedron(name: str, order: int) -> Element:
     if order == 1:
         points, weights, nodes = np.full((1, 3), 0.25), np.array([1 / 6]), corners
     else:
-        a, b = (
-            0.585410196624969,
-            0.138196601125011,
-        )  # degree 2, four points (Hammer and Stroud 1956)
+        # Degree 2, four points (Hammer and Stroud 1956).
+        a, b = 0.585410196624969, 0.138196601125011
         points = np.array([[b, b, b], [a, b, b], [b, a, b], [b, b, a]])
         weights = np.full(4, 1 / 24)
         nodes = np.vstack([corners, 0.5 * (corners[edges[:, 0]] + corners[edges[:, 1]])])
@@ -355,16 +340,7 @@ ELEMENTS: dict[str, Element] = {
 
 
 def element(name: str) -> Element:
-    """The reference element called ``name``.
-
-    Raises
-    ------
-    InputError
-        If there is none; the message lists what there is.
-    """
-    try:
-        return ELEMENTS[name]
-    except KeyError:
-        raise InputError(
-            f"unknown element {name!r}; known elements: {', '.join(ELEMENTS)}"
-        ) from None
+    """The reference element called ``name``; InputError if there is none."""
+    if name not in ELEMENTS:
+        raise InputError(f"unknown element {name!r}; known elements: {', '.join(ELEMENTS)}")
+    return ELEMENTS[name]

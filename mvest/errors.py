@@ -1,7 +1,7 @@
-"""The one family of exceptions that a user of mvest meets.
+"""The exceptions of mvest.
 
-A message says what is wrong, where (file, field, element number), and what would be right. A
-computation that does not converge is no exception: it is a result whose `reason` says so.
+A message names the place (file, field, element number), the value found and the value expected. A
+computation that does not converge raises nothing; the `reason` of its result says so.
 """
 
 import errno
@@ -10,11 +10,11 @@ from pathlib import Path
 
 
 class MvestError(ValueError):
-    """Root of everything that mvest raises on purpose."""
+    """Base class of all errors that mvest raises on purpose."""
 
 
 class InputError(MvestError):
-    """A value, an array or a file is not what it must be."""
+    """A value, an array or a file is invalid."""
 
 
 class GeometryError(InputError):
@@ -34,7 +34,7 @@ class MeshingError(MvestError):
 
 
 def message_of(error: BaseException) -> str:
-    """What an error says: one of a file with its name, one that nobody foresaw with its type."""
+    """The text of an error, with the name of its file, or with its type if it is unexpected."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     text, kind = str(error).strip(), type(error).__name__
@@ -44,16 +44,9 @@ def message_of(error: BaseException) -> str:
 
 
 def require_numbers(owner: object, what: str, *names: str, least: float | None = None) -> None:
-    """Raise InputError where an attribute is no finite number above 0, or of at least ``least``.
+    """Raise an InputError unless all attributes ``names`` are finite and > 0, or >= ``least``.
 
-    Parameters
-    ----------
-    owner : object
-    what : str
-        What the owner is, for the message.
-    names : str
-        Of the attributes.
-    least : float, optional
+    ``what`` describes the owner in the message.
     """
     expected = "> 0" if least is None else f">= {least:g}"
     for name in names:
@@ -63,7 +56,7 @@ def require_numbers(owner: object, what: str, *names: str, least: float | None =
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:
-    """What to raise where a file could not be written."""
+    """The error to raise if a file could not be written."""
     wrong_place = error.errno in (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM)
     hint = "; its folder must exist and be writable" if wrong_place else ""
     return InputError(f"cannot write {path}: {error.strerror or error}{hint}")

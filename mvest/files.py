@@ -1,4 +1,4 @@
-"""Files and folders that appear under their names only once they are whole, and their digests."""
+"""Atomic writing of files and folders, and their digests."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from pathlib import Path
 from mvest.errors import InputError, cannot_write
 
 PREFIX = ".part-"
-"""With which every temporary name begins."""
+"""Beginning of temporary names."""
 
 
 def write_atomically(
     path: Path | str, content: str | bytes | Callable[[Path], object], *, sync: bool = False
 ) -> Path:
-    """Write a file or a folder under a temporary name beside it, which then takes its own.
+    """Write a file or a folder under a temporary name, and then rename it.
 
-    Neither an interruption nor a second process ever leaves or sees half of it. What was there
-    before is replaced.
+    An existing one is replaced. Interruptions leave no partial content, and other processes see
+    none.
 
     Parameters
     ----------
     path : Path or str
         Its folder must exist.
     content : str, bytes or callable
-        Text is written as UTF-8, with a ? (and a note) for what has none; a callable is given the
-        temporary path, which ends as ``path`` does, and makes a file or a folder there.
+        Text is written as UTF-8, with a ? (and a note) for characters without UTF-8. A callable
+        gets the temporary path, which ends as ``path`` does, and makes a file or a folder there.
     sync : bool
-        Whether all of it is on the disk, and not merely on its way, before it takes its name.
+        Whether to flush the content to the disk before renaming.
 
     Returns
     -------
@@ -69,13 +69,7 @@ def write_atomically(
 
 
 def require_writable(folder: Path) -> None:
-    """Make a folder if need be, and refuse one that cannot be written before anything is computed.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made or written to.
-    """
+    """Create a folder if necessary; an InputError says that it cannot be created or written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f"{PREFIX}{uuid.uuid4().hex}"
@@ -86,14 +80,9 @@ def require_writable(folder: Path) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 (64 hexadecimal digits) of the bytes of a file, or of all that lies in a folder.
+    """SHA-256 (64 hexadecimal digits) of a file, or of all names and contents in a folder.
 
-    Of a folder names count as well as contents; links are followed.
-
-    Raises
-    ------
-    InputError
-        If something in it cannot be read.
+    Links are followed. If something cannot be read, an InputError names it.
     """
     try:
         if not path.is_dir():
@@ -109,15 +98,14 @@ def sha256_of(path: Path) -> str:
 def _tree(folder: Path) -> Iterator[Path]:
     for place, inner, names in os.walk(folder, followlinks=True):
         here = Path(place)
-        real = here.resolve()
-        # A link to a folder above it would never end.
-        above = {real, *real.parents}
+        # Skip links to a parent folder, which would never end.
+        above = {here.resolve(), *here.resolve().parents}
         inner[:] = [name for name in inner if (here / name).resolve() not in above]
         yield from (here / name for name in names if (here / name).is_file())
 
 
 SETTLED_NS = 2_000_000_000
-"""Age from which on another change of a file is sure to change its times, on any file system."""
+"""A file of this age changes its times with its next change, on any file system."""
 
 
 def _sha256(file: Path) -> str:
@@ -133,7 +121,7 @@ def _sha256(file: Path) -> str:
 
 @lru_cache(maxsize=4096)
 def _remembered(file: Path, key: tuple[int, ...]) -> str:
-    """A large volume is read once, however often its digest is needed."""
+    """The digest of a large volume is computed once."""
     return _digest(file)
 
 
@@ -143,7 +131,7 @@ def _digest(file: Path) -> str:
 
 
 def _encoded(text: str, target: Path) -> bytes:
-    """UTF-8, with a ? and a note for a character that has none."""
+    """UTF-8, with a ? and a note for characters without it."""
     try:
         return text.encode()
     except UnicodeEncodeError as error:
@@ -153,10 +141,7 @@ def _encoded(text: str, target: Path) -> bytes:
 
 
 def remove_parts(folder: Path, name: str = "") -> None:
-    """Remove what killed processes left of files in ``folder``, or of one ``name``.
-
-    No process may be writing them.
-    """
+    """Remove the temporary files of killed processes in ``folder``, or those of one ``name``."""
     for part in folder.glob(f"{PREFIX}*"):
         if part.name.endswith(f"-{name}" if name else ""):
             _remove(part)

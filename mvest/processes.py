@@ -1,12 +1,10 @@
 """Start child processes that exit when their parent does. All computing processes start here.
 
-A supervisor runs beside each program: this file, run as a script. It holds one end of a socket, the
-lifeline. The system closes the other end when the parent dies, even of a signal that nobody can
-catch. The supervisor then ends the program, and what that one has started, within two seconds. On
-Linux it also ends what has left the program's process group (prctl(2), child subreaper), and the
-program dies with a supervisor that is killed.
-
-Imports only the standard library, so that a supervisor starts in milliseconds.
+A supervisor runs next to each program: this file as a script. It holds one end of a socket, the
+lifeline. The system closes the other end when the parent dies, even if it is killed. The supervisor
+then ends the program and its descendants within two seconds. On Linux it also ends descendants that
+left the program's process group (prctl(2), child subreaper), and the program dies if its supervisor
+is killed. Only the standard library is imported, so a supervisor starts in milliseconds.
 """
 
 from __future__ import annotations
@@ -28,26 +26,21 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[1]
-"""Folder that holds this package, and those that were installed with it."""
+"""Folder of this package and of those that were installed with it."""
 
-GRACE_S = 1.0
-"""Time from asking a program to stop to killing it."""
-
-MAX_WAIT_S = 2.0
-"""Time that killed processes get to be gone."""
-
-POLL_S, WATCH_S = 0.01, 0.5
-"""Time between two looks at killed processes, and at the parent of a pool."""
+GRACE_S, MAX_WAIT_S, POLL_S, WATCH_S = 1.0, 2.0, 0.01, 0.5
+"""From asking a program to stop to killing it; for killed processes to disappear; between two looks
+at killed processes; and between two looks at the parent of a pool."""
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 """Options of prctl(2)."""
 
 
 class Program(AbstractContextManager["Program"]):
-    """A running program, which ends with this process and takes with it all that it has started.
+    """A running program that ends with this process, together with its descendants.
 
-    It leads a session of its own, so that signals of a terminal do not reach it. A context manager
-    ends it on leaving; otherwise it ends when nothing refers to it any more.
+    It leads its own session, so that signals of a terminal do not reach it. A context manager ends
+    it on exit; otherwise it ends when it is no longer referenced.
 
     Parameters
     ----------
@@ -59,8 +52,7 @@ class Program(AbstractContextManager["Program"]):
     Attributes
     ----------
     process : subprocess.Popen
-        The supervisor. Its streams are the program's, and it ends with the program's exit status
-        or signal.
+        The supervisor, with the program's streams and its exit status or signal.
     pid : int
         Number of the program, and of its session and group.
 
@@ -94,14 +86,14 @@ class Program(AbstractContextManager["Program"]):
             raise
 
     def end(self) -> None:
-        """Ask for the program's end, without waiting for it; from any thread."""
+        """Ask the program to end, without waiting for it; from any thread."""
         with suppress(OSError):  # it has ended
             self._lifeline.shutdown(socket.SHUT_WR)
-            # A supervisor that was stopped does not notice.
+            # A stopped supervisor would not notice.
             self.process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
-        """End the program, and wait until it and all that it has started is gone."""
+        """End the program, and wait until it and its descendants have disappeared."""
         self.end()
         self.process.wait()
         self._lifeline.close()
@@ -115,17 +107,17 @@ class Program(AbstractContextManager["Program"]):
 
 
 def python(module: str, *arguments: str) -> list[str]:
-    """Command that runs a module in another Python; start it with an `environment`.
+    """Command that runs a module in another Python, to be started with an `environment`.
 
-    The folder in which it is started is no place to import from: it may be a case of somebody else.
+    It does not import from its working folder, which may be somebody else's case.
     """
     return [sys.executable, "-P", "-m", module, *arguments]
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Environment of another Python: this one's and ``more``; it finds the packages found here.
+    """The environment of another Python: the present one and ``more``, with the same packages.
 
-    Entries of ``PYTHONPATH`` that are empty or relative mean the working folder, and are left out.
+    Empty and relative entries of ``PYTHONPATH`` mean the working folder and are left out.
     """
     places = [str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     path = os.pathsep.join(dict.fromkeys(filter(os.path.isabs, places)))
@@ -139,7 +131,7 @@ def run(
     timeout: float | None = None,
     **options: Any,
 ) -> subprocess.CompletedProcess[Any]:
-    """Run a program to its end, as `subprocess.run` does; it ends with this process at the latest.
+    """Run a program as `subprocess.run` does; it never outlives this process.
 
     Parameters
     ----------
@@ -147,7 +139,7 @@ def run(
     input : str, optional
         For its standard input.
     timeout : float, optional
-        s, after which it is ended.
+        s; the program is ended after this time.
     **options
         Of `subprocess.Popen`.
 
@@ -166,7 +158,7 @@ def run(
 
 
 def ending(code: int) -> str:
-    """How a process ended, in words; a negative exit status is the signal that killed it."""
+    """How a process ended; a negative exit status is the number of the signal that killed it."""
     if code >= 0:
         return f"exit status {code}"
     name = {int(known): known.name for known in signal.Signals}.get(-code, "unknown")
@@ -177,22 +169,22 @@ def ending(code: int) -> str:
 def side_by_side(
     function: Callable[..., T], calls: Iterable[tuple[Any, ...]], processes: int
 ) -> Iterator[T]:
-    """What a function returns for many arguments, in their order, from processes of one thread.
+    """Results of a function for many arguments, in order, from processes with one thread each.
 
     Parameters
     ----------
     function : callable
-        Of a module, so that another process can import it.
+        Importable by another process.
     calls : iterable of tuple
-        Arguments of each call; taken as they are needed.
+        Arguments of each call, consumed when needed.
     processes : int
-        1 computes here, without further processes.
+        1 computes in this process.
     """
     if processes == 1:
         return (function(*arguments) for arguments in calls)
-    import joblib  # and with it asyncio, which one process needs not wait for
+    import joblib  # slow to import
 
-    # joblib starts processes now and later, without -P.
+    # joblib starts its processes without -P.
     os.environ.update(environment(PYTHONSAFEPATH="1"))
     with joblib.parallel_config(
         backend="loky", inner_max_num_threads=1, initializer=_watch, initargs=(os.getpid(),)
@@ -202,10 +194,10 @@ def side_by_side(
 
 
 def _watch(parent: int) -> None:
-    """End this process once its parent has ended.
+    """End this process when its parent has ended.
 
-    The system's own signal for that is none to use here: it comes when the thread ends that started
-    this process, and a pool's processes are started by any thread.
+    PR_SET_PDEATHSIG is no alternative: it acts when the starting thread ends, and any thread may
+    start the processes of a pool.
     """
 
     def look() -> None:
@@ -217,14 +209,14 @@ def _watch(parent: int) -> None:
 
 
 def _supervise(lifeline: int, command: list[str]) -> None:
-    """Run a program to its end or that of the lifeline; end with its exit status or signal."""
+    """Run a program until it or the lifeline ends; end with its exit status or signal."""
     supervisor = os.getpid()
     os.set_inheritable(lifeline, False)
     _prctl(PR_SET_CHILD_SUBREAPER, 1)
 
     def end_with_supervisor() -> None:
         _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != supervisor:  # it died before
+        if os.getppid() != supervisor:  # it has died already
             os._exit(1)
 
     try:
@@ -237,7 +229,7 @@ def _supervise(lifeline: int, command: list[str]) -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nothing, stream)
-    # A signal to the supervisor is meant for the program.
+    # Pass signals on to the program.
     for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(which, lambda number, _: _signal(-program.pid, number))
 
@@ -260,10 +252,12 @@ def _supervise(lifeline: int, command: list[str]) -> None:
 
 def _kill_descendants(group: int) -> None:
     """Kill a program's group and the orphans that this process has adopted."""
-    until = time.monotonic() + MAX_WAIT_S
-    children = [0]
+    until, children = time.monotonic() + MAX_WAIT_S, [group]
     while children and time.monotonic() < until:
-        children = _children()
+        children = []
+        with suppress(OSError):  # only Linux lists them
+            listed = Path(f"/proc/self/task/{os.getpid()}/children").read_text()
+            children = [int(number) for number in listed.split()]
         for target in (-group, *children):
             _signal(target, signal.SIGKILL)
         with suppress(ChildProcessError):
@@ -272,21 +266,14 @@ def _kill_descendants(group: int) -> None:
         time.sleep(POLL_S if children else 0)
 
 
-def _children() -> list[int]:
-    """Processes whose parent this is, where the system lists them."""
-    with suppress(OSError):
-        return [int(n) for n in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()]
-    return []
-
-
 def _prctl(option: int, value: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 
 def _signal(target: int, which: int) -> None:
-    """Signal a process, or the group that a negative number names, if it exists."""
-    # macOS refuses if all of a group has ended and waits to be collected.
+    """Signal a process, or the group of a negative number, if it exists."""
+    # macOS refuses if the whole group has ended but was not waited for.
     with suppress(ProcessLookupError, PermissionError):
         os.kill(target, which)
 

@@ -1,7 +1,4 @@
-"""Where a result came from: commit, configuration, package versions, threads and machine.
-
-Everything here is plain dictionaries of strings, numbers and None, ready for JSON.
-"""
+"""Origin of a result as plain data: commit, configuration, versions, threads and machine."""
 
 import hashlib
 import importlib.metadata
@@ -11,6 +8,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,48 +16,30 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 
 KEY_PACKAGES = (
-    "mvest",
-    "numpy",
-    "scipy",
-    "numba",
-    "pypardiso",
-    "ipctk",
-    "pytetwild",
-    "vtk",
-    "trimesh",
-    "SimpleITK",
-    "nibabel",
-    "pynrrd",
-    "pydicom",
-    "lightgbm",
-    "hydra-core",
-    "mlflow",
-)
-"""Packages whose version can change a number or how it was recorded."""
+    "mvest", "numpy", "scipy", "numba", "pypardiso", "ipctk", "pytetwild", "vtk", "trimesh",
+    "SimpleITK", "nibabel", "pynrrd", "pydicom", "lightgbm", "hydra-core", "mlflow",
+)  # fmt: skip
+"""Packages whose version can change a number or its record."""
 
 THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-)
-"""Environment variables that cap the threads of the numerical libraries."""
+    "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS",
+)  # fmt: skip
+"""Environment variables that limit the threads of the numerical libraries."""
 
 
 def provenance(directory: Path | None = None) -> dict[str, Any]:
-    """Describe the code and the machine that are about to compute something.
+    """Describe the code and the machine of a computation.
 
     Parameters
     ----------
     directory : Path, optional
-        A folder of the checkout; the one that holds this file if not given.
+        A folder of the checkout; by default that of this file.
 
     Returns
     -------
     dict
-        ``git`` (see `git_state`), ``versions`` (package name to version, None where not
-        installed), ``threads`` (environment variable to value, None where unset), ``python``,
-        ``platform``, ``machine`` and ``cpu_count``.
+        ``git`` (see `git_state`), ``versions`` of packages and ``threads`` by environment variable
+        (None if not installed or unset), ``python``, ``platform``, ``machine`` and ``cpu_count``.
     """
     return {
         "git": git_state(directory or Path(__file__).resolve().parent),
@@ -73,20 +53,20 @@ def provenance(directory: Path | None = None) -> dict[str, Any]:
 
 
 def git_state(directory: Path) -> dict[str, Any]:
-    """Commit checked out in a folder, and whether its tracked files differ from it.
+    """The commit of a folder, and whether its tracked files differ from it.
 
     Returns
     -------
     dict
         ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside ``results/``
-        was changed). Both are None outside a checkout, in a folder of which it tracks nothing,
-        before the first commit, or without git.
+        was changed). Both are None without git, without a commit, or without tracked files in the
+        folder.
     """
     sha = _git(directory, "rev-parse", "--verify", "HEAD")
-    # Packages that are installed within somebody's checkout are no part of it.
+    # An installation within somebody's checkout does not belong to it.
     if sha is None or not _git(directory, "ls-files"):
         return {"sha": None, "dirty": None}
-    # What runs write to results/ is no part of what they ran.
+    # Runs write to results/.
     places = (":(top)", ":(top,exclude)results")
     changes = _git(directory, "status", "--porcelain", "--untracked-files=no", "--", *places)
     return {"sha": sha, "dirty": None if changes is None else bool(changes)}
@@ -94,31 +74,23 @@ def git_state(directory: Path) -> dict[str, Any]:
 
 def _git(directory: Path, *arguments: str) -> str | None:
     command = ["git", "-C", str(directory), *arguments]
-    try:
-        return subprocess.run(
-            command, capture_output=True, text=True, check=True, timeout=30
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
+    with suppress(OSError, subprocess.SubprocessError):
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
+        return done.stdout.strip()
+    return None
 
 
 def _version(name: str) -> str | None:
-    try:
+    with suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    return None
 
 
 def canonical_json(value: Any) -> str:
-    """The same text for equal data, whatever the order of its keys: JSON with sorted keys, ASCII.
+    """ASCII JSON with sorted keys; equal data give equal texts, but 1 and 1.0 do not.
 
-    Tuples, NumPy arrays and NumPy scalars are written as their plain counterparts, paths as text.
-    1 and 1.0 give different texts, as in JSON.
-
-    Raises
-    ------
-    InputError
-        Something in it has no JSON form, NaN and infinities included.
+    Tuples and NumPy values are written as plain data, and paths as text. A value without a JSON
+    form, such as NaN, is an InputError.
     """
     plain = _plain(value, "value")
     return json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -130,50 +102,38 @@ def config_hash(config: Mapping[str, Any]) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write data as JSON, whole or not at all; keys keep their order, otherwise `canonical_json`.
+    """Write data as JSON, atomically; keys keep their order.
 
     Raises
     ------
     InputError
-        The data has no JSON form, or the file cannot be written.
+        The data have no JSON form, or the file cannot be written.
     """
     text = json.dumps(_plain(value, "value"), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     write_atomically(path, text, sync=True)
 
 
 def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data with a digest of their content, which `require_sealed` checks on reading.
-
-    Raises
-    ------
-    InputError
-        The data has no JSON form.
-    """
+    """Plain data with a digest of their content for `require_sealed`, or an InputError."""
     plain = _plain(value, "value")
     return {"sha256": _sealing(plain), **{k: v for k, v in plain.items() if k != "sha256"}}
 
 
 def require_sealed(data: Mapping[str, Any], where: str) -> None:
-    """Check that data are those that were written; ``where`` names them in an error.
-
-    Raises
-    ------
-    InputError
-        Their digest is missing or does not match.
-    """
+    """Raise an InputError that names ``where`` if the digest of `sealed` data does not match."""
     if data.get("sha256") != _sealing(data):
         raise InputError(f"{where}: its content is not what was written (SHA-256 does not match)")
 
 
 def _sealing(data: Mapping[str, Any]) -> str:
-    """Digest of plain data as they are written: with a ? for what has no UTF-8."""
+    """Digest of plain data as written, with a ? for characters without UTF-8."""
     content = {key: value for key, value in data.items() if key != "sha256"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode(errors="replace")).hexdigest()
 
 
 def _plain(value: Any, where: str) -> Any:
-    # Not at the top: `experiments` caps the threads of numerical libraries before they are loaded.
+    # Imported here, since `experiments` limits the threads of numerical libraries first.
     import numpy as np
 
     if isinstance(value, np.generic | np.ndarray):

@@ -1,7 +1,7 @@
-"""Types of settings: each is a number with its unit and its admissible range.
+"""Types of settings: numbers with a unit and an admissible range.
 
-A setting states its range where it is declared, by its type: ``length: Length = 20.0``. pydantic
-and `experiments.common.schema` read it there; to everything else the type is a float or an int.
+A setting declares its range by its type, such as ``length: Length = 20.0``. pydantic and
+`experiments.common.schema` check it; everything else sees a float or an int.
 """
 
 from __future__ import annotations
@@ -20,14 +20,7 @@ class OutsideError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """The range of a type of settings: pydantic checks what is annotated by it.
-
-    Attributes
-    ----------
-    low, high : float
-        Both ends are admissible.
-    unit, why : str
-    """
+    """A range, with both ends admissible, that pydantic checks if it annotates a type."""
 
     low: float
     high: float
@@ -35,13 +28,7 @@ class Within:
     why: str
 
     def check(self, value: Any, name: str = "") -> Any:
-        """A number, nested lists of them, or None, all of them inside.
-
-        Raises
-        ------
-        OutsideError
-            With the number, which is called ``name``, and the range.
-        """
+        """The value, if it is None or all numbers in it are inside; else an OutsideError."""
         for part in value if isinstance(value, list | tuple) else ():
             self.check(part, name)
         if isinstance(value, int | float) and not self.low <= value <= self.high:
@@ -51,7 +38,7 @@ class Within:
         return value
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        """What pydantic asks for."""
+        """The hook of pydantic."""
         return AfterValidator(self.check).__get_pydantic_core_schema__(source, handler)
 
 

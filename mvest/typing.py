@@ -1,4 +1,4 @@
-"""Names for the array types in signatures; shapes and units stand in each docstring."""
+"""Array types of signatures; docstrings state shapes and units."""
 
 from typing import TypeAlias
 

@@ -1,8 +1,8 @@
-"""Conversions at the boundary between what people write and what the library computes with.
+"""Conversions between the units of users and of the library.
 
-Inside mvest lengths are mm, times s, masses tonne, forces N, stresses and pressures MPa. The set is
-consistent: 1 N = 1 t mm/s² and 1 MPa = 1 N/mm². Every conversion is a factor, so it takes a float
-or an array of any shape and returns the same.
+Inside mvest lengths are mm, times s, masses tonne, forces N, stresses and pressures MPa. These are
+consistent: 1 N = 1 t mm/s² and 1 MPa = 1 N/mm². A conversion takes a float or an array and returns
+the same.
 
 Sources: the conventional millimetre of mercury is 13.5951 g/cm³ × 9.80665 m/s² × 1 mm, which is
 133.322387415 Pa exactly (NIST SP 811, 2008, appendix B.8, gives 133.3224). Every other factor

@@ -1,4 +1,4 @@
-"""Entries of a store: made once, whole, in the order in which they are asked for."""
+"""Entries of a cache: made once, complete, and made again if they are damaged."""
 
 import json
 import subprocess
@@ -7,11 +7,11 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
-from filelock import FileLock
 
 from experiments.common.building import closure
-from mvest.cache import Entry, code_digest, get_or_make, source_key
+from mvest.cache import Entry, code_digest, content_digest, get_or_make, source_key
 from mvest.errors import InputError, MeshingError
 from mvest.simulation.population import draw_population
 
@@ -41,20 +41,15 @@ def made(value):
 
 
 @pytest.mark.parametrize("how", [write, write_folder])
-def test_what_is_kept_is_not_made_again(tmp_path, how):
+def test_a_cached_value_is_made_once_and_always_read_back(tmp_path, how):
     make = made("a")
     for _ in range(3):
-        entry = Entry(tmp_path / "below" / "entry", read)
-        assert entry.get_or_make(make, how) == "a"
+        assert Entry(tmp_path / "below" / "entry", read).get_or_make(make, how) == "a"
     assert make.calls == 1
+    assert Entry(tmp_path / "other", read).get_or_make(made((1, 2)), write) == [1, 2]
 
 
-def test_who_makes_it_is_given_what_others_will_read(tmp_path):
-    entry = Entry(tmp_path / "entry", read)
-    assert entry.get_or_make(made((1, 2)), write) == [1, 2]
-
-
-def test_what_is_not_to_be_kept_is_made_again(tmp_path):
+def test_a_value_that_is_not_to_be_cached_is_made_again(tmp_path):
     make, entry = made("a"), Entry(tmp_path / "entry", read)
     for _ in range(2):
         assert entry.get_or_make(make, write, lambda value: value != "a") == "a"
@@ -62,23 +57,9 @@ def test_what_is_not_to_be_kept_is_made_again(tmp_path):
     assert entry.found() is None
 
 
-@pytest.mark.parametrize("how", [write, write_folder])
-def test_a_damaged_entry_is_made_again_with_a_note(tmp_path, how, capsys):
-    make, entry = made("a"), Entry(tmp_path / "entry", read)
-    entry.get_or_make(make, how)
+def unreadable(entry):
     inner = entry.path / "text" if entry.path.is_dir() else entry.path
     inner.write_bytes(b"\xff")
-    assert entry.found() is None
-    assert capsys.readouterr().err == ""
-    assert entry.get_or_make(make, how) == "a"
-    assert make.calls == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line == f"note: {entry.path} is damaged and is made again"
-    if how is write_folder:
-        inner.unlink()
-        (entry.path / "rest").touch()
-        entry.get_or_make(make, how)
-        assert [path.name for path in entry.path.iterdir()] == ["text"]
 
 
 def other_numbers(entry):
@@ -103,13 +84,15 @@ def one_more_file(entry):
 @pytest.mark.parametrize(
     ("how", "harm"),
     [
+        (write, unreadable),
+        (write_folder, unreadable),
         (write, other_numbers),
         (write, no_digest),
         (write, taken_from_another),
         (write_folder, one_more_file),
     ],
 )
-def test_a_readable_entry_that_was_not_written_as_it_is_is_made_again(tmp_path, how, harm, capsys):
+def test_an_entry_that_is_not_as_it_was_written_is_made_again(tmp_path, how, harm, capsys):
     make, entry = made("a"), Entry(tmp_path / "entry", read)
     entry.get_or_make(make, how)
     harm(entry)
@@ -121,7 +104,7 @@ def test_a_readable_entry_that_was_not_written_as_it_is_is_made_again(tmp_path, 
     assert entry.found() == "a"
 
 
-def test_what_would_not_be_the_same_again_is_refused(tmp_path):
+def test_a_damaged_entry_that_cannot_be_reproduced_is_refused(tmp_path):
     def refuse(path):
         raise MeshingError(f"{path} is damaged")
 
@@ -171,12 +154,8 @@ def test_of_several_entries_the_missing_ones_are_made_together_and_each_kept_as_
     assert asked == [[0, 2, 3]]
     # With nothing to make, nothing is asked.
     get_or_make(entries, lambda missing: pytest.fail("asked"), write)
-
-
-def test_too_few_values_are_no_silent_loss(tmp_path):
-    entries = [Entry(tmp_path / str(k), read) for k in range(2)]
     with pytest.raises(ValueError, match="shorter"):
-        get_or_make(entries, lambda _: [1], write)
+        get_or_make([Entry(tmp_path / name, read) for name in "ab"], lambda _: [1], write)
 
 
 def test_of_several_that_need_the_same_entries_one_makes_them_and_no_two_wait_for_each_other(
@@ -244,18 +223,6 @@ def test_after_a_process_was_killed_while_it_wrote_one_of_those_that_wait_makes_
     }  # fmt: skip
 
 
-def test_locks_are_taken_in_one_order_whatever_the_order_of_the_entries(tmp_path, monkeypatch):
-    taken = []
-
-    def lock(path):
-        taken.append(path.name)
-        return FileLock(path)
-
-    monkeypatch.setattr("filelock.FileLock", lock)
-    get_or_make([Entry(tmp_path / name, read) for name in "bca"], lambda numbers: numbers, write)
-    assert taken == [".a.lock", ".b.lock", ".c.lock"]
-
-
 def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"^cannot write .*entry: "):
@@ -265,36 +232,37 @@ def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):
 # -- keys of code ---------------------------------------------------------------------------------
 
 
-def edited(place):
-    place.write_text("SCALE = 3.0")
-
-
-def renamed(place):
-    place.rename(place.with_name("other.py"))
-
-
-def another(place):
-    place.with_name("another.py").touch()
-
-
-def data(place):
-    place.with_name("table.csv").touch()
-
-
-@pytest.mark.parametrize("change", [edited, renamed, another, data])
+@pytest.mark.parametrize("change", ["edit", "rename", "add", "data"])
 def test_every_change_of_code_changes_its_digest(tmp_path, change):
-    place = tmp_path / "package" / "room" / "units.py"
-    place.parent.mkdir(parents=True)
+    place = tmp_path / "package" / "units.py"
+    place.parent.mkdir()
     place.write_text("SCALE = 2.0")
     before = code_digest(tmp_path)
-    change(place)
-    # A process has the code with which it began.
+    {
+        "edit": lambda: place.write_text("SCALE = 3.0"),
+        "rename": lambda: place.rename(place.with_name("other.py")),
+        "add": lambda: place.with_name("another.py").touch(),
+        "data": lambda: place.with_name("table.csv").touch(),
+    }[change]()
+    # A process keeps the code that it has loaded.
     assert code_digest(tmp_path) == before
     code_digest.cache_clear()
-    assert (code_digest(tmp_path) == before) is (change is data)
+    assert (code_digest(tmp_path) == before) is (change == "data")
 
 
 def test_a_key_covers_mvest_and_the_package_of_the_maker():
     assert source_key(draw_population) == source_key()
     assert source_key(closure.closure_model) == source_key(closure, draw_population)
     assert source_key(closure) != source_key()
+
+
+def test_a_digest_tells_values_apart_and_nothing_else():
+    a = np.arange(6.0)
+    values = [a, a.reshape(2, 3), a.astype(np.float32), list(a), ("ab", ""), ("a", "b")]
+    values += [{"a": 1}, {"a": 1.0}, {"b": 1}, None, True, "True"]
+    assert len({content_digest(v) for v in values}) == len(values)
+    assert content_digest(a) == content_digest(a.copy())
+    assert content_digest({"a": 1, "b": 2}) == content_digest({"b": 2, "a": 1})
+    assert content_digest(np.float64(1.5)) == content_digest(1.5)
+    with pytest.raises(InputError, match="no digest of a function"):
+        content_digest(content_digest)

@@ -25,20 +25,15 @@ def test_text_bytes_and_what_a_function_writes_take_the_name(tmp_path, content, 
     assert path.stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
-def test_a_function_is_given_a_hidden_name_with_the_same_ending_beside_the_file(tmp_path):
-    given = []
-    write_atomically(tmp_path / "a.seq.nrrd", lambda part: (given.append(part), part.touch()))
-    assert given[0].parent == tmp_path
-    assert given[0].name.startswith(".part-")
-    assert given[0].name.endswith("-a.seq.nrrd")
-
-
 def test_a_folder_takes_the_place_of_the_one_before_it(tmp_path):
-    folder = tmp_path / "case"
+    folder = tmp_path / "case.d"
     folder.mkdir()
     (folder / "old").touch()
 
     def fill(part: Path) -> None:
+        # A hidden name with the same ending.
+        assert part.name.startswith(".part-")
+        assert part.name.endswith("-case.d")
         part.mkdir()
         (part / "new").touch()
         assert (folder / "old").exists()
@@ -48,9 +43,8 @@ def test_a_folder_takes_the_place_of_the_one_before_it(tmp_path):
     assert list(tmp_path.iterdir()) == [folder]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_an_interruption_leaves_what_was_there(tmp_path, error, kind):
+def test_an_interruption_leaves_what_was_there(tmp_path, kind):
     path = tmp_path / "result"
     path.write_text("before")
 
@@ -59,9 +53,9 @@ def test_an_interruption_leaves_what_was_there(tmp_path, error, kind):
             part.mkdir()
             part = part / "one"
         part.write_text("half")
-        raise error
+        raise KeyboardInterrupt
 
-    with pytest.raises(error):
+    with pytest.raises(KeyboardInterrupt):
         write_atomically(path, fill)
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
@@ -82,10 +76,6 @@ def test_a_file_is_on_the_disk_before_it_takes_its_name_where_that_is_asked_for(
 def test_what_cannot_be_written_is_one_line_of_the_family(tmp_path):
     with pytest.raises(InputError, match=r"^cannot write .*absent.a: No such .*must exist"):
         write_atomically(tmp_path / "absent" / "a", "")
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(InputError, match=r"cannot write .*taken"):
-        write_atomically(tmp_path / "taken", "")
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
 def test_leftovers_are_taken_away_and_nothing_else(tmp_path):
@@ -101,29 +91,20 @@ def test_leftovers_are_taken_away_and_nothing_else(tmp_path):
     remove_parts(tmp_path / "absent")
 
 
-def test_a_digest_is_that_of_the_bytes_and_follows_every_change(tmp_path):
-    file = tmp_path / "volume.nrrd"
-    file.write_bytes(b"abc")
-    # NIST's example for SHA-256.
-    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert sha256_of(file) == known
-    about = file.stat()
-    file.write_bytes(b"abd")
-    os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
-    assert sha256_of(file) != known
-
-
 def test_an_old_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
     file, reads = tmp_path / "volume.nrrd", []
     file.write_bytes(b"abc")
     true = mvest.files._digest
     monkeypatch.setattr(mvest.files, "_digest", lambda path: (reads.append(path), true(path))[1])
     monkeypatch.setattr(mvest.files, "SETTLED_NS", 0)
-    first = sha256_of(file)
-    assert sha256_of(file) == first
+    # NIST's example for SHA-256.
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert sha256_of(file) == sha256_of(file) == known
     assert len(reads) == 1
-    file.write_bytes(b"abcd")
-    assert sha256_of(file) != first
+    about = file.stat()
+    file.write_bytes(b"abd")
+    os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert sha256_of(file) != known
     monkeypatch.setattr(mvest.files, "SETTLED_NS", 10**12)
     reads.clear()
     assert sha256_of(file) == sha256_of(file)

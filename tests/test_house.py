@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -184,9 +184,10 @@ def within(name: str, module: str) -> bool:
     return name == module or name.startswith(module + ".")
 
 
-def imports(source: str, module: str, is_package: bool = False) -> Iterator[Import]:
+@cache
+def imports(source: str, module: str, is_package: bool = False) -> list[Import]:
     """Every absolute dotted name that a module's source imports, wherever it does so."""
-    tree = ast.parse(source)
+    tree, found = ast.parse(source), []
     deferred: set[ast.AST] = set()
     for node in ast.walk(tree):
         is_guard = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
@@ -209,8 +210,8 @@ def imports(source: str, module: str, is_package: bool = False) -> Iterator[Impo
                 args=[ast.Constant(value=str(name)), *_],
             ):
                 names = [name]
-        for name in names:
-            yield Import(node.lineno, name, node not in deferred)
+        found += [Import(node.lineno, name, node not in deferred) for name in names]
+    return found
 
 
 def runner_level(module: str) -> int:
@@ -276,88 +277,43 @@ def test_conf_is_data() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "source"),
+    ("module", "source", "count"),
     [
         # Siblings do not cross, however the import is written.
-        ("mvest.valve.anatomy.template", "import mvest.mechanics.law.biot"),
-        ("mvest.valve.anatomy.template", "from mvest import imaging"),
-        ("mvest.valve.anatomy.template", "from ...estimation import gaussian"),
-        ("mvest.mechanics.law.biot", "from mvest.estimation.gaussian import Gaussian"),
-        ("mvest.mechanics.law.biot", "def f():\n    import mvest.imaging"),
-        ("mvest.imaging.tracking", "from mvest.mechanics import static"),
-        ("mvest.estimation.ekf", "from mvest.valve.anatomy.valve import Valve"),
-        ("mvest.estimation.ekf", "import importlib\nimportlib.import_module('mvest.mechanics')"),
-        # Of the valve, mechanics and imaging know the value objects only.
-        ("mvest.mechanics.law.biot", "from mvest.valve.anatomy.template import make_template"),
-        ("mvest.imaging.tracking", "from mvest.valve.measure.coaptation import orifice_area"),
-        # Leaves import nothing but each other.
-        ("mvest.errors", "from mvest.provenance import git_state"),
-        ("mvest.elements", "from mvest.mechanics import assembly"),
-        ("mvest.units", "from .valve import anatomy"),
-        # Joints: the model knows no images and no study, reporting knows no physics.
-        ("mvest.closure.model", "from mvest.imaging import tracking"),
-        ("mvest.closure.model", "import mvest.problem.estimate"),
-        ("mvest.valve.anatomy.template", "import mvest.closure.model"),
-        ("mvest.mechanics.law.biot", "from mvest.problem.estimate import Problem"),
-        ("mvest.reporting.figures", "from mvest.mechanics import law"),
-        ("mvest.reporting.figures", "if TYPE_CHECKING:\n    import mvest.mechanics"),
-        # The library knows nothing of how it is run.
-        ("mvest.problem.estimate", "import hydra"),
-        ("mvest.problem.estimate", "from omegaconf import OmegaConf"),
-        ("mvest.reporting.figures", "def f():\n    import mlflow.tracking"),
-        ("mvest.problem.estimate", "from experiments.run import main"),
-        ("mvest.problem.estimate", "import tests.test_house"),
-        ("experiments.run", "from tests.valve import shapes"),
+        ("mvest.valve.anatomy.template", "import mvest.mechanics.law.biot", 1),
+        ("mvest.valve.anatomy.template", "from mvest import imaging", 1),
+        ("mvest.valve.anatomy.template", "from ...estimation import gaussian", 1),
+        ("mvest.mechanics.law.biot", "def f():\n    import mvest.imaging", 1),
+        ("mvest.estimation.ekf", "import importlib\nimportlib.import_module('mvest.valve')", 1),
+        ("mvest.reporting.figures", "if TYPE_CHECKING:\n    import mvest.mechanics", 1),
+        ("mvest.valve.anatomy.template", "from . import mesh\nfrom mvest.valve import a", 0),
+        # Mechanics and imaging know the value objects of the valve only, and leaves only leaves.
+        ("mvest.mechanics.law.biot", "from mvest.valve.anatomy.template import make_template", 1),
+        ("mvest.mechanics.law.biot", "from mvest.valve.mesh.solid_mesh import SolidMesh", 0),
+        ("mvest.imaging.tracking", "from ..valve.anatomy.valve import Motion\nimport numpy", 0),
+        ("mvest.errors", "from mvest.provenance import git_state", 1),
+        ("mvest.errors", "from mvest.typing import FloatArray", 0),
+        # The library does not know how it is run. A name that begins alike is another package.
+        ("mvest.problem.estimate", "import hydra", 1),
+        ("mvest.problem.estimate", "from experiments.run import main", 1),
+        ("mvest.problem.estimate", "import hydrate, mlflower, testslide", 0),
+        ("experiments.run", "from tests.valve import shapes", 1),
+        ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.estimate import Problem", 0),
         # A study knows no other, nor what runs or publishes it.
-        ("experiments.studies.a", "from experiments.studies.ab import STUDY"),
-        ("experiments.studies.a", "def f():\n    import experiments.runner.job"),
-        ("experiments.studies.a", "from experiments.results.published import publish"),
-        ("experiments.studies.a", "from experiments import studies"),
-        # What a job is does not depend on how jobs are run or logged.
-        ("experiments.runner.jobs", "from experiments.runner.tracking import store"),
-        ("experiments.runner.job", "def f():\n    import experiments.runner.sweep"),
-        # The package's face imports lazily, nothing here imports the face, and a new station has to
-        # be given its place.
-        ("mvest", "from mvest.errors import MvestError"),
-        ("mvest.problem.estimate", "import mvest"),
-        ("mvest.problem.estimate", "from mvest import Gaussian"),
-        ("mvest.helpers", "import math"),
-    ],
-)  # fmt: skip
-def test_a_wrong_import_is_seen(module: str, source: str) -> None:
-    assert len(import_violations(source, module, is_package=module == "mvest")) == 1
-
-
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        (
-            "mvest.valve.anatomy.template",
-            "from mvest.valve.anatomy.valve import Valve\nfrom . import mesh",
-        ),
-        (
-            "mvest.mechanics.law.biot",
-            "from mvest.valve.mesh.solid_mesh import SolidMesh\nimport mvest.elements",
-        ),
-        ("mvest.imaging.tracking", "from ..valve.anatomy.valve import Motion\nimport numpy"),
-        ("mvest.errors", "from mvest.typing import FloatArray"),
-        ("mvest.closure.model", "from mvest import estimation, mechanics, valve"),
-        (
-            "mvest.problem.estimate",
-            "from mvest import closure, estimation, mechanics, observation, valve",
-        ),
-        ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.estimate import Problem"),
-        (
-            "experiments.studies.a.study",
-            "from experiments.common.study import Study\nfrom experiments.studies.a import part",
-        ),
-        ("experiments.runner.job", "from experiments.runner.tracking import store"),
-        # A name that only begins alike is another package.
-        ("mvest.problem.estimate", "import hydrate, mlflower, testslide"),
+        ("experiments.studies.a", "from experiments.studies.ab import STUDY", 1),
+        ("experiments.studies.a", "def f():\n    import experiments.runner.job", 1),
+        ("experiments.studies.a.study", "from experiments.studies.a import part", 0),
+        # A job does not depend on how jobs are run or logged.
+        ("experiments.runner.jobs", "from experiments.runner.tracking import store", 1),
+        ("experiments.runner.job", "from experiments.runner.tracking import store", 0),
+        # Nothing imports the package's face, and a new package needs a place.
+        ("mvest", "from mvest.errors import MvestError", 1),
+        ("mvest.problem.estimate", "from mvest import Gaussian", 1),
+        ("mvest.helpers", "import math", 1),
     ],
 )
-def test_a_right_import_passes(module: str, source: str) -> None:
-    assert import_violations(source, module) == []
+def test_wrong_imports_are_seen(module: str, source: str, count: int) -> None:
+    assert len(import_violations(source, module, is_package=module == "mvest")) == count
 
 
 @pytest.mark.parametrize(
@@ -365,9 +321,7 @@ def test_a_right_import_passes(module: str, source: str) -> None:
     [
         ("a.b.c", False, "from . import d", "a.b.d"),
         ("a.b", True, "from . import d", "a.b.d"),
-        ("a.b.c", False, "from .d import e", "a.b.d.e"),
         ("a.b.c", False, "from ..d import e", "a.d.e"),
-        ("a.b", True, "from ..d import e", "a.d.e"),
     ],
 )
 def test_relative_imports_are_resolved(
@@ -396,26 +350,15 @@ def test_nothing_in_the_house_goes_through_a_lazy_face() -> None:
         }
         for stub in (ROOT / "mvest").rglob("__init__.pyi")
     }
-    assert "Gaussian" in faces["mvest"] & faces["mvest.estimation"]
+    deferred = "def f():\n    from mvest.estimation import Gaussian, filters"
+    assert len(through_faces(deferred, "mvest.x", faces)) == 1
+    assert not through_faces("from mvest.estimation.gaussian import Gaussian", "mvest.x", faces)
     hidden = [
         message
         for module, path in modules("mvest", "experiments")
         for message in through_faces(path.read_text(encoding="utf-8"), module, faces)
     ]
     assert hidden == []
-
-
-@pytest.mark.parametrize(
-    ("source", "count"),
-    [
-        ("from mvest.estimation import Gaussian, filters", 1),
-        ("def f():\n    from mvest.estimation import Gaussian", 1),
-        ("from mvest.estimation.gaussian import Gaussian", 0),
-        ("import mvest.estimation", 0),
-    ],
-)
-def test_a_name_from_a_face_is_seen(source: str, count: int) -> None:
-    assert len(through_faces(source, "mvest.x", {"mvest.estimation": {"Gaussian"}})) == count
 
 
 def test_common_and_runner_name_no_study() -> None:
@@ -451,22 +394,13 @@ def test_what_table_1_needs_is_small() -> None:
 # --- names --------------------------------------------------------------------------------------
 
 
-def public_classes(source: str) -> list[str]:
-    """Names of the classes of a module that others may use."""
-    names = [node.name for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
-    return [name for name in names if not name.startswith("_")]
-
-
 def test_a_public_class_of_the_library_has_a_name_of_its_own() -> None:
     places: dict[str, list[str]] = {}
     for module, path in modules("mvest"):
-        for name in public_classes(path.read_text(encoding="utf-8")):
-            places.setdefault(name, []).append(module)
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(module)
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
-
-
-def test_public_classes_are_seen() -> None:
-    assert public_classes("class A:\n    class B: ...\nclass _C: ...\ndef D(): ...") == ["A"]
 
 
 # --- dependencies -------------------------------------------------------------------------------
@@ -516,9 +450,7 @@ def test_what_is_imported_is_declared(project: dict) -> None:
 @pytest.mark.parametrize(
     ("source", "count"),
     [
-        ("import numpy.linalg", 0),
-        ("import os", 0),
-        ("import seaborn", 1),
+        ("import os, numpy.linalg", 0),
         ("import pyvista", 1),
         ("def view():\n    import pyvista", 0),
         ("def view():\n    import seaborn", 1),
@@ -605,12 +537,9 @@ def test_tracked_files_name_no_machine_path_and_no_private_host() -> None:
     "text",
     [
         "see /" + "home/someone/data",
-        "path=/" + "tmp/out.json",
         '"/' + 'Users/someone"',
-        "(/" + "work/project)",
         "--find-links file:" + "///srv/wheels",
         "http:" + "//packages.example.internal/simple",
-        "http:" + "//buildhost:8080/simple",
         "http:" + "//someone:secret@10.0.0.7/simple",
         "git clone ssh:" + "//git@server.lan/repository",
     ],
@@ -619,17 +548,11 @@ def test_a_private_mention_is_seen(text: str) -> None:
     assert len(private_mentions(text)) == 1
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "https://pypi.org/simple and https://doi.org/10.1000/182.",
-        "open http://127.0.0.1:5000 or http://localhost:5000/",
-        "${HOME}/work/data, outputs/work/mesh.vtu, ./tmp/file, <root>/home/x",
-        "#!/usr/bin/env bash",
-        "kPa/mm and at /root",
-    ],
-)
-def test_a_public_mention_passes(text: str) -> None:
+def test_a_public_mention_passes() -> None:
+    text = (
+        "https://pypi.org/simple, https://doi.org/10.1000/182. http://127.0.0.1:5000 "
+        "${HOME}/work/data, outputs/work/mesh.vtu, ./tmp/file, <root>/home/x #!/usr/bin/env kPa/mm"
+    )
     assert private_mentions(text) == []
 
 

@@ -1,4 +1,4 @@
-"""One's own valve: from a case folder to moduli with intervals."""
+"""Your own valve: from a case folder to moduli with intervals."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Settings:
     """What the study adds to the configuration."""
 
     case: CaseInput = None  # folder of a case
-    strict: bool = False  # refuse an implausible case, instead of saying so
-    gate: bool = False  # with check=true: test whether the closed state is the only one, minutes
+    strict: bool = False  # refuse an implausible case instead of warning
+    gate: bool = False  # with check=true: test whether the closed state is unique (minutes)
     personal: PersonalSettings
 
 
@@ -37,7 +37,7 @@ def run(job: Job[Settings]) -> Result:
 
 
 def check_case(values: Mapping[str, Any], folder: Path) -> str:
-    """Read, check and draw the configured case, and say what an estimate could tell."""
+    """Read, check and draw the configured case, and list the intervals to expect."""
     return check(values, _read(values), folder, gate=values["gate"])
 
 

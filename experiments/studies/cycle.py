@@ -1,12 +1,12 @@
-"""What a whole cycle tells: what its frames could tell, what time steps do, and estimates from it.
+"""Information in the frames of a whole cycle, errors of time steps, and estimates from them.
 
-Everything follows from one simulated cycle of a valve whose parameters are known. The experiments
-`cycle`, `joint`, `joint_open` and `chord` differ in the unknowns and in what is estimated.
+All results are from one simulated cycle of a valve with known parameters. The experiments `cycle`,
+`joint`, `joint_open` and `chord` differ in the unknowns and in the estimates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,30 +40,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
-"""Observations that parameters are estimated from; all but the second are of all frames."""
-
+"""Observations for estimates; all but the second are of all frames."""
 WIDER = f"{OTHER}, with the mesh's error"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CycleSettings:
-    """What is simulated, and what is estimated from it.
-
-    Meshes are columns and rows of cells, then of contact points.
-    """
+    """The simulation and the estimates; meshes are columns and rows of cells, then of contacts."""
 
     protocol: CycleProtocol = field(default_factory=CycleProtocol)
     noise_mm: Length = 0.5  # SD of each coordinate
     estimated: tuple[str, ...] = ()  # of no noise, open and closed, whole cycle, another mesh
-    exact_assumed_mm: Length = 0.1  # SD that the filter assumes of coordinates without noise
+    exact_assumed_mm: Length = 0.1  # SD that the filter assumes for coordinates without noise
     seeds: Count = 8  # of the noise of the whole cycle
-    # Decrease of the objective below which a search ends that starts near its end: 0.02 moves no
-    # parameter by more than a fifth of its standard deviation, 0.05 by a third.
+    # A search that starts near its end stops when the objective decreases by less than this: 0.02
+    # moves no parameter by more than a fifth of its standard deviation, 0.05 by a third.
     objective_tolerance: Tolerance = 0.02
-    finer: tuple[AxisCount, ...] = (32, 4, 96, 21)  # mesh of a truth that is not the estimator's
-    check: tuple[AxisCount, ...] = (40, 5, 120, 26)  # mesh that shows what the estimator's does
+    finer: tuple[AxisCount, ...] = (32, 4, 96, 21)  # mesh of the truth in "another mesh"
+    check: tuple[AxisCount, ...] = (40, 5, 120, 26)  # mesh for the error of the estimator's mesh
     time_steps: tuple[TimeStep, ...] = ()  # s, each half of the last, to be compared
-    path_steps: Count = 16  # along which frames are looked at for jumps
+    path_steps: Count = 16  # steps of the path on which frames are tested for jumps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,17 +70,17 @@ class Settings:
 
 
 FINER_STEP, PATH_CHANGE = 0.5, -0.3
-"""Time step on other meshes in parts of the estimator's, and how far the first parameter changes
-along the path on which frames are looked at for jumps."""
+"""Time step on other meshes over the estimator's, and relative change of the first parameter along
+the path on which frames are tested for jumps."""
 
 
 def run_cycle(job: Job[Settings]) -> Result:
-    """Simulate a cycle; say what its frames could tell, and estimate what is to be estimated.
+    """Simulate a cycle, compute the bounds of its frames, and make the configured estimates.
 
     Raises
     ------
     InputError
-        If the truth has no cycle, on whichever mesh, or a setting is inadmissible.
+        If the truth has no cycle on one of the meshes, or a setting is inadmissible.
     """
     values, settings = job.values, job.settings.cycle
     truth = np.array(values["truth"]["values"], dtype=float)
@@ -94,7 +90,12 @@ def run_cycle(job: Job[Settings]) -> Result:
     if not true.converged:
         raise InputError(f"the truth has no cycle: {true.reason}")
     frames = true.y.reshape(len(settings.protocol.times), -1, 3)
-    bounds = _bounds(settings, true.jacobian.reshape(*frames.shape, -1), model.names, truth)
+    H = true.jacobian.reshape(*frames.shape, -1)
+    bounds = [
+        {"frames": label, "count": len(chosen), "parameter": name, "bound": finite(percent)}
+        for label, chosen in settings.protocol.frame_sets().items()
+        for name, percent in _bounds(H[chosen], settings.noise_mm, model.names, truth)
+    ]
     tables = {"": table(bounds, frames="", count="", parameter="", bound="%")}
     numbers: dict[str, Number] = {"vertices": frames.shape[1], "noise_mm": settings.noise_mm}
     solves = 1
@@ -123,18 +124,11 @@ def run_cycle(job: Job[Settings]) -> Result:
 
 
 def _bounds(
-    settings: CycleSettings, H: FloatArray, names: Sequence[str], truth: FloatArray
-) -> Iterator[dict[str, Any]]:
-    """Cramér-Rao bounds of sets of frames.
-
-    ``H (f, n, 3, p)`` are the derivatives of the frames at the truth ``(p,)``.
-    """
-    for label, chosen in settings.protocol.frame_sets().items():
-        rows = H[chosen].reshape(-1, len(truth))
-        bound = identifiability(rows, settings.noise_mm**2, truth, names=names)
-        for name, percent in zip(names, 100 * bound.std / truth, strict=True):
-            about = {"frames": label, "count": len(chosen), "parameter": name}
-            yield {**about, "bound": finite(percent)}
+    H: FloatArray, noise_mm: float, names: Sequence[str], truth: FloatArray
+) -> Iterable[tuple[str, float]]:
+    """Cramér-Rao bounds (%) from derivatives ``(f, n, 3, p)`` of frames at the truth ``(p,)``."""
+    bound = identifiability(H.reshape(-1, len(truth)), noise_mm**2, truth, names=names)
+    return zip(names, 100 * bound.std / truth, strict=True)
 
 
 def _estimates(
@@ -171,12 +165,12 @@ def _estimates(
             if found is None:
                 continue
             if what == WHOLE and not k and result.converged and isinstance(search, IteratedFilter):
-                # The mode does not depend on where its search starts.
+                # The mode does not depend on the start, so later searches start near it.
                 start, enough = tuple(found.mean.tolist()), settings.objective_tolerance
                 nearer = replace(search, start=start, objective_tolerance=enough)
                 problem = replace(problem, filter=nearer)
             if what == OTHER:
-                # What its own mesh may have done to it, from one run on a third mesh.
+                # The error of the estimator's mesh follows from one run on a third mesh.
                 finer = _on_mesh(values, settings, settings.check)
                 try:
                     wider, _, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
@@ -200,14 +194,14 @@ def _on_mesh(values: Values, settings: CycleSettings, mesh: tuple[int, ...]) -> 
 
 
 def _bar(title: str, model: CycleModel, solves: int, names: Sequence[str] = ()) -> SolveBar:
-    """A progress bar that follows a model."""
+    """A progress bar of a model's steps."""
     bar = SolveBar(title, len(model.protocol.steps()), solves, names)
     model.closure.on_step = bar.step
     return bar
 
 
 def _problem(values: Values, settings: CycleSettings) -> tuple[CycleModel, Problem]:
-    """The estimator's own model, and what is to be estimated with it."""
+    """The estimator's model and problem."""
     names = tuple(values["parameters"])
     filter_, transform, prior = build_filter(values["filter"], names)
     model = CycleModel(closure_model(values), settings.protocol)
@@ -218,14 +212,14 @@ def _problem(values: Values, settings: CycleSettings) -> tuple[CycleModel, Probl
 def _observation(
     settings: CycleSettings, positions: FloatArray, std_mm: float, at: list[int]
 ) -> Observation:
-    """Some of the frames ``(f, n, 3)`` mm of a cycle."""
+    """An observation of the frames ``at`` of a cycle ``(f, n, 3)`` mm."""
     names = settings.protocol.frames
     frames = tuple(names[k] for k in at)
     return Observation(frames, positions[at], np.array(std_mm**2), predicted=names)
 
 
 def expect_cycle(values: Values, _folder: Path | None = None) -> str:
-    """What ``check=true`` says of all frames of a cycle: the answer of the Fisher information."""
+    """The text of ``check=true``: expected intervals from all frames of a cycle."""
     settings = build(CycleSettings, values["cycle"])
     model, problem = _problem(values, settings)
     at = settings.protocol.frame_sets()[WHOLE]
@@ -237,7 +231,7 @@ def expect_cycle(values: Values, _folder: Path | None = None) -> str:
 
 
 def figure(results: Results) -> Figure:
-    """What sets of frames could tell, beside the estimates if there are any."""
+    """Bounds of sets of frames, and the errors of estimates if there are any."""
     from mvest.reporting.figures import COLOURS, MARKERS, SMALL, log_axis, panels
 
     estimates = results.first.estimates
@@ -247,7 +241,7 @@ def figure(results: Results) -> Figure:
         axes[0].plot(own["bound"], own["frames"], ls="", label=name, **style)
     axes[0].set(xscale="log", xlabel="smallest possible SD (%)")
     if estimates:
-        _draw_estimates(axes[1], estimates)
+        _draw_errors(axes[1], estimates)
     for one in axes:
         one.invert_yaxis()
         log_axis(one.xaxis)
@@ -256,19 +250,19 @@ def figure(results: Results) -> Figure:
     return drawn
 
 
-def _draw_estimates(axes: Any, estimates: Sequence[EstimateRecord]) -> None:
-    """Errors ± 2 standard deviations, a group for each parameter."""
+def _draw_errors(axes: Any, estimates: Sequence[EstimateRecord]) -> None:
+    """Errors ± 2 standard deviations, grouped by parameter."""
     from mvest.reporting.figures import COLOURS
 
-    kinds = list(dict.fromkeys(one.case.partition(", errors")[0] for one in estimates))
-    for j, one in enumerate(estimates):
+    kinds = [one.case.partition(", errors")[0] for one in estimates]
+    colours = dict(zip(dict.fromkeys(kinds), COLOURS, strict=False))
+    for j, (one, kind) in enumerate(zip(estimates, kinds, strict=True)):
         own = [unknown for unknown in one.parameters if unknown.estimate]
-        colour = COLOURS[kinds.index(one.case.partition(", errors")[0]) % 6]
         y = np.arange(len(own)) + 0.7 * ((j + 0.5) / len(estimates) - 0.5)
         error = [100 * (unknown.relative_error or 0.0) for unknown in own]
         two = [200 * (unknown.std or 0.0) / (unknown.estimate or 1.0) for unknown in own]
-        axes.errorbar(error, y, xerr=two, fmt="o", ms=3, lw=1, color=colour)
-    for colour, kind in zip(COLOURS, kinds, strict=False):
+        axes.errorbar(error, y, xerr=two, fmt="o", ms=3, lw=1, color=colours[kind])
+    for kind, colour in colours.items():
         axes.plot([], [], "o", color=colour, label=kind)
     axes.axvline(0.0, color="black", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)

@@ -1,9 +1,8 @@
-"""Which observations would make the moduli known, found out before any are made.
+"""Comparison of observations before any are made, from exact derivatives.
 
-Two experiments compare designs from exact derivatives alone. `identifiability` asks for one
-configured valve which frames, vertices and errors it takes, and what must be known of chordae and
-pressure. `design` asks for virtual patients how many closed frames it takes under how well known
-pressures, and estimates some of them.
+The experiment `identifiability` varies frames, vertices, errors and the knowledge of nuisances for
+one configured valve. `design` varies the number of closed frames and the errors of their pressures
+for virtual patients, and makes estimates for some designs.
 """
 
 from __future__ import annotations
@@ -63,26 +62,25 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignsSettings:
-    """Observations of the configured valve that are compared before any is made."""
+    """Observations of the configured valve that are compared."""
 
-    pressures_mmHg: tuple[Pressure, ...] = (60.0,)  # of one closed frame more
+    pressures_mmHg: tuple[Pressure, ...] = (60.0,)  # of one more closed frame
     cycle_times: tuple[BeatTime, ...] = ()  # s, observed in a whole cycle
     cycle_dt: TimeStep = 0.003125  # s
     noise_mm: tuple[Length, ...] = (0.1, 0.25, 0.5, 1.0)
-    typical_mm: Length = 0.5  # noise of what tables say at one noise
+    typical_mm: Length = 0.5  # noise of tables for a single noise
     correlation_length_mm: Length = 5.0
-    target: Share = 0.05  # relative standard deviation that is wanted of a modulus
-    # Relative standard deviations of the nuisances, by what is assumed to be known of them: 0
-    # for what is known, and nothing is known of what is not named.
+    target: Share = 0.05  # wanted relative standard deviation of a modulus
+    # Knowledge -> relative standard deviations of nuisances; 0 is known, and missing is unknown.
     knowledge: dict[str, dict[str, Factor]] = field(default_factory=dict)
-    known: tuple[str, ...] = ()  # parameters taken as known where confounded ones are looked for
+    known: tuple[str, ...] = ()  # parameters taken as known in the table of confounded ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corner:
-    """A design with which a patient is estimated: errors as stated, and as drawn."""
+    """A design for which a patient is estimated; its errors are stated and drawn."""
 
-    frames: Count = 1  # closed ones, the first under the closed frame's pressure
+    frames: Count = 1  # closed frames, the first with the pressure of the closed frame
     factor: Factor = 0.1  # relative, on all pressures
     offset_mmHg: PressureError = 0.0
     each_mmHg: PressureError = 0.0
@@ -90,15 +88,15 @@ class Corner:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FramesSettings:
-    """Frames of a virtual patient that are designed, and which designs are also tried."""
+    """Designs of the frames of a virtual patient."""
 
-    geometry: NuisanceGeometry | None = None  # how well it is known where it is not exactly
+    geometry: NuisanceGeometry | None = None  # its errors where it is not exact
     corners: dict[str, Corner] | None = None  # name -> design
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the study adds to the configuration: of the configured valve, or of a patient."""
+    """What the study adds to the configuration: for the configured valve, or for a patient."""
 
     designs: DesignsSettings = field(default_factory=DesignsSettings)
     frames: FramesSettings | None = None
@@ -118,13 +116,7 @@ def run(job: Job[Settings]) -> Result:
 
 # -- one configured valve -------------------------------------------------------------------------
 def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
-    """Derivatives of one run for each set of frames, and all designs from them.
-
-    Raises
-    ------
-    GeometryError
-        If the valve does not close.
-    """
+    """All designs from the derivatives of one run for each set of frames."""
     model = replace(closure_model(values), continuation=True)
     truth = np.array(values["truth"]["values"], dtype=float)
     require_one_each("truth.values", truth, model.names)
@@ -149,7 +141,7 @@ def _valve_designs(values: Values, settings: DesignsSettings) -> Result:
 def _jacobians(
     settings: DesignsSettings, model: ClosureModel, truth: FloatArray
 ) -> dict[str, list[FloatArray]]:
-    """Derivatives ``(3n, p)`` of each of some frames, by what they are called."""
+    """Label -> derivatives ``(3n, p)`` of its frames; GeometryError if the valve does not close."""
     protocol = model.settings.protocol
     peak, closed = protocol.pressure_mmHg, dict[float, FloatArray]()
     for pressure in (*settings.pressures_mmHg, peak):
@@ -161,7 +153,7 @@ def _jacobians(
         if not found.converged:
             raise GeometryError(f"closed at {pressure:g} mmHg: {found.reason}")
         closed[pressure] = found.jacobian[len(found.y) // 2 :]
-    # The open valve is the model's own shape at rest, which depends on no parameter.
+    # The open valve is at rest and does not depend on parameters.
     open_ = np.zeros_like(closed[peak])
     frames = {"closed": [closed[peak]], "open and closed": [open_, closed[peak]]}
     for pressure in sorted(closed.keys() - {peak}):
@@ -181,7 +173,7 @@ def _designs(
     frames: Mapping[str, Sequence[FloatArray]],
     truth: FloatArray,
 ) -> Iterator[tuple[Row, Design]]:
-    """What each observation says, and what it consists of."""
+    """Each observation, and its information."""
     observed, length = values["observation"], settings.correlation_length_mm
     correlation = SpatialCorrelation(model.valve.surface.vertices, length)
     sets = vertex_sets(observed["columns"], observed["rows"])
@@ -204,20 +196,15 @@ def _expected(settings: DesignsSettings, design: Design) -> Iterator[Row]:
     """Each modulus with each knowledge of the nuisances."""
     moduli = [name for name in design.names if name.startswith("E_f.")]
     for (knowledge, stds), name in product(settings.knowledge.items(), moduli):
-        noise = design.needed_noise(name, settings.target, stds)
-        yield {
-            "knowledge of the nuisances": knowledge,
-            "parameter": name,
-            **{
-                f"std at {mm:g} mm": finite(100 * design.std(name, mm, stds))
-                for mm in settings.noise_mm
-            },
-            f"noise for {100 * settings.target:g} %": finite(noise),
-        }
+        row: Row = {"knowledge of the nuisances": knowledge, "parameter": name}
+        for mm in settings.noise_mm:
+            row[f"std at {mm:g} mm"] = finite(100 * design.std(name, mm, stds))
+        needed = design.needed_noise(name, settings.target, stds)
+        yield row | {f"noise for {100 * settings.target:g} %": finite(needed)}
 
 
 def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) -> Iterator[Row]:
-    """Changes of parameters that hardly show together, where nothing is known of nuisances."""
+    """Changes of parameters that compensate each other, if nuisances are unknown."""
     for about, design in designs:
         bound = design.at(settings.typical_mm, dict.fromkeys(settings.known, 0.0))
         for group in bound.confounded():
@@ -232,17 +219,11 @@ def _confounded(settings: DesignsSettings, designs: list[tuple[Row, Design]]) ->
 
 # -- frames of a virtual patient ------------------------------------------------------------------
 VALUES, ANATOMY, ERRORS = range(3)
-"""Streams of random numbers, so that all designs are tried on the same valve."""
+"""Streams of random numbers, so that all designs are for the same valve."""
 
 
 def _patient_designs(job: Job[Settings], frames: FramesSettings, about: PatientSettings) -> Result:
-    """All designs of a patient's valve at the generic moduli, and estimations with some.
-
-    Raises
-    ------
-    GeometryError
-        If the patient's valve does not close.
-    """
+    """All designs for a patient's valve with the generic moduli, and estimates for some."""
     patient = _patient(job.values, about, Corner(), ())
     wanted = settings_of(job.values, job.settings.personal)
     known = {"exact": None} | ({"considered": frames.geometry} if frames.geometry else {})
@@ -270,12 +251,9 @@ def _patient_designs(job: Job[Settings], frames: FramesSettings, about: PatientS
 def _patient(
     values: Values, about: PatientSettings, corner: Corner, pressures: tuple[float, ...]
 ) -> VirtualPatient:
-    """The patient as a design sees it: further frames under pressures, which are off as it says."""
-    simulation = replace(
-        about.simulation,
-        fitted_pressure_mmHg=pressures,
-        fitted_relaxation=(0.0,) * len(pressures),
-    )
+    """The patient with further closed frames, and with the pressure errors of a design."""
+    still = (0.0,) * len(pressures)
+    simulation = replace(about.simulation, fitted_pressure_mmHg=pressures, fitted_relaxation=still)
     deviations = replace(
         about.deviations,
         pressure=corner.factor,
@@ -304,7 +282,7 @@ def _tried(
     name: str,
     corner: Corner,
 ) -> tuple[EstimateRecord, dict[str, float]]:
-    """An estimate of the patient with a design, and what the design predicts of each modulus."""
+    """An estimate of the patient with a design, and the predicted errors of the moduli."""
     further = tuple(designs.pressures_mmHg[k] for k in designs.chosen(corner.frames))[1:]
     unknowns = tuple(
         replace(u, std=corner.factor) if u.name == "pressure_scale" else u for u in wanted.unknowns
@@ -313,30 +291,23 @@ def _tried(
     patient = _patient(values, about, corner, further)
     fit = personalise(patient.case, replace(wanted, unknowns=unknowns, pressures=pressures))
     record = record_of(fit.result, seed=values["seed"], case=name, simulated=True)
-    stated = {
-        "factor": corner.factor,
-        "offset": corner.offset_mmHg,
-        "each": corner.each_mmHg,
-    }
-    kept = record.without_details().with_truth(patient.values)
-    return kept, designs.left(corner.frames, stated)
+    stated = {"factor": corner.factor, "offset": corner.offset_mmHg, "each": corner.each_mmHg}
+    known = record.without_details().with_truth(patient.values)
+    return known, designs.left(corner.frames, stated)
 
 
 TRIED: dict[str, Column | str] = {
-    "design": "",
-    "modulus": "",
-    "predicted": Column("%", ".0f"),
-    "reported": Column("%", ".0f"),
-    "error": Column("%", ".0f"),
-    "generic": Column("%", ".0f", label="error of the generic guess"),
+    **dict.fromkeys(("design", "modulus"), ""),
+    **dict.fromkeys(("predicted", "reported", "error"), "%:.0f"),
+    "generic": "%:.0f:error of the generic guess",
 }
-"""Of the standard deviation of the prior's logarithm."""
+"""Percentages of the standard deviation of the prior's logarithm."""
 
 
 def _compared(
     record: EstimateRecord, predicted: Mapping[str, float], knowledge: Mapping[str, float]
 ) -> Iterator[Row]:
-    """What became of each modulus that was estimated with a design."""
+    """The predicted and the actual error of each modulus with a design."""
     for name, share in predicted.items():
         own, scale = record.unknown(name), knowledge[name] / 100
         estimate, truth, generic = own.estimate, own.truth or np.nan, own.prior_mean or np.nan
@@ -353,43 +324,39 @@ def _compared(
 
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
-    """For readers: a row for each observation, or for each design the median over patients."""
+    """A row for each observation, or the median over patients for each design."""
     rest = {name: results.table(name) for name in results.table_names if name}
     if "left" not in results.table().values:
-        worse = _worse(results).reset_index()
-        known = worse.columns[len(OBSERVATION) :]
-        first = dict.fromkeys(OBSERVATION, "")
-        return {"worse_modulus": table(worse, **first, **dict.fromkeys(known, "%:.2g")), **rest}
+        worse = _worse(results)
+        columns = dict.fromkeys(OBSERVATION, "") | dict.fromkeys(worse.columns, "%:.2g")
+        return {"worse_modulus": table(worse.reset_index(), **columns), **rest}
     medians = _medians(results).reset_index()
     counts = {name: Column("%", ".0f") for name in medians.columns if name.endswith("closed")}
     keys: dict[str, Column | str] = {"geometry": "", "errors": "", "error": "mmHg", "known": ""}
     shown = {"median_left": table(medians, **keys, **counts), **rest}
     if "tried" in rest:
         values = list(TRIED)[2:]
-        squares = rest["tried"].frame.dropna().groupby("design", sort=False)[values].agg(_rms)
+        squares = rest["tried"].frame.dropna().set_index("design")[values].astype(float) ** 2
+        rms = np.sqrt(squares.groupby("design", sort=False).mean()).reset_index()
         about = {name: TRIED[name] for name in values}
-        shown["root_mean_squares"] = table(squares.reset_index(), design="", **about)
+        shown["root_mean_squares"] = table(rms, design="", **about)
     return shown
-
-
-def _rms(values: Any) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 OBSERVATION = ["vertices", "errors", "frames"]
 
 
 def _worse(results: Results) -> DataFrame:
-    """Deviation of the worse modulus at the typical noise, a column for each knowledge."""
+    """Standard deviation of the worse modulus at the typical noise, by knowledge of nuisances."""
     frame, column = results.table().frame, f"std at {results.first.numbers['typical_mm']:g} mm"
     known = "knowledge of the nuisances"
-    # Infinite where it is not determined.
+    # A missing value is an undetermined modulus.
     worse = frame.fillna({column: np.inf}).groupby([*OBSERVATION, known], sort=False)[column].max()
     return worse.unstack().loc[:, frame[known].unique()]
 
 
 def _medians(results: Results) -> DataFrame:
-    """What is left of the guess's error, median over patients and moduli, by number of frames."""
+    """Remaining error of the guess, as median over patients and moduli, by number of frames."""
     keys = ["geometry", "errors", "error", "known", "frames"]
     frame = results.table().frame
     medians = frame.groupby(keys, sort=False)["left"].median().unstack()

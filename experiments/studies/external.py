@@ -1,7 +1,7 @@
-"""Any model behind the filters: a program called through files, or a Python function.
+"""Estimates with any model: a program called through files, or a Python function.
 
-It estimates its parameters from observed positions. Of several models each estimates from what the
-first ones predict for known parameters.
+A single model is fitted to observed positions. Several models are fitted to the predictions of some
+of them for known parameters.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = ("points",)
-"""The one frame that models predict."""
+"""The single frame that models predict."""
 
 FITTED = "fitted.csv"
-"""Where a single model puts the observed points at its estimate."""
+"""The observed points as predicted by a single model at its estimate."""
 
 
-def _command(value: tuple[str, ...], beside: Values) -> Any:
-    files = contents(files_of_command(value, beside.get("environment") or {}))
+def _command(value: tuple[str, ...], other: Values) -> Any:
+    files = contents(files_of_command(value, other.get("environment") or {}))
     return [*value, files] if value else value
 
 
@@ -64,30 +64,30 @@ class ModelSettings:
     # FILE:FUNCTION, which is called with the settings and returns the model.
     python: Annotated[str | None, Reads(_python)] = None
     apart: bool = False  # FILE is run as a program instead, with the request and its folder
-    settings: dict[str, Any] = field(default_factory=dict)  # given to the model as they are
-    environment: dict[str, str] = field(default_factory=dict)  # beside what this process has
-    # Files and folders after whose change runs are done anew, beside those in the command.
+    settings: dict[str, Any] = field(default_factory=dict)  # passed to the model unchanged
+    environment: dict[str, str] = field(default_factory=dict)  # added to this process's
+    # Runs are repeated after a change of these files and folders, or of those in the command.
     inputs: Annotated[tuple[str, ...], Reads(contents)] = ()
     time_limit_s: TimeLimit = 600.0  # of one run
     differences: str = "central"  # or forward, or none: the program must give jacobian.csv
     relative_step: Tolerance = 1e-3  # of a parameter
     floor: Annotated[float, within(0, 1e12, "", "in the units of any model")] = 0.0  # if it is zero
-    processes: Annotated[Processes, NOT_HASHED] = 1  # runs at a time
-    reuse: bool = True  # finished runs serve again
+    processes: Annotated[Processes, NOT_HASHED] = 1  # simultaneous runs
+    reuse: bool = True  # of finished runs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExternalSettings(ModelSettings):
-    """The model, or several, and what is observed."""
+    """The model, or several, and the observation."""
 
     folder: Annotated[str | None, NOT_HASHED] = None  # of runs; null: in the folder of the job
     observation: InputFile = None  # .csv x,y,z (mm), one row per observed point
-    points: InputFile = None  # .csv x,y,z (mm), reference positions that programs are given
+    points: InputFile = None  # .csv x,y,z (mm), reference positions for programs
     units: tuple[str, ...] = ()  # of the parameters; empty: not stated
     prior_std: tuple[Value, ...] = ()  # of the parameters
     noise_mm: Length | None = None  # SD of the error of each observed coordinate
     models: dict[str, ModelSettings] = field(default_factory=dict)  # several, with their settings
-    data: tuple[str, ...] = ()  # those of them that predict observations from truth.values
+    data: tuple[str, ...] = ()  # models that predict observations from truth.values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +98,7 @@ class Settings:
 
 
 def problem_of(about: ExternalSettings, values: Values) -> Problem:
-    """What is estimated, with a model that predicts nothing.
+    """The problem, with a model that predicts nothing.
 
     Raises
     ------
@@ -108,20 +108,16 @@ def problem_of(about: ExternalSettings, values: Values) -> Problem:
     names = tuple(values["parameters"])
     for key, instead in (("P0", "external.prior_std"), ("R", "external.noise_mm")):
         if values["filter"][key] is not None:
-            raise ConfigurationError(f"filter.{key} is given; expected {instead} in its place")
+            raise ConfigurationError(f"filter.{key} is given; expected {instead} instead")
+    each = f"for each of {', '.join(names)}"
     if about.units and len(about.units) != len(names):
-        raise ConfigurationError(
-            f"external.units = {list(about.units)}, expected one for each of {', '.join(names)}"
-        )
+        raise ConfigurationError(f"external.units = {list(about.units)}, expected one {each}")
     if len(about.prior_std) != len(names) or min(about.prior_std) <= 0:
-        raise ConfigurationError(
-            f"external.prior_std = {list(about.prior_std)}, expected one standard deviation > 0 "
-            f"for each of {', '.join(names)}"
-        )
+        found = f"external.prior_std = {list(about.prior_std)}"
+        raise ConfigurationError(f"{found}, expected one standard deviation > 0 {each}")
     if not about.noise_mm:
-        raise ConfigurationError(
-            f"external.noise_mm = {about.noise_mm}, expected a number > 0 (mm)"
-        )
+        found = f"external.noise_mm = {about.noise_mm}"
+        raise ConfigurationError(f"{found}, expected a number > 0 (mm)")
     settings = {**values["filter"], "P0": [std**2 for std in about.prior_std]}
     filter_, transform, prior = build_filter(settings, names, positive=True)
     return Problem(names, lambda _: Prediction.failed("no model"), prior, filter_, transform, {})
@@ -130,7 +126,7 @@ def problem_of(about: ExternalSettings, values: Values) -> Problem:
 def model_of(
     about: ExternalSettings, parameters: tuple[str, ...], name: str, count: int, folder: Path
 ) -> ObservationModel:
-    """One of the configured models, of ``count`` observed points.
+    """A configured model of ``count`` observed points.
 
     Raises
     ------
@@ -140,25 +136,24 @@ def model_of(
     source = about.models.get(name, about)
     settings, command = {**about.settings, **source.settings}, source.command
     if source.python is not None:
-        file, function = _file(source.python), source.python.rpartition(":")[2]
-        if file is None:
-            raise ConfigurationError(
-                f"python = {source.python}: no such file, expected FILE:FUNCTION"
-            )
+        where, function = f"python = {source.python}", source.python.rpartition(":")[2]
+        if (file := _file(source.python)) is None:
+            raise ConfigurationError(f"{where}: no such file, expected FILE:FUNCTION")
         command = (sys.executable, str(file), "{request}", "{folder}")
         if not source.apart:
             found = runpy.run_path(str(file))
             if function not in found:
-                raise ConfigurationError(
-                    f"python = {source.python}: no function {function!r} there"
-                )
+                raise ConfigurationError(f"{where}: no function {function!r} in the file")
             return found[function](**settings)
     if not command:
         raise ConfigurationError(
             "external.command is not given; expected the program and its arguments, such as "
             '[python,"{here}/solve.py","{request}","{folder}"]'
         )
-    steps = source.relative_step, source.floor, source.processes
+    differences = None
+    if source.differences != "none":
+        steps = source.relative_step, source.floor, source.processes
+        differences = Differences(source.differences, *steps)
     return ProcessModel(
         Command(command, source.environment, source.time_limit_s),
         folder / "runs" if about.folder is None else Path(about.folder),
@@ -167,16 +162,14 @@ def model_of(
         units=about.units or None,
         points=None if about.points is None else _points(about.points, "points"),
         settings=settings,
-        differences=None
-        if source.differences == "none"
-        else Differences(source.differences, *steps),
+        differences=differences,
         reuse=source.reuse,
         inputs=tuple(map(Path, source.inputs)),
     )
 
 
 def _file(python: str) -> Path | None:
-    """The file of a FILE:FUNCTION, from the checkout or from where the command was typed."""
+    """The file of FILE:FUNCTION, in the checkout or in the working folder."""
     name = python.rpartition(":")[0]
     places = (CHECKOUT / name, Path(name).absolute())
     return next((place for place in places if place.is_file()), None)
@@ -194,7 +187,7 @@ def _points(file: str | None, what: str) -> FloatArray:
 
 
 def run(job: Job[Settings]) -> Result:
-    """Estimate with each model from each observation."""
+    """Fit each model to each observation."""
     about = job.settings.external
     problem = problem_of(about, job.values)
     names, noise_mm = problem.parameters, float(about.noise_mm or 0.0)
@@ -205,7 +198,7 @@ def run(job: Job[Settings]) -> Result:
         exact = predict(model_of(about, names, name, 0, job.folder), np.array(true))
         if not exact.converged:
             return Result(status="failed", reason=f"{name}: {exact.reason}")
-        # The same errors for all, so that estimates differ by the models alone.
+        # Equal errors for all, so that only the models differ.
         errors = np.random.default_rng(job.values["seed"]).standard_normal(exact.y.size)
         data[name] = (exact.y + noise_mm * errors).reshape(-1, 3)
     estimates, rows = list[EstimateRecord](), list[dict[str, Any]]()
@@ -246,11 +239,11 @@ COLUMNS: dict[str, Column | str] = {
     "forward_solves": Column(label="predictions"),
     "distance_mean": Column("mm"),
 }
-"""What the table takes of the rows of a record."""
+"""Columns of a record that the table shows."""
 
 
 def check_external(values: Values, folder: Path) -> str:
-    """Run the program once at the initial values, and compare its derivatives with differences.
+    """Run the program once at the initial values, and test its derivatives by differences.
 
     Raises
     ------
@@ -265,18 +258,22 @@ def check_external(values: Values, folder: Path) -> str:
     if not found.converged:
         raise InputError(f"at the initial values: {found.reason}")
     distance = np.linalg.norm(found.y.reshape(-1, 3) - y, axis=1)
-    derivatives = "derivatives: by differences, the program gives none"
-    if not isinstance(model, ProcessModel) or model.own_jacobian:
-        by = model.by_differences(m, found.y) if isinstance(model, ProcessModel) else "a function"
-        derivatives = f"derivatives: the model's own; not compared with differences: {by}"
-        if not isinstance(by, str):
-            off = np.linalg.norm(found.jacobian - by, axis=0) / np.linalg.norm(by, axis=0)
-            each = zip(problem.parameters, off, strict=True)
-            shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in each)
-            derivatives = f"derivatives: the program's own; apart from differences by {shares}"
+    by: FloatArray | str = "it is a function"
+    if isinstance(model, ProcessModel):
+        by = model.by_differences(m, found.y) if model.own_jacobian else ""
+    if isinstance(by, str) and not by:
+        derivatives = "by differences, the program gives none"
+    elif isinstance(by, str):
+        derivatives = f"the model's own; not compared with differences: {by}"
+    else:
+        off = np.linalg.norm(found.jacobian - by, axis=0) / np.linalg.norm(by, axis=0)
+        each = zip(problem.parameters, off, strict=True)
+        shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in each)
+        derivatives = f"the program's own; differences deviate by {shares}"
     return (
         f"{len(y)} points; at the initial values they are {distance.mean():.3g} mm (mean) and "
-        f"{distance.max():.3g} mm (largest) from the observed ones\n{derivatives}\nIn order"
+        f"{distance.max():.3g} mm (largest) from the observed ones\nderivatives: {derivatives}\n"
+        "In order"
     )
 
 

@@ -1,4 +1,4 @@
-"""All filters on the same problems, compared with draws from the posterior itself."""
+"""All filters on the same problems, compared with draws from the posterior."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class FilterProblem:
     fixed: Annotated[dict[str, float], BY_PARAMETER] = field(default_factory=dict)  # known
     columns: PointsAround = 28
     rows: PointsAlong = 8
-    every: AxisCount = 1  # of so many vertices one is seen
+    every: AxisCount = 1  # every n-th vertex is observed
     noise_mm: Length  # of each coordinate of the closed frame
 
 
@@ -56,7 +56,7 @@ class FilterStudySettings:
     problems: dict[str, FilterProblem] = field(default_factory=dict)
     # _target_ and settings of each filter; a Q of `prior` is the prior's covariance.
     methods: dict[str, dict[str, Any]] = field(default_factory=dict)
-    # The filter that draws from the posterior itself, with which all others are compared.
+    # The filter that draws from the posterior; the others are compared with it.
     reference: dict[str, Any] = field(default_factory=dict)
 
 
@@ -82,7 +82,7 @@ def run(job: Job[Settings]) -> Result:
     for name, about in settings.problems.items():
         problem = build_problem(job.values, name, about)
         mesh = mesh or Mesh.of(problem.closure.mesh)
-        # All are made before any is run: a wrong setting is refused at once.
+        # All are built before any is run, so that a wrong setting is refused at once.
         filters = {method: problem.filter(values) for method, values in settings.methods.items()}
         reference = problem.estimate(filter_of(settings.reference), seed)
         if reference.transformed_samples is None:
@@ -122,7 +122,7 @@ COLUMNS: dict[str, Column | str] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """What every filter estimates: the parameters of one observation of the closed frame."""
+    """Parameters to be estimated from one observation of the closed frame."""
 
     name: str
     about: FilterProblem
@@ -131,18 +131,12 @@ class Problem:
     prior: Gaussian
 
     def filter(self, method: Values) -> Filter:
-        """A configured filter; the paper's has process noise as large as the prior."""
+        """A configured filter; a Q of ``prior`` is the prior's covariance."""
         own = {"Q": self.prior.covariance.tolist()} if method.get("Q") == "prior" else {}
         return filter_of({**method, **own})
 
     def estimate(self, filter_: Filter, seed: int) -> Estimate:
-        """One estimate with the model itself, from the open valve on: nobody gains from others.
-
-        Raises
-        ------
-        ConfigurationError
-            If the true valve does not close.
-        """
+        """One estimate from the open valve; ConfigurationError if the true valve does not close."""
         about = self.about
         self.closure.restart(None)
         exact = predict(self.model, np.array(about.truth))
@@ -151,15 +145,13 @@ class Problem:
         errors = np.random.default_rng(seed).standard_normal(exact.y.shape)
         self.closure.restart(None)
         with SolveBar(self.name, 0, 0, about.parameters) as bar:
-            return filter_(
-                self.model,
-                self.prior,
-                exact.y + about.noise_mm * errors,
-                about.noise_mm**2,
-                names=about.parameters,
-                transform=TRANSFORM,
-                on_iterate=bar.iterate,
-            )
+            y, R = exact.y + about.noise_mm * errors, about.noise_mm**2
+            how: dict[str, Any] = {
+                "names": about.parameters,
+                "transform": TRANSFORM,
+                "on_iterate": bar.iterate,
+            }
+            return filter_(self.model, self.prior, y, R, **how)
 
     def rows(self, method: str, found: Estimate, reference: Estimate) -> list[dict[str, Any]]:
         """A row for each unknown, its interval relative to that of the reference."""
@@ -189,13 +181,7 @@ class Problem:
 
 
 def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
-    """One of the configured problems.
-
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible.
-    """
+    """A configured problem; a MvestError if a setting is inadmissible."""
     mean, spread = np.array(about.initial), np.array(about.log_std)
     if mean.shape != (len(about.parameters),) or spread.shape != mean.shape:
         raise ConfigurationError(
@@ -223,7 +209,7 @@ def build_problem(config: Values, name: str, about: FilterProblem) -> Problem:
 
 
 def figure(results: Results) -> Figure:
-    """95 % interval that each filter gives each unknown, on that of the reference."""
+    """The 95 % intervals of each filter over those of the reference."""
     from textwrap import fill
 
     from mvest.reporting.figures import BAD, GOOD, SMALL, headline, panels
@@ -234,7 +220,7 @@ def figure(results: Results) -> Figure:
     for axes, by in zip(grid[0], references, strict=True):
 
         def in_std(row: Values, *names: str, by: Values = by) -> list[float]:
-            """Logarithms in deviations of the reference from its mean."""
+            """Logarithms as deviations from the reference's mean in its standard deviations."""
             return [(np.log(row[name]) - by["log mean"]) / by["log std"] for name in names]
 
         axes.axvspan(*in_std(by, "low", "high"), color="0.88")

@@ -1,6 +1,6 @@
-"""How a valve closes, and whether its closed state is the only one.
+"""Closures of a valve, and tests whether its closed state is unique.
 
-The gate closes an anatomy under variations that must not matter and follows it along its moduli
+The gate closes an anatomy under variations that must not matter, and follows it along its moduli
 (`mvest.closure.robustness`). With ``gate.every_step`` one closure is measured step by step instead.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
-    """What is done with the valve."""
+    """Which test is run."""
 
     every_step: bool = False  # measure one closure step by step, without the gate
 
@@ -58,7 +58,7 @@ def _gate(job: Job[Settings]) -> Result:
     verdict = {"passed": report.passed, "closures": closures}
     return Result(
         tables={"": table([verdict], passed=""), "variations": gate_rows(report)},
-        # By these others look the verdict up.
+        # Other studies look the verdict up by these.
         numbers={"anatomy": anatomy_digest(values), "passed": report.passed},
         status="converged" if reference.passed else "failed",
         reason="completed" if reference.passed else reference.reason,
@@ -86,7 +86,7 @@ def _closing(job: Job[Settings]) -> Result:
 
 
 def summary(results: Results) -> dict[str, Table]:
-    """The verdict on each anatomy and the largest distance of each variation; steps as they are."""
+    """The verdicts and the largest distance of each variation by anatomy, or the steps."""
     parts = {record.row: record.table_of() for record in results.records.values()}
     if "variations" not in results.table_names:
         return {"": results.table()}
@@ -101,7 +101,7 @@ def summary(results: Results) -> dict[str, Table]:
 
 
 MOMENTS = (0.75, 0.1)
-"""Shares of the open orifice at which a closing valve is drawn, beside the open and the last."""
+"""Shares of the open orifice at which a closing valve is drawn, besides the first and last step."""
 
 CURVES = {
     "orifice": "orifice (mm²)",
@@ -111,13 +111,7 @@ CURVES = {
 
 
 def figure(results: Results) -> Figure | None:
-    """Four moments of a closing valve from the atrium and from the side, above four curves.
-
-    Raises
-    ------
-    InputError
-        If the arrays (`Closing.arrays`) cannot be read.
-    """
+    """Four moments of a closing valve from the atrium and from the side, and its measures."""
     name, record = next(iter(results.records.items()))
     if name not in results.arrays:
         return None
@@ -144,14 +138,14 @@ def figure(results: Results) -> Figure | None:
 
 
 def _moments(orifice: FloatArray) -> list[int]:
-    """Open, half open, nearly closed, closed; the last one for what is never reached."""
+    """Open, half open, nearly closed and last step; the last one if a share is not reached."""
     share, last = orifice / max(float(orifice[0]), 1e-9), len(orifice) - 1
     reached = [int(np.append(np.flatnonzero(share < level), last)[0]) for level in MOMENTS]
     return [0, *reached, last]
 
 
 def _draw_curves(part: Any, values: Mapping[str, Any], moments: list[int], at_rest: bool) -> None:
-    """Measures over time, the drawn moments marked; the equilibrium is at no time, so apart."""
+    """Measures over time with the drawn moments; the equilibrium has no time and is drawn apart."""
     from mvest.reporting.figures import COLOURS, plain_axes
 
     time = np.array(values["time"], dtype=float)

@@ -1,8 +1,8 @@
-"""Virtual patients in simulated volumes: imaged, estimated blindly, then revealed.
+"""Virtual patients in simulated volumes: blind estimates, compared with the truth.
 
-A process of its own goes from the file of a volume to the moduli. Two others start from better
-geometries: from where the valve truly was (known geometry), and from that with the error of a voxel
-(perfect segmentation). What is left of the error there is not the images'.
+A separate process goes from the file of a volume to the moduli. Two others start from better
+geometries: the true one (known geometry), and the true one with the error of a voxel (perfect
+segmentation). The errors that remain there are not caused by the images.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.stats import linregress, sem
@@ -50,7 +50,7 @@ from mvest.problem.stored import entry_of
 from mvest.provenance import write_json
 from mvest.reading.documents import read_mapping
 from mvest.reporting.skill import skill_table, verdict_table
-from mvest.reporting.tables import Column, Table, joined, table
+from mvest.reporting.tables import Column, Table, table
 from mvest.simulation.imaged_patient import (
     IMAGED,
     EchoSettings,
@@ -67,38 +67,28 @@ from mvest.simulation.virtual_patient import (
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
-"""A patient, how it was imaged, and how many anatomies were drawn for it."""
+"""A patient, its imaging, and the number of anatomies drawn for it."""
 
-VOLUME, HIDDEN, TRUTH = "volume.seq.nrrd", "hidden", "hidden/truth"
-"""In the folder of a patient: the file that an estimator is given, the folder that it cannot open,
-with the truth and the cases of better geometries, and what no estimation is given."""
+VOLUME, HIDDEN, TRUTH, REVEALED = "volume.seq.nrrd", "hidden", "hidden/truth", "hidden.json"
+"""In the folder of a patient: the file for the estimator; the folder that it cannot open, with the
+cases of better geometries; the folder that no estimation can open; and the file of the truth."""
 
-REVEALED = "hidden.json"
 KNOWN, SEGMENTED = "known", "segmented"
-"""Folders of the better geometries, and what a record calls the estimates from them."""
-
-SOURCES = {
-    "": "the volume",
-    SEGMENTED: "a perfect segmentation",
-    KNOWN: "the known geometry",
-}
+"""Folders of the better geometries, and names of their estimates in a record."""
+SOURCES = {"": "the volume", SEGMENTED: "a perfect segmentation", KNOWN: "the known geometry"}
 
 MAX_DRAWS = 10
-"""Anatomies that are drawn, one after another, until one closes as a valve does."""
+"""Anatomies are drawn until one closes as a valve, but not more than this."""
 
 KNOWN_UNCERTAINTY = {"std_mm": 0.5, "correlation_length_mm": 10.0}
-"""What the case of the true positions states: about what the image step does."""
+"""Stated errors of the true positions, similar to those of the image step."""
 
 VOXELS_CORRELATED = 10.0
-"""Voxels over which errors of a segmentation are correlated: surfaces of label maps are smoothed,
-and rougher ones cannot be meshed."""
+"""Correlation length of errors of a segmentation in voxels: surfaces of label maps are smoothed."""
 
 SAMPLES = 100
-"""Of the errors of a segmentation, that go with its case."""
+"""Samples of the errors of a segmentation in its case."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +104,7 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_imaged_patient(job: Job[Settings]) -> Result:
-    """Simulate, estimate from the volume and from better geometries, reveal."""
+    """Simulate, estimate from the volume and from better geometries, then reveal the truth."""
     values, folder, personal = job.values, job.folder, job.settings.personal
     place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
     hidden = read_mapping(place / TRUTH / REVEALED)
@@ -129,11 +119,8 @@ def run_imaged_patient(job: Job[Settings]) -> Result:
     estimate = _numbers_if_converged(found.estimates[0])
     about = {"case": job.settings.patient.name, "seed": values["seed"]}
     others = {"alternatives": {**estimate.alternatives, **better}}
-    ratios = [
-        {"family": name, "ratio": one}
-        for name, each in hidden["chord_ratios"].items()
-        for one in each
-    ]
+    chordae = hidden["chord_ratios"].items()
+    ratios = [{"family": name, "ratio": one} for name, each in chordae for one in each]
     return found.changed(
         tables={"chordae": table(ratios)} if ratios else {},
         numbers={"anatomies_drawn": hidden["anatomies_drawn"]},
@@ -144,7 +131,7 @@ def run_imaged_patient(job: Job[Settings]) -> Result:
 
 
 def _numbers_if_converged(record: EstimateRecord) -> EstimateRecord:
-    """An estimate; its unknowns have no numbers where it did not converge."""
+    """An estimate, without numbers if it did not converge."""
     if record.converged:
         return record
     nothing = dict.fromkeys(("estimate", "std", "low", "high", "bound"))
@@ -154,15 +141,11 @@ def _numbers_if_converged(record: EstimateRecord) -> EstimateRecord:
 
 # -- the patient ----------------------------------------------------------------------------------
 def make_imaged_patient(values: Values, patient: PatientSettings, echo: EchoSettings) -> Path:
-    """Simulate and image the configured patient, unless that was done: the folder where it lies."""
+    """The folder of the configured patient, which is simulated and imaged once."""
+    about = ("name", "description", "moduli", "moduli_spread", "variation", "deviations")
     described = {
-        "patient": {
-            key: values["patient"][key]
-            for key in ("name", "description", "moduli", "moduli_spread", "variation", "deviations")
-        },
-        "echo": values["echo"],
-        "valve": values["valve"],
-        "mechanics": values["mechanics"],
+        "patient": {key: values["patient"][key] for key in about},
+        **{key: values[key] for key in ("echo", "valve", "mechanics")},
         "uncertainty": KNOWN_UNCERTAINTY,
         "seed": values["seed"],
     }
@@ -199,7 +182,7 @@ def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> M
 def _write(place: Path, imaged: Made, patient: PatientSettings, described: Values) -> None:
     made, probe, volume, draws = imaged
     (place / TRUTH).mkdir(parents=True)
-    # The source of what is simulated names the patient; a file has its name alone.
+    # The source of a simulated volume names the patient; a file has only its own name.
     write_sequence_nrrd(place / VOLUME, volume)
     frames = CaseFrames(0, made.closed, made.pressure_mmHg)
     true = true_sequence(made.valve, probe)
@@ -213,12 +196,9 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
         KNOWN: (stated, "its true positions", None),
         SEGMENTED: (seen, "a perfect segmentation", samples),
     }
+    about: dict[str, Any] = {"source": "simulated", "licence": "MIT", "simulated": True}
     for name, (sequence, what, errors) in better.items():
-        about = f"{patient.description}, {what}"
-        texts = {
-            "name": patient.name, "description": about, "source": "simulated", "licence": "MIT",
-            "simulated": True,
-        }  # fmt: skip
+        texts = {"name": patient.name, "description": f"{patient.description}, {what}", **about}
         case = case_of_sequence(sequence, frames, texts, error_samples=errors)
         write_case(place / HIDDEN / name, case)
     write_json(
@@ -236,10 +216,9 @@ def _write(place: Path, imaged: Made, patient: PatientSettings, described: Value
 def _segmented(
     true: ValveSequence, frames: CaseFrames, voxel_mm: float, seed: int
 ) -> tuple[ValveSequence, ErrorSamples]:
-    """The true positions as a label map without mistakes has them: to the error of a voxel.
+    """The true positions with the rounding error of a voxel, and samples of this error.
 
-    The error of a position that is rounded to a voxel, in open and closed frame and of the tips,
-    independent of each other, and samples of it.
+    Errors of open frame, closed frame and tips are independent.
     """
     rng = np.random.default_rng([seed, 3])
     std, count = voxel_mm / np.sqrt(12.0), len(true.times)
@@ -265,7 +244,7 @@ def _segmented(
 
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
-    """Moduli beside the truth, what they are worth, and what costs them how much."""
+    """Moduli and truths, the skill and bias of each source, and the lengths of chordae."""
     groups = _by_source(results)
     skill = unknowns_of(groups) | unknowns_of(groups, by_name=True)
     estimates = [estimate for _, estimate in revealed(results)]
@@ -280,7 +259,7 @@ def summary(results: Results) -> dict[str, Table]:
 
 
 def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
-    """Estimates by what they are from; each has its own verdict, or that on the volume's."""
+    """Estimates by source, each with its own verdict or with that of the volume's estimate."""
     return grouped(
         (source, estimate, own if verdict_of_volume else estimate)
         for _, own in revealed(results)
@@ -289,33 +268,25 @@ def _by_source(results: Results, *, verdict_of_volume: bool = False) -> Groups:
     )
 
 
-def _figure(results: Results) -> dict[str, Figure]:
-    return {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))}
-
-
 def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each patient and modulus; errors have a sign."""
+    """A row for each patient and modulus, with signed errors."""
     rows = []
     for estimate in estimates:
         for own in estimate.moduli:
             row = {"patient": estimate.case, **modulus_row(estimate, own)}
             for name in (SEGMENTED, KNOWN):
                 better = estimate.alternatives[name]
-                error = modulus_row(better, better.unknown(own.name))["error"]
-                row[f"error, {name}"] = error
+                row[f"error, {name}"] = modulus_row(better, better.unknown(own.name))["error"]
             rows.append(row)
-    percent = MODULUS_COLUMNS["error"]
     about = {"patient": Column(label="patient (simulated)"), **MODULUS_COLUMNS}
-    about[f"error, {SEGMENTED}"] = replace(percent, label="error from a perfect segmentation")
-    about[f"error, {KNOWN}"] = replace(percent, label="error from the known geometry")
+    for name in (SEGMENTED, KNOWN):
+        label = f"error from {SOURCES[name]}"
+        about[f"error, {name}"] = replace(MODULUS_COLUMNS["error"], label=label)
     return table(rows, **about)
 
 
 def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
-    """Mean error of each modulus' logarithm, and how far estimates follow the truth.
-
-    Of all that converged, also of those that the verdict denies: it does not see the truth.
-    """
+    """Mean error of each modulus's logarithm, and its slope over the truth's, if converged."""
     rows = []
     for source, moduli in groups.items():
         known = [(own.truth, own.estimate) for own in moduli if own.estimate is not None]
@@ -328,23 +299,20 @@ def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
             line = linregress(truth, found)
             row |= {"slope": line.slope, "slope SE": line.stderr}
         rows.append(row)
-    about = {"estimated from": Column(), "n": Column()}
-    about["bias"] = Column(digits=".2f", std="bias SE", label="mean error of the logarithm ± SE")
-    about["slope"] = Column(digits=".2f", std="slope SE", label="slope over the truth's ± SE")
-    return table(rows, **about)
+    bias = Column(digits=".2f", std="bias SE", label="mean error of the logarithm ± SE")
+    slope = Column(digits=".2f", std="slope SE", label="slope over the truth's ± SE")
+    return table(rows, **{"estimated from": "", "n": "", "bias": bias, "slope": slope})
 
 
 def _chordae(results: Results) -> Table:
-    """True rest length over the distance of a chord's ends in the closed valve, by family.
+    """True rest length of chordae over the distance of their ends in the closed valve, by family.
 
-    Beside it the ratio by which estimators lay chordae out.
+    ``laid out`` is the ratio that estimators assume.
     """
     laid_out = {"marginal": SEEN_CLOSURE.marginal_slack, "basal": SEEN_CLOSURE.basal_slack}
-    records = results.records
-    chordae = {k: one.table_of("chordae") for k, one in records.items() if "chordae" in one.tables}
-    if not chordae:
+    if "chordae" not in results.table_names:
         return table([])
-    families = joined(chordae).frame.groupby("family", sort=False)["ratio"]
+    families = results.table("chordae").frame.groupby("family", sort=False)["ratio"]
     rows = families.agg(ratio="mean", SD="std").reset_index()
     rows["laid out"] = rows["family"].map(laid_out)
     three = Column(digits=".3f")
@@ -355,7 +323,7 @@ STUDY = Study(
     settings=Settings,
     run=run_imaged_patient,
     summary=summary,
-    figure=_figure,
+    figure=lambda results: {"moduli": groups_figure(_by_source(results, verdict_of_volume=True))},
     captions={
         "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
         "verdict on the one from the volume. Simulated.",

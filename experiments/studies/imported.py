@@ -1,8 +1,8 @@
-"""Valves from outside: imported, closed, gated and estimated from.
+"""Imported valves: closures, gates and estimates.
 
-A recorded closure (``donor``) is fitted from its closed frame, from several starts. The shape of a
-reference heart (``heart``) is meshed and closed, and moduli that were put in are estimated on it.
-Neither is part of this project; ``conf/experiment`` says where they are from.
+A recorded closure (``donor``) is fitted to its closed frame from several starts. The shape of a
+reference heart (``heart``) is meshed and closed, and known moduli are estimated on it. The data are
+not part of this project; ``conf/experiment`` names their sources.
 """
 
 from __future__ import annotations
@@ -34,12 +34,7 @@ from experiments.common.schema import InputFile, Reads, Values, contents
 from experiments.common.study import Job, Result, Results, Study
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import write_case
-from mvest.cases.tissue import (
-    CLOSED_DEPTH,
-    LeafletBand,
-    assumed_closure,
-    lay_out_chordae,
-)
+from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -59,21 +54,15 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.remesh import layered_wedges
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from mvest.valve.mesh.structured import layered_wedges
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def recording_folder(recording: str | None, case: str) -> Path:
-    """The folder of a case in a checkout of a donor's data.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """The folder of a case in a checkout of a donor's data; an InputError if there is none."""
     folder = Path(recording or "") / case
     if not recording or not folder.is_dir():
         raise InputError(
@@ -82,16 +71,15 @@ def recording_folder(recording: str | None, case: str) -> Path:
     return folder
 
 
-def _recording(value: str | None, beside: Values) -> Any:
+def _recording(value: str | None, other: Values) -> Any:
     try:
-        return contents(recording_files(recording_folder(value, str(beside.get("case", "")))))
+        return contents(recording_files(recording_folder(value, str(other.get("case", "")))))
     except InputError:
-        # The study says what is missing.
-        return value
+        return value  # the study raises the error
 
 
 LARGEST_CHANGE = 0.15
-"""Of a modulus' logarithm from one closed state to the next."""
+"""Of a modulus's logarithm between closed states."""
 
 WHERE_FROM = "the data are not part of this package, for where to get them see conf/experiment"
 
@@ -102,20 +90,20 @@ class DonorSettings:
 
     # Checkout of the data.
     recording: Annotated[str | None, Reads(_recording)] = None
-    case: str = ""  # folder in it, after which its deck and frames are called; empty: no donor
+    case: str = ""  # its folder, which names its deck and frames; empty: no donor
     citation: str = ""  # of the data
     leaflets: dict[str, str] = field(default_factory=dict)  # name of a leaflet -> element set
     annulus: str = ""  # node set
     free_edge: str = ""  # node set
-    # Of the midsurface that is meshed and observed, and of that on which contact is sampled.
+    # Of the meshed and observed midsurface, and of that for contact.
     vertices: Count = 430
     contact_vertices: Count = 3000
-    starts: tuple[Any, ...] = ()  # MPa, moduli from which each fit starts
+    starts: tuple[Any, ...] = ()  # MPa, moduli at the start of each fit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeartSettings:
-    """One still shape of a thick valve between two papillary muscles, and what is done with it.
+    """A static shape of a thick valve with two papillary muscles, and its twins.
 
     Files, names and units are options of `mvest.exchange.importing.leaflets`.
     """
@@ -127,13 +115,13 @@ class HeartSettings:
     units: str = "mm"
     name: str = "imported valve"
     citation: str = ""
-    smoothing_mm: Length = 4.0  # round the valve: a spike is sharper than leaflets are thick
-    # Thickness is kept within bounds, as parts are no leaflet.
+    smoothing_mm: Length = 4.0  # removes spikes that are sharper than leaflets are thick
+    # Bounds of the thickness, since some parts are no leaflet.
     min_thickness_mm: Thickness = 0.3
     max_thickness_mm: Thickness = 3.0
-    # Of the free edges below the annulus, closed over open, for which chordae are long enough.
+    # Depth of the free edges below the annulus, closed over open, which sets lengths of chordae.
     closed_depth: Share = 0.5
-    # Of each twin, what its truth has otherwise than the estimator's model (settings of truth).
+    # Twin -> settings of truth that differ from the estimator's model.
     twins: dict[str, Any] = field(default_factory=dict)
 
 
@@ -146,19 +134,19 @@ class Settings:
 
 
 def run(job: Job[Settings]) -> Result:
-    """Fit the recorded donor valve, or do everything of the reference heart.
+    """Fit the recorded donor valve, or close, gate and estimate the reference heart.
 
     Raises
     ------
     MvestError
-        If the data are absent (the message says where to get them) or a setting is inadmissible.
+        If the data are absent (the message names their source) or a setting is inadmissible.
     """
     return _donor(job) if job.settings.donor.case else _heart(job)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """A recorded valve, ready to be closed; ``coarse`` is its midsurface as meshed and observed."""
+    """A recorded valve, ready to be closed; ``coarse`` is the meshed and observed midsurface."""
 
     recording: Recording
     coarse: Valve
@@ -173,9 +161,9 @@ class Recorded:
         return ClosureModel(*valves, self.mesh, self.settings, parameters, **settings)
 
     def distances(self, closed: FloatArray | None) -> dict[str, float | None]:
-        """Distances (mm) of closed positions ``(n, 3)`` from where they were recorded.
+        """Distances (mm) of closed positions ``(n, 3)`` from the recorded ones.
 
-        The surface's is the mean of the whole surface from the recorded one, both ways.
+        ``surface`` is the mean distance between the whole surfaces, in both directions.
         """
         if closed is None:
             return dict.fromkeys(DISTANCES)
@@ -202,10 +190,10 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
     protocol = settings.protocol
     if protocol.pressure_mmHg != 0 or protocol.curve:
         raise ConfigurationError(
-            f"mechanics.protocol.pressure_mmHg = {protocol.pressure_mmHg}: the recording says how "
-            "large the pressure is and how it rises; leave it 0, without a curve"
+            f"mechanics.protocol.pressure_mmHg = {protocol.pressure_mmHg}: the recording has the "
+            "pressure and its rise; expected 0, without a curve"
         )
-    # The pressure may rise otherwise than the motion.
+    # The pressure may rise differently from the motion.
     shares, times = recording.pressure_share, recording.times / recording.times[-1] * protocol.ramp
     together = np.allclose(shares, recording.valve.motion.phase, rtol=0, atol=1e-12)
     curve = () if together else tuple(zip(times.tolist(), shares.tolist(), strict=True))
@@ -215,11 +203,11 @@ def recorded_valve(config: Values, donor: DonorSettings) -> Recorded:
         raise ConfigurationError(
             f"parameters = {config['parameters']}, expected one modulus for each leaflet: {unknown}"
         )
-    places, coarse = recording.remeshed(donor.vertices)
+    kept, coarse = recording.remeshed(donor.vertices)
     _, contact = recording.remeshed(donor.contact_vertices)
     layers = {"element_type": config["mechanics"]["element"], "layers": config["mesh"]["layers"]}
     mesh = layered_wedges(coarse.surface, recording.valve.surface, **layers)
-    seen = recording.positions(places.triangle, places.weights, -1)
+    seen = recording.frames[-1][kept]
     return Recorded(recording, coarse, contact, mesh, replace(settings, protocol=loaded), seen)
 
 
@@ -230,7 +218,7 @@ def _donor(job: Job[Settings]) -> Result:
     if not isinstance(filter_, IteratedFilter):
         raise ConfigurationError(
             "filter: a recorded valve needs the iterated filter, whose result does not depend on "
-            "the start by construction"
+            "the start"
         )
     starts = [np.array(start, dtype=float) for start in donor.starts]
     if not starts or any(start.shape != prior.mean.shape for start in starts):
@@ -244,7 +232,7 @@ def _donor(job: Job[Settings]) -> Result:
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(starts), parameters) as bar:
         first = valve.model(parameters, repeat=False, **how)
         first.on_step = bar.step
-        # A start is met again by rounding of its logarithm.
+        # A start differs by the rounding of its logarithm.
         known = Remembered(first, rtol=1e-12)
         generic: Prediction = known(prior.mean)
         if generic.converged:
@@ -252,7 +240,7 @@ def _donor(job: Job[Settings]) -> Result:
         row = {"closure": "generic", "ended": generic.reason}
         rows.append(row | valve.distances(shapes.get("generic")))
         for k, start in enumerate(starts):
-            # Each goes on from the generic closed valve.
+            # Each continues from the generic closed valve.
             model = Remembered(copy(first), known.runs, known.rtol)
             own = replace(filter_, start=tuple(map(float, start)))
             tissue = valve.settings.tissue
@@ -268,16 +256,14 @@ def _donor(job: Job[Settings]) -> Result:
     failed = [] if generic.converged else [f"generic: {generic.reason}"]
     failed += [one.reason for one in records if not one.converged]
     about = {"closure": Column(), "ended": Column(hidden=True)}
+    pressure = valve.settings.protocol.pressure_mmHg
     return Result(
         tables={
-            "": table(rows, **about, **dict.fromkeys(DISTANCES, Column("mm", ".2f"))),
+            "": table(rows, **about, **dict.fromkeys(DISTANCES, "mm:.2f")),
             "moduli": estimates_table("estimation", records),
         },
         estimates=tuple(records),
-        numbers={
-            "data": donor.citation,
-            "pressure_mmHg": valve.settings.protocol.pressure_mmHg,
-        },
+        numbers={"data": donor.citation, "pressure_mmHg": pressure},
         arrays=_arrays(valve, shapes) if len(shapes) == 2 else {},
         status="failed" if failed else "converged",
         reason=failed[0] if failed else records[0].reason,
@@ -288,16 +274,13 @@ def _donor(job: Job[Settings]) -> Result:
 
 
 def _arrays(valve: Recorded, shapes: Mapping[str, FloatArray]) -> dict[str, Any]:
-    """As those of a case (`mvest.problem.fields`)."""
-    tips = valve.recording.valve.motion.papillary_tips
-    away = {k: np.linalg.norm(points - valve.seen, axis=1)[None] for k, points in shapes.items()}
-    return {
-        **valve_fields(valve.coarse, ["closed"]),
-        "tips": tips[[0, -1]],
-        "observed": valve.seen[None],
-        **{name: points[None] for name, points in shapes.items()},
-        **{f"distance_{name}": distance for name, distance in away.items()},
-    }
+    """Fields of a case (`mvest.problem.fields`)."""
+    tips = valve.recording.valve.motion.papillary_tips[[0, -1]]
+    arrays = {**valve_fields(valve.coarse, ["closed"]), "tips": tips, "observed": valve.seen[None]}
+    for name, points in shapes.items():
+        away = np.linalg.norm(points - valve.seen, axis=1)
+        arrays |= {name: points[None], f"distance_{name}": away[None]}
+    return arrays
 
 
 def import_heart(heart: HeartSettings) -> ValveCase:
@@ -306,7 +289,7 @@ def import_heart(heart: HeartSettings) -> ValveCase:
     Raises
     ------
     InputError, GeometryError
-        A part is missing or is none of a thick valve with two muscles.
+        A part is missing, or is not part of a thick valve with two muscles.
     """
     for file in (heart.source, *(heart.muscles if heart.leaflets is None else ())):
         if file is None or not Path(file).is_file():
@@ -334,9 +317,13 @@ def import_heart(heart: HeartSettings) -> ValveCase:
 
 
 def _heart(job: Job[Settings]) -> Result:
-    heart, values = job.settings.heart, job.values
+    heart, values, place = job.settings.heart, job.values, job.folder / "case"
     case = import_heart(heart)
-    own = _on_case(values, case, job.folder / "case")
+    if place.exists():
+        shutil.rmtree(place)
+    write_case(place, case)
+    anatomy = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
+    own = {**values, "valve": {**values["valve"], **anatomy}}
     closing = close_valve(own)
     gate = gate_report(own)
     records = [_twin(own, name, changes) for name, changes in heart.twins.items()]
@@ -363,15 +350,6 @@ def _heart(job: Job[Settings]) -> Result:
     )
 
 
-def _on_case(values: Values, case: ValveCase, place: Path) -> dict[str, Any]:
-    """The configuration on the anatomy of a case, which is written to a folder of its own."""
-    if place.exists():
-        shutil.rmtree(place)
-    write_case(place, case)
-    own = {"folder": str(place), "folder_sha256": folder_hash(str(place))}
-    return {**values, "valve": {**values["valve"], **own}}
-
-
 def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
     """Moduli from one simulated observation."""
     twin = build_twin({**values, "truth": {**values["truth"], **changes}})
@@ -380,7 +358,7 @@ def _twin(values: Values, name: str, changes: Values) -> EstimateRecord:
 
 
 def figure(results: Results) -> Figure | None:
-    """The closed donor valve with generic and fitted moduli, or the heart's open and closed."""
+    """The closed donor valve with generic and fitted moduli, or the open and closed heart valve."""
     from matplotlib.figure import Figure
 
     from mvest.reporting.case.figures import case_figure

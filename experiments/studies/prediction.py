@@ -1,8 +1,8 @@
-"""What an estimated valve would do under other conditions, with its truth beside it.
+"""Predictions of an estimated valve under other conditions, compared with the truth.
 
-Simulated patients with one leaking anatomy: each is observed closed, with errors, on another mesh;
-parameters are estimated from that alone; scenarios are predicted at the estimate and at samples of
-its posterior. Only then are the same scenarios computed with the true parameters.
+Simulated patients with one leaking anatomy are observed closed, with errors, on another mesh. Their
+parameters are estimated, and scenarios are predicted at the estimate and at samples of its
+posterior. Then the same scenarios are computed with the true parameters.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.records.record import Mesh
-from experiments.common.schema import Values
 from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -39,7 +38,6 @@ from mvest.scenarios.predict import (
     predict_scenario,
 )
 from mvest.scenarios.scenario import Scenario, model_under
-from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -51,10 +49,10 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 MEASURED_ON = (96, 22)
-"""Vertices around and along the leaflets of the surface on which shapes are measured."""
+"""Vertices around and along the leaflets of the surface for measurements."""
 
 Compared = tuple[PredictedScenario, Sample, Sample]
-"""A prediction, and the valve with the true parameters on its own and on the estimator's mesh."""
+"""A prediction, and the true valve on its own and on the estimator's mesh."""
 
 LARGE = {"p95": "95th percentile", "p99": "99th percentile", "max": "largest"}
 PREDICTED = {
@@ -69,7 +67,7 @@ PREDICTED = {
         for which, label in LARGE.items()
     },
 }
-"""Measures whose intervals are counted, and what readers call them."""
+"""Measures whose intervals are counted, and their labels."""
 
 DRAWN = ("gap_mm2", "coaptation_length_mm", "coaptation_area_mm2", "tenting_height_mm",
          "stress_p99_anterior_mpa", "stress_p99_posterior_mpa")  # fmt: skip
@@ -78,12 +76,12 @@ KINDS = {
     "without_mesh_error": ("low", "high", "truth_own_mesh", "inside_own_mesh"),
     "same_mesh": ("low", "high", "truth_same_mesh", "inside_same_mesh"),
 }
-"""Kinds of intervals -> columns with their ends, the truth, and whether they hold it."""
+"""Kinds of intervals -> columns of the ends, of the truth, and of whether the truth is inside."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionSettings:
-    """What is predicted of estimated valves, and how well their truth is hit."""
+    """Scenarios, samples and simulated patients."""
 
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     samples: Count = 32  # of the first patient's posterior; a power of two
@@ -91,8 +89,7 @@ class PredictionSettings:
     patients: Repeats = 1
     further_samples: Count = 8  # of the posterior of every other patient
     spread: tuple[Logarithm, ...] = ()  # SD of the logarithms of true parameters
-    # Cells of the finer mesh on which each estimate is predicted once to measure the mesh's error;
-    # empty: intervals do not include it.
+    # Cells of a finer mesh for the error of the mesh, which intervals include unless this is empty.
     check_mesh: tuple[AxisCount, ...] = ()
 
 
@@ -109,15 +106,27 @@ def run_prediction(job: Job[Settings]) -> Result:
     Raises
     ------
     ConfigurationError
-        If scenarios, samples or the spread of true parameters make no sense.
+        If scenarios, samples or the spread of true parameters are inadmissible.
     """
     config, settings = job.values, job.settings.prediction
-    _require(settings, config["parameters"])
+    if not settings.scenarios:
+        raise ConfigurationError("prediction.scenarios is empty, expected at least one")
+    for name in ("samples", "further_samples"):
+        count = getattr(settings, name)
+        if count < 2 or count & (count - 1):
+            raise ConfigurationError(f"prediction.{name} = {count}, expected a power of two > 1")
+    spread, parameters = np.array(settings.spread), tuple(config["parameters"])
+    require_one_each("prediction.spread", spread, parameters)
     twin = build_twin(config)
-    # Measured on more points than are observed, which cost time where their errors are correlated.
+    # Measured on more points than are observed, since correlated errors of points cost time.
     valve = anatomy_of(config).valve(*MEASURED_ON)
     usual = replace(twin.model, valve=valve)
-    finer = _mesh_of(config, settings.check_mesh) if settings.check_mesh else None
+    finer = None
+    if settings.check_mesh:
+        columns, rows = settings.check_mesh
+        cells = {**config["mesh"], "columns": columns, "rows": rows}
+        element, store = config["mechanics"]["element"], mesh_store(config)
+        finer = build_mesh(anatomy_of(config), cells, element, store)
     counts = [settings.samples, *[settings.further_samples] * (settings.patients - 1)]
     total = sum(len(settings.scenarios) * (2 + count) + 1 for count in counts)
     with PartBar("prediction", total, "closure") as bar:
@@ -128,7 +137,7 @@ def run_prediction(job: Job[Settings]) -> Result:
     records = tuple(
         record_of(result, seed=seed, simulated=True) for seed, (result, _) in patients.items()
     )
-    rows = [
+    measured = [
         {"patient": seed, "scenario": title, "measure": measure, **row}
         for seed, (_, found) in patients.items()
         for title, (predicted, own, same) in found.items()
@@ -138,10 +147,10 @@ def run_prediction(job: Job[Settings]) -> Result:
     every = [predicted for _, found in patients.values() for predicted, *_ in found.values()]
     attempted = sum(len(one.samples) for one in every)
     tables = {
-        "": table(rows, **dict.fromkeys(rows[0], "")) if rows else table([]),
+        "": table(measured, **dict.fromkeys(measured[0], "")) if measured else table([]),
         "parameters": estimates_table("patient", records),
-        "first_patient": first_patient_table(rows),
-        "coverage": coverage_table(rows),
+        "first_patient": first_patient_table(measured),
+        "coverage": coverage_table(measured),
         "not_closed": table(_failures(patients)),
     }
     return Result(
@@ -163,22 +172,7 @@ def run_prediction(job: Job[Settings]) -> Result:
     )
 
 
-def _require(settings: PredictionSettings, parameters: Sequence[str]) -> None:
-    if not settings.scenarios:
-        raise ConfigurationError("prediction.scenarios is empty, expected at least one")
-    for name in ("samples", "further_samples"):
-        count = getattr(settings, name)
-        if count < 2 or count & (count - 1):
-            raise ConfigurationError(f"prediction.{name} = {count}, expected a power of two > 1")
-    require_one_each("prediction.spread", np.array(settings.spread), tuple(parameters))
-
-
 # -- estimate and predict -------------------------------------------------------------------------
-def _draw_truth(twin: Twin, settings: PredictionSettings, rng: np.random.Generator) -> FloatArray:
-    spread = np.array(settings.spread, dtype=float)
-    return np.asarray(twin.truth_values * np.exp(spread * rng.standard_normal(len(spread))))
-
-
 def _patient(
     twin: Twin,
     usual: ClosureModel,
@@ -188,14 +182,15 @@ def _patient(
     settings: PredictionSettings,
     step: Callable[[], None],
 ) -> tuple[StudyResult, dict[str, Compared]]:
-    """One simulated patient: the estimate, and what is predicted by the titles of scenarios."""
+    """One simulated patient: the estimate, and predictions by the title of the scenario."""
     rng = np.random.default_rng(seed)
-    truth = _draw_truth(twin, settings, rng)
+    spread = np.array(settings.spread, dtype=float)
+    truth = np.asarray(twin.truth_values * np.exp(spread * rng.standard_normal(len(spread))))
     data = twin.observe(twin.source, truth, rng)
     step()
     if data.observation is None:
         return StudyResult.failed(twin.problem, data.reason), {}
-    # From the open valve, so that no patient depends on the one before.
+    # From the open valve, so that patients do not depend on each other.
     twin.model.restart(None)
     steps = len(twin.model.settings.protocol.steps())
     with SolveBar(f"patient {seed}", steps, TYPICAL_SOLVES, twin.problem.parameters) as bar:
@@ -209,7 +204,7 @@ def _patient(
     predicted = []
     for scenario in settings.scenarios.values():
         model = model_under(usual, scenario)
-        check = None if finer is None else _on_mesh(model, finer)
+        check = None if finer is None else replace(model.fresh(), mesh=finer, guide=None)
         found = predict_scenario(model, result.filtered, samples, lambda _: step(), finer=check)
         predicted.append((scenario, model, found))
         step()
@@ -221,24 +216,8 @@ def _patient(
     return result, compared
 
 
-def _mesh_of(config: Values, cells: Sequence[int]) -> SolidMesh:
-    """The configured mesh with ``cells`` around and along the leaflets."""
-    columns, rows = cells
-    return build_mesh(
-        anatomy_of(config),
-        {**config["mesh"], "columns": columns, "rows": rows},
-        config["mechanics"]["element"],
-        mesh_store(config),
-    )
-
-
-def _on_mesh(model: ClosureModel, mesh: SolidMesh) -> ClosureModel:
-    """A fresh model of the same valve on another mesh, closed from the open valve."""
-    return replace(model.fresh(), mesh=mesh, guide=None)
-
-
 def _fields(valve: Valve, compared: Mapping[str, Compared]) -> dict[str, NDArray[Any]]:
-    """Closed shapes at the estimate as fields of a case; NaN where there is none."""
+    """Closed shapes at the estimate as fields of a case; NaN if a valve did not close."""
     blank = np.full(valve.surface.vertices.shape, np.nan)
     shapes = [blank if found.shape is None else found.shape for found, *_ in compared.values()]
     return valve_fields(valve, list(compared)) | {"fitted": np.stack(shapes).astype(np.float32)}
@@ -246,9 +225,9 @@ def _fields(valve: Valve, compared: Mapping[str, Compared]) -> dict[str, NDArray
 
 # -- tables ---------------------------------------------------------------------------------------
 def first_patient_table(rows: Sequence[Row]) -> Table:
-    """Measures of the first patient by condition, with 95 % intervals; a cross marks a miss.
+    """Measures of the first patient by condition, with 95 % intervals.
 
-    Intervals are with the error of the mesh, where that is known.
+    The intervals include the error of the mesh if it is known.
     """
     cells: dict[str, dict[str, Any]] = {}
     columns: dict[str, Column] = {"measure": Column()}
@@ -267,10 +246,9 @@ def first_patient_table(rows: Sequence[Row]) -> Table:
 
 
 def coverage_table(rows: Sequence[Row]) -> Table:
-    """How many intervals of all patients and conditions hold the truth, by measure and in all.
+    """Numbers of intervals that contain the truth, of all patients and conditions, by measure.
 
-    Where all samples and the truth are one number (no gap at all) there is no uncertainty that
-    could be right or wrong: such an interval is not counted.
+    An interval without width at the truth (no gap at all) has no uncertainty and is not counted.
     """
     labels = [*PREDICTED.items(), ("all", "all")]
     out: dict[str, dict[str, Any]] = {name: {"measure": label} for name, label in labels}
@@ -288,7 +266,7 @@ def coverage_table(rows: Sequence[Row]) -> Table:
 
 
 def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]) -> Iterator[Row]:
-    """Valves that were not estimated or did not close, and why."""
+    """Valves that were not estimated or did not close, with the reasons."""
     for seed, (result, compared) in patients.items():
         whole: dict[str, Any] = {"patient": seed, "scenario": "", "valve": "estimate", "count": 1}
         if not compared:
@@ -305,10 +283,10 @@ def _failures(patients: Mapping[int, tuple[StudyResult, Mapping[str, Compared]]]
 
 # -- figure ---------------------------------------------------------------------------------------
 def figure(results: Results) -> Figure | None:
-    """The first patient's closed valve by condition, seen from the atrium, above its measures.
+    """The first patient's closed valve by condition from the atrium, and its measures.
 
-    Leaflets are midsurfaces, which lie a thickness apart where they touch; the slit between them is
-    drawn as tissue, and what is left open in the colour of blood. None without a prediction.
+    Touching midsurfaces are a thickness apart: the slit between them is drawn as tissue, and gaps
+    in the colour of blood. None without a prediction.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
@@ -359,7 +337,7 @@ def figure(results: Results) -> Figure | None:
 
 
 def _draw_measure(axes: Any, rows: DataFrame, titles: Sequence[str]) -> None:
-    """Draw one measure of all patients; matplotlib leaves out what is missing."""
+    """Draw one measure of all patients; matplotlib leaves out missing values."""
     from mvest.reporting.figures import COLOURS, SMALL, plain_axes
 
     plain_axes(axes)

@@ -1,8 +1,8 @@
-"""Virtual patients whose geometry arrives as another program or a segmentation brings it.
+"""Virtual patients whose geometry comes from files of other programs.
 
-The valve of a virtual patient is exported (as surfaces, as a folder of SlicerHeart, as label maps),
-imported, and estimated as any own valve is. No reader or writer of this project takes part in the
-exports: VTK (through PyVista) cuts and writes surfaces, pandas tables, nibabel label maps.
+The valve of a virtual patient is exported (as surfaces, a SlicerHeart folder or label maps),
+imported, and estimated like any own valve. The exports use no reader or writer of this project: VTK
+(through PyVista) cuts and writes surfaces, pandas writes tables, and nibabel label maps.
 """
 
 from __future__ import annotations
@@ -49,13 +49,12 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_surfaces(job: Job[Settings]) -> Result:
-    """Simulate, export, import, estimate in a process of its own, reveal the truth."""
+    """Simulate, export, import, estimate in another process, then reveal the truth."""
     arrival, folder = job.settings.arrival, job.folder
     place = make_patient(job.values, job.settings.patient)
     hidden, positions = place.truth()
     patient = read_case(place.case)
-    for name in ("arrival", "case"):
-        # Of an earlier run.
+    for name in ("arrival", "case"):  # of an earlier run
         shutil.rmtree(folder / name, ignore_errors=True)
     (folder / "arrival").mkdir()
     registration = np.array([hidden["values"][name] for name in REGISTRATION])
@@ -66,7 +65,7 @@ def run_surfaces(job: Job[Settings]) -> Result:
     for role, true in (("open", arrived.opened), ("closed", arrived.closed)):
         numbers[f"{role}_back_mm"] = surface_error(arrived.case.frame(true.role), true)
     numbers["thickness_mean_mm"] = thickness_error(arrived, patient.surface.thickness)
-    # What is displaced in the case of the patient is not in what was imported.
+    # Displacements of the patient's case are not in the imported one.
     truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
     about = {"case": patient.name, "seed": job.values["seed"]}
     (estimate,) = (one.model_copy(update=about).with_truth(truth) for one in found.estimates)
@@ -74,16 +73,13 @@ def run_surfaces(job: Job[Settings]) -> Result:
 
 
 def surface_error(found: Frame, true: Frame) -> float:
-    """Root mean square (mm) of the distances of the true midsurface's vertices from another."""
+    """Root mean square distance (mm) of the true midsurface's vertices from another surface."""
     distance = closest_points(true.vertices, found.vertices, found.triangles).distance
     return float(np.sqrt(np.mean(np.square(distance))))
 
 
 def thickness_error(arrived: Arrived, thickness_mm: FloatArray) -> float:
-    """Mean thickness of the open midsurface less the true one at the nearest point, mm.
-
-    ``thickness_mm`` ``(n,)`` is that of the vertices of the true frame.
-    """
+    """Mean error (mm) of the thickness, from ``thickness_mm (n,)`` at the true frame's vertices."""
     surface, true = arrived.case.surface, arrived.opened
     nearest = closest_points(surface.vertices, true.vertices, true.triangles)
     return float(np.mean(surface.thickness - nearest.interpolate(thickness_mm, true.triangles)))
@@ -91,7 +87,7 @@ def thickness_error(arrived: Arrived, thickness_mm: FloatArray) -> float:
 
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
-    """Each modulus by how the geometry arrived, and what estimates of each way are worth."""
+    """Each modulus by source of the geometry, and the skill of each source."""
     rows = []
     for record, estimate in _runs(results):
         failed_checks = () if estimate.verdict is None else estimate.verdict.failed_checks
@@ -116,18 +112,17 @@ def summary(results: Results) -> dict[str, Table]:
 
 
 OFF = ("open_back", "closed_back", "thickness_mean")
-"""How far geometries are off, in mm, by their names in a record."""
+"""Errors of geometries in mm, by their names in a record."""
 
 
 def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:
-    """Record and estimate of each run, by patient and way."""
+    """Record and estimate of each run, sorted by patient and source."""
 
-    def place(run: tuple[Record, EstimateRecord]) -> tuple[str, int, str]:
-        record, estimate = run
-        kind = KINDS.index(str(record.numbers["kind"]))
-        return estimate.case, kind, str(record.numbers["geometry"])
+    def key(run: tuple[Record, EstimateRecord]) -> tuple[str, int, str]:
+        numbers = run[0].numbers
+        return run[1].case, KINDS.index(str(numbers["kind"])), str(numbers["geometry"])
 
-    return sorted(revealed(results), key=place)
+    return sorted(revealed(results), key=key)
 
 
 def _by_geometry(results: Results) -> Groups:

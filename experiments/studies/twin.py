@@ -66,7 +66,7 @@ def run_twin(job: Job[Settings]) -> Result:
 
 
 def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:
-    """By how many percent the least-squares estimate follows the extrapolation of the truth."""
+    """Change (%) of the least-squares estimate by the extrapolation of the truth."""
     predicted = None if result.filtered is None else result.filtered.prediction
     if not isinstance(twin.source, Extrapolated) or predicted is None:
         return None
@@ -76,7 +76,7 @@ def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:
 
 
 def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
-    """The last observed and fitted frame, as those of a case (`mvest.problem.fields`)."""
+    """The last observed and fitted frame, as fields of a case (`mvest.problem.fields`)."""
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
     return {
@@ -89,23 +89,15 @@ def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
 
 
 def require_twin(values: Mapping[str, Any]) -> None:
-    """Refuse settings of filter and observation that no job could run with.
-
-    Raises
-    ------
-    ConfigurationError
-        If a setting is inadmissible; the message names it.
-    """
+    """Raise a ConfigurationError for inadmissible settings of filter or observation."""
     build_filter(values["filter"], tuple(values["parameters"]))
     observation_variance(values["filter"]["R"])
 
 
 def _row(
-    values: Mapping[str, Any],
-    record: EstimateRecord,
-    band: Sequence[float] | None,
+    values: Mapping[str, Any], record: EstimateRecord, band: Sequence[float] | None
 ) -> dict[str, Any]:
-    """What tables say of one run: plain numbers, errors without sign."""
+    """The row of a run in tables; errors have no sign."""
     row: dict[str, Any] = {"run": values["row"], "source": "mvest"}
     for k, name in enumerate(values["parameters"]):
         own = record.unknown(name)
@@ -134,7 +126,7 @@ def _row(
 
 
 def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, Any]:
-    """What the paper reports of the same experiment."""
+    """The paper's row for the same experiment."""
     paper, names = values["paper"], values["parameters"]
     columns = {
         "estimate": [f"estimate {name}" for name in names],
@@ -150,9 +142,9 @@ def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, A
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Rows of runs with the meaning of their columns."""
+    """Rows of runs, with the meaning of their columns."""
     about: dict[str, Column] = {"run": Column()}
-    for name in (key.removeprefix("estimate ") for key in rows[0] if key.startswith("estimate ")):
+    for name in (key.partition(" ")[2] for key in rows[0] if key.startswith("estimate ")):
         unit, std, band = unit_of(name), f"std {name}", f"truth of {name} known to"
         about |= {
             f"truth {name}": Column(unit, hidden=True),
@@ -161,33 +153,33 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
             f"error {name}": Column("%", std=band, label=f"error {name}"),
             band: Column("%"),
         }
-    about["moduli error mean"] = Column("%", std="moduli error SD", label="error of all moduli")
-    about["moduli error SD"] = Column("%")
-    about["distance mean"] = Column("mm", std="distance SD", label="distance")
-    about["distance SD"] = Column("mm")
-    return table(
-        rows, **about, **dict.fromkeys(("source", "status", "reason"), Column(hidden=True))
-    )
+    about |= {
+        "moduli error mean": Column("%", std="moduli error SD", label="error of all moduli"),
+        "moduli error SD": Column("%"),
+        "distance mean": Column("mm", std="distance SD", label="distance"),
+        "distance SD": Column("mm"),
+        **dict.fromkeys(("source", "status", "reason"), Column(hidden=True)),
+    }
+    return table(rows, **about)
 
 
 def summary(results: Results) -> dict[str, Table]:
-    """A row for each run, failed ones included, below the paper's own row."""
+    """The paper's row, and a row for each run, failed ones included."""
     whole = results.table()
+    paper = [row for row in whole.rows if row["source"] == "paper"][:1]
     rows = [row for row in whole.rows if row["source"] != "paper"]
-    paper = [row for row in whole.rows if row["source"] == "paper"]
-    return {"": table([*paper[:1], *rows], **whole.columns)}
+    return {"": table([*paper, *rows], **whole.columns)}
 
 
 def figure(results: Results) -> dict[str, Figure]:
-    """How the main estimate came about, and the fitted valve if its arrays are there."""
+    """Iterates of the main estimate, and the fitted valve if its arrays are stored."""
     from mvest.reporting.case.figures import case_figure
     from mvest.reporting.figures import iterates_figure
 
     name, record = next(iter(results.records.items()))
     drawn: dict[str, Figure] = {}
     if len(results.records) > 1 and name != record.table:
-        # No run stands for the others.
-        return drawn
+        return drawn  # there is no main run
     if (iterates := iterates_figure(record.estimates[:1])) is not None:
         drawn[""] = iterates
     if name in results.arrays:
@@ -202,7 +194,7 @@ STUDY = Study(
     figure=figure,
     captions={
         "": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
-        "valve": "The fitted closed valve by its distance from the observed one. Simulated.",
+        "valve": "The fitted valve by its distance from the observed one. Simulated.",
     },
     latex=("table1",),
     checks=lambda: (expect_twin,),

@@ -1,4 +1,4 @@
-"""One's own volume over time: from images to moduli with intervals."""
+"""Your own volume over time: from images to moduli with intervals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run(job: Job[Settings]) -> Result:
 
 
 def check_volume(values: Mapping[str, Any], folder: Path) -> str:
-    """Find, measure and draw the valve without simulating anything, and say so."""
+    """Find, measure and draw the valve without simulating anything."""
     from mvest.reporting.images import write_image_step
 
     imaged = build(ImagedInput, values["imaged"])

@@ -1,16 +1,16 @@
-"""A band of leaflets: its boundary loops, commissures and ears, and what must hold of it.
+"""A band of leaflets: its boundary loops, commissures and ears, and its checks.
 
 All loops run in the direction of their triangles. With normals towards the ventricle in both
-frames, two such loops have the same direction, so that commissures differ by which region begins
+frames, two such loops have the same direction, so that commissures differ by the region that begins
 there.
 
-Ears are triangles that lie on an edge of the band with all three corners. Decimation and remeshing
-leave them. The coordinate from annulus to free edge, from which fibres and chordae are laid out,
-does not vary in them. Turning the edge that an ear shares with its neighbour cures it without
-moving a vertex.
+Ears are triangles with all three corners on one edge of the band. Decimation and remeshing leave
+them. The coordinate from annulus to free edge, from which fibres and chordae are laid out, is
+constant in them. Flipping the edge that an ear shares with its neighbour removes it without moving
+a vertex.
 
 Each check raises one error for the first fault: what is wrong and what would be right. The reader
-of a case puts file and field before it.
+of a case adds file and field.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 ANNULUS_DIAMETER = (15.0, 80.0)
-"""mm, largest extent of an annulus between a small child's and the most dilated adult's."""
+"""mm, largest extent of an annulus, from a small child's to the most dilated adult's."""
 CLOSING_PRESSURE = (20.0, 250.0)
 """mmHg, transmitral pressure on a closed valve."""
 LARGEST_THICKNESS = 5.0
@@ -60,23 +60,34 @@ def find_loops(
     annulus: IntArray | None = None,
     free_edge: IntArray | None = None,
 ) -> Loops:
-    """Name the two boundary loops of a band.
+    """Identify annulus and free edge among the two boundary loops of a band.
 
     The free edge is the loop nearer to the papillary tips (mean distance of its vertices from
-    their nearest tips). A loop that is given keeps its order.
+    their nearest tips). A given loop keeps its order.
 
     Raises
     ------
     GeometryError
-        Not exactly two boundary loops, or a given list is not one of them; the loop near the tips
-        is the wider one, as if the tips lay on the atrial side.
+        There are not exactly two boundary loops, or a given list is not one of them; the loop near
+        the tips is the wider one, as if the tips were on the atrial side.
     """
     loops = two_loops(vertices, triangles)
     outer = None if annulus is None else _which("annulus", annulus, loops)
     inner = None if free_edge is None else _which("free_edge", free_edge, loops)
-    if inner is None:
-        inner = _nearer_to_tips(vertices, tips, loops) if outer is None else 1 - outer
-    outer = 1 - inner if outer is None else outer
+    if outer is None and inner is None:
+        curves = [vertices[loop] for loop in loops]
+        away = [np.linalg.norm(x[:, None] - tips, axis=2).min(axis=1).mean() for x in curves]
+        inner, area = int(np.argmin(away)), [np.linalg.norm(loop_vector_area(x)) for x in curves]
+        if area[inner] > area[1 - inner]:
+            raise GeometryError(
+                f"the papillary tips are nearest to the wider edge of the surface (which encloses "
+                f"{area[inner]:.0f} mm^2, the other {area[1 - inner]:.0f} mm^2), so they seem to "
+                "lie above the annulus, on the atrial side; correct papillary_tips, or name the "
+                "annulus if this is right"
+            )
+    if outer is None:
+        outer = 1 - (inner or 0)
+    inner = 1 - outer if inner is None else inner
     if outer == inner:
         raise GeometryError("annulus and free_edge are the same boundary loop; expected both loops")
     return Loops(
@@ -85,28 +96,10 @@ def find_loops(
     )
 
 
-def _nearer_to_tips(vertices: FloatArray, tips: FloatArray, loops: list[IntArray]) -> int:
-    """Number of the loop that is nearer to the papillary tips and must be the smaller one."""
-    curves = [vertices[loop] for loop in loops]
-    away = [np.linalg.norm(x[:, None] - tips, axis=2).min(axis=1).mean() for x in curves]
-    near, area = int(np.argmin(away)), [np.linalg.norm(loop_vector_area(x)) for x in curves]
-    if area[near] > area[1 - near]:
-        raise GeometryError(
-            f"the papillary tips are nearest to the wider edge of the surface (which encloses "
-            f"{area[near]:.0f} mm^2, the other {area[1 - near]:.0f} mm^2), so they seem to lie "
-            f"above the annulus, on the atrial side; correct papillary_tips, or name the annulus "
-            f"if this is right"
-        )
-    return near
-
-
 def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
-    """The boundary loops of a surface, or what is wrong if they are not two.
+    """The two boundary loops of a surface.
 
-    Raises
-    ------
-    GeometryError
-        With the size and place of the loops: those that are no annulus and no free edge are holes.
+    GeometryError with size and position of the loops if there are not two: further ones are holes.
     """
     loops = boundary_loops(triangles)
     if len(loops) == 2:
@@ -121,13 +114,12 @@ def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
         f"{np.round(vertices[loops[i]].mean(axis=0), 1).tolist()} (vertex {int(loops[i][0])})"
         for i in order[:5]
     )
+    advice = "open it along the annulus and along the free edge"
     if len(loops) > 2:
         advice = (
             f"close the {len(loops) - 2} holes (the shortest loops), or merge the vertices along "
             "the seams of its parts"
         )
-    else:
-        advice = "open it along the annulus and along the free edge"
     raise GeometryError(
         f"{len(loops)} boundary loops ({listed or 'none'}), expected two, the annulus and the free "
         f"edge: {advice}"
@@ -135,7 +127,7 @@ def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
 
 
 def _which(name: str, wanted: IntArray, loops: list[IntArray]) -> int:
-    """Number of the boundary loop that a list of vertices runs along, in either direction."""
+    """Number of the boundary loop with a list of vertices, in either direction."""
 
     def edges(loop: IntArray) -> set[frozenset[int]]:
         pairs = np.stack([loop, np.roll(loop, -1)], axis=1)
@@ -154,8 +146,8 @@ def _which(name: str, wanted: IntArray, loops: list[IntArray]) -> int:
     raise GeometryError(
         f"{name} is not closed: its {len(wanted)} vertices are not one of the boundary loops "
         f"({', '.join(str(len(loop)) for loop in loops)} vertices); of the nearest it misses "
-        f"{missing[:5].tolist()} ({len(missing)} in all) and has {extra[:5].tolist()} "
-        f"({len(extra)} in all) besides"
+        f"{missing[:5].tolist()} ({len(missing)} in all) and adds {extra[:5].tolist()} "
+        f"({len(extra)} in all)"
     )
 
 
@@ -168,17 +160,10 @@ def directed(loop: IntArray, triangles: IntArray) -> IntArray:
 def commissures(
     loop: IntArray, triangles: IntArray, region: IntArray
 ) -> dict[int, tuple[int, int]]:
-    """Where each region begins and ends along a loop that runs in the direction of its triangles.
+    """Positions (begin, end) of each region in a loop that runs in the direction of its triangles.
 
-    Returns
-    -------
-    dict
-        Region to the positions (begin, end) in ``loop``; the end is where the next region begins.
-
-    Raises
-    ------
-    GeometryError
-        A region does not touch the loop in one piece, or there is only one region.
+    The end is where the next region begins. GeometryError if a region does not touch the loop in
+    one piece, or there is only one region.
     """
     edges = map(tuple, directed_edges(triangles).tolist())
     region_at = dict(zip(edges, np.tile(region, 3).tolist(), strict=True))
@@ -214,35 +199,19 @@ def match_annulus(
     seen: tuple[FloatArray, IntArray, IntArray],
     seen_annulus: IntArray,
 ) -> FloatArray:
-    """Where the annulus vertices of the reference are on the annulus of another frame.
+    """Positions ``(k, 3)`` mm of the reference's annulus vertices on the annulus of another frame.
 
-    Between two commissures a vertex keeps its share of the arc length.
-
-    Parameters
-    ----------
-    reference, seen
-        Vertices ``(n, 3)`` mm, triangles and regions of the two frames.
-    reference_annulus, seen_annulus
-        The annulus loops.
-
-    Returns
-    -------
-    ndarray
-        ``(k, 3)`` mm, in the order of ``reference_annulus``.
-
-    Raises
-    ------
-    InputError
-        The regions follow each other differently along the two loops.
-    GeometryError
-        No commissures.
+    Between two commissures a vertex keeps its share of the arc length. Frames are vertices
+    ``(n, 3)`` mm, triangles and regions. The result has the order of ``reference_annulus``.
+    InputError if the regions follow each other differently along the two loops, GeometryError if
+    there are no commissures.
     """
     vertices, triangles, region = reference
     loop = directed(reference_annulus, triangles)
     other = directed(seen_annulus, seen[1])
     pieces = commissures(loop, triangles, region)
     other_pieces = commissures(other, seen[1], seen[2])
-    # Cyclic sequences, begun at their smallest entries.
+    # Cyclic sequences, rotated to begin with their smallest entries.
     order, other_order = (
         np.roll(labels, -int(np.argmin(labels))) for labels in (list(pieces), list(other_pieces))
     )
@@ -262,22 +231,10 @@ def match_annulus(
 
 
 def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
-    """The triangles with the inner edges of ears turned, where that can be done.
+    """Flip the inner edges of ears, if possible; returns the triangles and the numbers of the ears.
 
-    What is turned depends on the numbers of the vertices alone, so that surfaces that correspond
-    still do. A surface that is no band is left as it is: to refuse it is the checks' part.
-
-    Parameters
-    ----------
-    triangles : ndarray
-        ``(m, 3)``.
-
-    Returns
-    -------
-    triangles : ndarray
-        ``(m, 3)``.
-    ears : ndarray
-        ``(k,)`` those that were cured.
+    The result depends on the numbers of the vertices alone, so that surfaces that correspond still
+    do. A surface that is not a band is returned unchanged, for the checks to refuse it.
     """
     loops: list[IntArray] = []
     with suppress(GeometryError):
@@ -310,14 +267,14 @@ def _turn(
     ear: int,
     loop_of: IntArray,
 ) -> bool:
-    """Turn an inner edge of an ear, if there is a neighbour with a corner elsewhere."""
+    """Flip an inner edge of an ear, if a neighbour has a corner elsewhere."""
     for b, c in _edges(triangles[ear]):
         neighbour = owner.get((c, b))
         if neighbour is None:
             continue
         (a,) = set(triangles[ear]) - {b, c}
         (d,) = set(triangles[neighbour]) - {b, c}
-        # The turned edge must be new: two sheets would be joined otherwise.
+        # The flipped edge must be new: two sheets would be joined otherwise.
         if loop_of[d] == loop_of[a] or (a, d) in owner or (d, a) in owner:
             continue
         del owner[b, c], owner[c, b]
@@ -364,15 +321,12 @@ def check_band(vertices: FloatArray, triangles: IntArray, *, self_intersections:
 
 
 def check_annulus_size(annulus: FloatArray) -> None:
-    """Raise where the largest extent (mm) of the annulus is none of a valve."""
+    """Raise if the largest extent (mm) of the annulus is not that of a valve."""
     size = float(pdist(annulus).max())
     low, high = ANNULUS_DIAMETER
     if not low <= size <= high:
-        fits = [
-            unit
-            for unit, factor in (("m", 1000.0), ("cm", 10.0), ("mm", 0.1), ("mm", 0.001))
-            if low <= size * factor <= high
-        ]
+        factors = (("m", 1000.0), ("cm", 10.0), ("mm", 0.1), ("mm", 0.001))
+        fits = [unit for unit, factor in factors if low <= size * factor <= high]
         guess = f" (its numbers would fit {fits[0]} instead)" if fits else ""
         raise GeometryError(
             f"the annulus is {size:.3g} mm across, expected {low:g} to {high:g} mm: is "
@@ -381,15 +335,15 @@ def check_annulus_size(annulus: FloatArray) -> None:
 
 
 def ventricular_side(annulus: FloatArray, free_edge: FloatArray) -> float:
-    """1 where the vector area of an annulus (in its order) points to the free edge, else -1."""
+    """1 if the vector area of an annulus (in its order) points to the free edge, else -1."""
     down = free_edge.mean(axis=0) - annulus.mean(axis=0)
     return 1.0 if down @ loop_vector_area(annulus) > 0 else -1.0
 
 
 def check_tips(annulus: FloatArray, side: float, tips: FloatArray) -> None:
-    """Raise where a papillary tip is not on the ventricular side of the annulus, or far away.
+    """Raise if a papillary tip is not on the ventricular side of the annulus, or is too far away.
 
-    ``side`` is that of `ventricular_side` in the open frame; the annulus has the same order here.
+    ``side`` is `ventricular_side` of the open frame; the annulus has the same order here.
     """
     centre = annulus.mean(axis=0)
     normal = side * loop_vector_area(annulus)
@@ -414,8 +368,8 @@ def check_normals(
 ) -> None:
     """Raise unless the triangles face the ventricle.
 
-    The annulus runs as the triangles at it do, so its vector area has their side, however the
-    leaflets lie and however wide the orifice is. Edges within the surface are run along both ways.
+    The vector area of the annulus in the direction of its triangles has their side, whatever the
+    position of the leaflets and the width of the orifice. Inner edges cancel in pairs.
     """
     edges = directed_edges(triangles)
     start, end = np.moveaxis(vertices[edges[np.isin(edges, annulus).all(axis=1)]], 1, 0)
@@ -429,7 +383,7 @@ def check_normals(
 
 
 def check_thickness(thickness: FloatArray) -> None:
-    """Raise unless every thickness (mm) is positive and that of a leaflet."""
+    """Raise unless every thickness (mm) is positive and at most `LARGEST_THICKNESS`."""
     bad = np.flatnonzero(~((thickness > 0) & (thickness <= LARGEST_THICKNESS)))
     if len(bad):
         k = int(bad[0])
@@ -440,11 +394,11 @@ def check_thickness(thickness: FloatArray) -> None:
 
 
 def check_closing_pressure(pressure_mmhg: float, unit: str) -> None:
-    """Raise where the pressure on the closed valve is not one that closes a mitral valve."""
+    """Raise if the pressure on the closed valve cannot close a mitral valve."""
     low, high = CLOSING_PRESSURE
     if not low <= pressure_mmhg <= high:
         other = "kPa" if unit == "mmHg" else "mmHg"
         raise InputError(
             f"{pressure_mmhg:g} mmHg on the closed valve, expected {low:g} to {high:g} mmHg: is it "
-            f"in {other} (units.pressure says {unit})? It is positive where it closes the valve"
+            f"in {other} (units.pressure says {unit})? A positive pressure closes the valve"
         )

@@ -1,7 +1,8 @@
-"""One case: a valve at rest, and how it was seen in further frames.
+"""One case: a valve at rest and its observations in further frames.
 
-A case is what an estimation knows of a patient. It is read from a folder (`mvest.cases.folder`) or
-written by a simulation. It does not contain the moduli. All lengths are mm, times s.
+A case is all that an estimation knows of a patient. It is read from a folder
+(`mvest.cases.folder`) or written by a simulation. It does not contain the moduli. All lengths are
+mm, times s.
 """
 
 from __future__ import annotations
@@ -22,64 +23,37 @@ from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 
 MIN_SAMPLES, MAX_SAMPLES = 4, 500
 LARGEST_ERROR = 20.0
-"""mm, displacement of a point in any sample."""
+"""mm, largest displacement of a point in any sample."""
 
 
 class Role(StrEnum):
-    """What a frame is for.
-
-    ``REFERENCE`` is the open frame from which the model's geometry is taken; ``CLOSED`` the closed
-    frame that is fitted; ``FITTED`` a further frame of the closed valve (under another pressure,
-    with the annulus and the papillary tips elsewhere) that is fitted with it; ``HELD_OUT`` one that
-    no filter is shown and against which the fitted valve is judged.
-    """
+    """Purpose of a frame."""
 
     REFERENCE = "reference"
+    """Open; the model's geometry is made of it."""
     CLOSED = "closed"
+    """The closed frame that is fitted."""
     FITTED = "fitted"
+    """A further closed frame that is fitted, with another pressure, annulus and tips."""
     HELD_OUT = "held_out"
+    """No filter sees it; the fitted valve is tested against it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """How the valve was seen at one instant.
-
-    Attributes
-    ----------
-    name : str
-    time : float
-        s.
-    role : Role
-    pressure_mmHg : float
-        Transmitral pressure, positive where it closes the valve.
-    vertices : ndarray
-        ``(n, 3)`` mm.
-    triangles : ndarray
-        ``(m, 3)``.
-    region : ndarray
-        ``(m,)`` index into the regions of the case.
-    annulus : ndarray
-        ``(k, 3)`` mm, where the annulus vertices of the *reference* frame are in this frame.
-    free_edge : ndarray
-        ``(j, 3)`` mm, closed curve along the free edge.
-    papillary_tips : ndarray
-        ``(t, 3)`` mm.
-    corresponds : bool
-        Whether vertex i of this frame is the same material point as vertex i of the reference
-        frame.
-    """
+    """The valve as observed at one instant."""
 
     name: str
-    time: float
+    time: float  #: s
     role: Role
-    pressure_mmHg: float
-    vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
-    annulus: FloatArray
-    free_edge: FloatArray
-    papillary_tips: FloatArray
-    corresponds: bool
+    pressure_mmHg: float  #: transmitral, positive if it closes the valve
+    vertices: FloatArray  #: (n, 3) mm
+    triangles: IntArray  #: (m, 3)
+    region: IntArray  #: (m,) index into the regions of the case
+    annulus: FloatArray  #: (k, 3) mm, the annulus vertices of the *reference* in this frame
+    free_edge: FloatArray  #: (j, 3) mm, closed curve
+    papillary_tips: FloatArray  #: (t, 3) mm
+    corresponds: bool  #: vertex i is the same material point as vertex i of the reference
 
 
 def check_different(
@@ -96,9 +70,9 @@ def check_different(
 
 
 def check_frames(frames: Sequence[Any], wrong: Callable[[str, str], InputError]) -> None:
-    """Raise ``wrong(field, what)`` unless names, times, roles and tips of frames go together.
+    """Raise ``wrong(field, what)`` unless names, times, roles and tips of frames are consistent.
 
-    ``frames`` are of a case or of its file (`mvest.cases.schema.FrameEntry`).
+    ``frames`` are those of a case or of its file (`mvest.cases.schema.FrameEntry`).
     """
     names = [frame.name for frame in frames]
     check_different("frames", names, wrong)
@@ -123,7 +97,7 @@ def check_frames(frames: Sequence[Any], wrong: Callable[[str, str], InputError])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """How well vertices are seen.
+    """Errors of the observed vertices.
 
     Attributes
     ----------
@@ -161,22 +135,22 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorSamples:
-    """Where a valve may truly have been, instead of where it was seen: joint errors of all frames.
+    """Joint errors of all frames: samples of the true valve relative to the observed one.
 
     Errors of the frames that a model is built from (its open shape, the motion of its boundary, the
-    lengths of its chordae) are no noise of an observation: they change what is predicted. Each
-    sample is one way in which all frames may be wrong at once.
+    lengths of its chordae) are not observation noise: they change what is predicted. Each sample is
+    one possible error of all frames together.
 
     Attributes
     ----------
     vertices : (K, f, n, 3) mm
-        Displacement from where each vertex was seen to where it may have been, in each frame of
-        the case, in the axes of the case. The annulus and the free edge move with their vertices.
+        Displacement from the observed to the true position of each vertex, in each frame of the
+        case, in the axes of the case. The annulus and the free edge move with their vertices.
     tips : (K, f, t, 3) mm
         The same of the papillary tips.
     source : (K,) or None
-        From what each was made, a number: samples of one source, as a valve and what it is in a
-        mirror, are not independent of each other. None: all are.
+        Number of each sample's source. Samples of one source, such as an error and its mirror
+        image, depend on each other. None: all are independent.
     """
 
     vertices: FloatArray
@@ -191,8 +165,7 @@ class ErrorSamples:
             if len(bad):
                 at = tuple(bad[0].tolist())
                 raise InputError(
-                    f"{where}: {values[at]} mm at {at}, expected a displacement of at most "
-                    f"{LARGEST_ERROR:g} mm"
+                    f"{where}: {values[at]} mm at {at}, expected at most {LARGEST_ERROR:g} mm"
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
@@ -215,7 +188,7 @@ class ErrorSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ValveCase:
-    """A valve and how it was seen.
+    """A valve and its observations.
 
     Attributes
     ----------
@@ -223,24 +196,24 @@ class ValveCase:
     simulated : bool
         Whether the frames come from a simulation, which every picture and table then states.
     surface : LeafletSurface
-        Midsurface of the reference frame with thickness and fibres; its vertices and triangles are
-        those of the reference frame.
+        Midsurface of the reference frame with thickness and fibres; it has the vertices and
+        triangles of the reference frame.
     annulus, free_edge : ndarray
         ``(k,)`` and ``(j,)`` vertices of ``surface`` in loop order.
     frames : tuple of Frame
         In the order of time, one of them the reference and one the closed frame; or the reference
-        alone: an anatomy whose closure nobody saw.
+        alone, for an anatomy without an observed closure.
     chordae : Chordae
     uncertainty : Uncertainty
+    derived : tuple of str
+        Sentences, one for everything that was derived instead of given.
+    sha256 : str
+        Of all files of the folder; empty for a case that was not read from one.
     error_samples : ErrorSamples or None
         Joint errors of all frames, in their order; all frames correspond then.
     chordae_follow : bool
-        Whether the chordae were laid out by the shape of the frames, so that they are laid out anew
-        where the frames are taken to be elsewhere; otherwise they are known by themselves.
-    derived : tuple of str
-        Sentences, one for everything that was not given but derived.
-    sha256 : str
-        Of all files of the folder; empty for a case that was not read from one.
+        Whether chordae are laid out by the shape of the frames, and laid out again for each error
+        sample. Otherwise they are measured.
     """
 
     name: str
@@ -272,8 +245,8 @@ class ValveCase:
             if std.shape != (n,):
                 raise self._wrong("observation", f"std_mm of {len(std)} vertices, expected {n}")
             if self.closed is not None and not self.closed.corresponds:
-                what = "std_mm of each vertex, but the vertices of the closed frame do not "
-                raise self._wrong("observation", f"{what}correspond; expected one number")
+                what = "std_mm of each vertex, but those of the closed frame do not correspond"
+                raise self._wrong("observation", f"{what}; expected one number")
         if samples is None:
             return
         f, t = len(self.frames), len(self.frame(Role.REFERENCE).papillary_tips)
@@ -287,12 +260,10 @@ class ValveCase:
             if given != (f, count):
                 what = f"{name} of {given[0]} frames of {given[1]} points, expected {f} of {count}"
                 raise self._wrong("error samples", what)
-        strange = [frame.name for frame in self.frames if not frame.corresponds]
-        if strange:
-            what = (
-                f"the vertices of frame {strange[0]!r} do not correspond; expected frames that do"
-            )
-            raise self._wrong("error samples", what)
+        for frame in self.frames:
+            if not frame.corresponds:
+                what = f"the vertices of frame {frame.name!r} do not correspond; expected that"
+                raise self._wrong("error samples", f"{what} they do")
 
     def __str__(self) -> str:
         regions = ", ".join(self.surface.region_names)
@@ -311,13 +282,7 @@ class ValveCase:
         )
 
     def frame(self, role: Role) -> Frame:
-        """The only frame of a role (reference or closed).
-
-        Raises
-        ------
-        InputError
-            The case is its reference frame alone.
-        """
+        """The only frame of a role (reference or closed); InputError if there is no closed one."""
         if role is Role.CLOSED and self.closed is None:
             raise InputError(
                 f"case {self.name}: no closed frame, so there is nothing to estimate from; add one "
@@ -327,25 +292,22 @@ class ValveCase:
 
     @property
     def closed(self) -> Frame | None:
-        """The closed frame; None of an anatomy alone."""
+        """The closed frame; None for an anatomy alone."""
         return next((frame for frame in self.frames if frame.role is Role.CLOSED), None)
 
     @property
     def fitted(self) -> tuple[Frame, ...]:
-        """The further frames that are fitted with the closed one."""
+        """The further frames to be fitted with the closed one."""
         return tuple(frame for frame in self.frames if frame.role is Role.FITTED)
 
     @property
     def held_out(self) -> tuple[Frame, ...]:
-        """The frames that no filter is shown."""
+        """The frames that no filter sees."""
         return tuple(frame for frame in self.frames if frame.role is Role.HELD_OUT)
 
     @property
     def valve(self) -> Valve:
-        """The valve at rest, with its boundary's way to the closed frame.
-
-        Where there is none the boundary stays where it is.
-        """
+        """The valve at rest with its boundary's motion to the closed frame, if there is one."""
         reference = self.frame(Role.REFERENCE)
         closed = self.closed or reference
         return Valve(

@@ -1,15 +1,13 @@
 """Reading and writing a case as a folder: ``case.yaml`` and the files that it names.
 
-What a field means stands in ``README.md`` beside this module. Every error begins with the file and
-the field it comes from.
-
-Joint errors of all frames are one file of arrays by name, in NumPy's ``.npz``.
+``README.md`` in this package explains the fields. Every error begins with its file and field. Joint
+errors of all frames are one file of named arrays, NumPy's ``.npz``.
 
 The transmitral pressure over time is measured or generic. The generic curve is left ventricular
 minus left atrial pressure, each a monotone cubic (PCHIP) through the points that heart-valve
 simulations take from Yellin's data. Its clock is that of one cardiac cycle: the pressure rises from
-9 to 113 mmHg between 0.53 and 0.58 s and stays near 120 mmHg up to 0.70 s. No curve is continued
-beyond its ends: a time outside is an error.
+9 to 113 mmHg between 0.53 and 0.58 s and stays near 120 mmHg up to 0.70 s. Curves are not
+extrapolated.
 """
 
 from __future__ import annotations
@@ -61,23 +59,13 @@ GENERIC_SAMPLES = 301
 def pressure_curve(time: FloatArray, pressure_mmhg: FloatArray) -> Callable[[float], float]:
     """Transmitral pressure (mmHg) over time (s): PCHIP between points ``(k,)``, k >= 2.
 
-    The curve raises InputError at a time outside it.
-
-    Raises
-    ------
-    InputError
-        On wrong shapes, values that are not finite, or times that do not increase.
+    InputError on wrong shapes, values that are not finite, or times that do not increase. The curve
+    itself raises InputError at a time outside it.
     """
     time = checked_floats("pressure curve: times", time, (None,))
     pressure = checked_floats("pressure curve: pressures", pressure_mmhg, time.shape)
-    if len(time) < 2:
-        raise InputError(f"pressure curve: {len(time)} point, expected two or more")
-    if (np.diff(time) <= 0).any():
-        row = int(np.argmax(np.diff(time) <= 0)) + 1
-        raise InputError(
-            f"pressure curve: time {time[row]:g} s of point {row} does not follow "
-            f"{time[row - 1]:g} s; expected increasing times"
-        )
+    if len(time) < 2 or (np.diff(time) <= 0).any():
+        raise InputError(f"pressure curve: times {time} s, expected two or more that increase")
     interpolated = scipy.interpolate.PchipInterpolator(time, pressure)
 
     def curve(at: float) -> float:
@@ -103,17 +91,11 @@ def generic_curve() -> Callable[[float], float]:
 
 
 def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
-    """Read the samples of a case whose frames have these names, in this order.
+    """Read the error samples of a case with frames of these names, in this order.
 
-    ``frames`` are names ``(f,)``, ``vertices (K, f, n, 3)`` and ``tips (K, f, t, 3)`` displacements
-    in mm from where a point was seen to where it may have been. ``source (K,)`` may be there:
-    integers, equal for samples that are not independent of each other.
-
-    Raises
-    ------
-    InputError
-        The file is no ``.npz``, holds other arrays, is of other frames, or a value is no
-        displacement.
+    The arrays are ``frames``, names ``(f,)``, ``vertices (K, f, n, 3)`` and ``tips (K, f, t, 3)``
+    as in `ErrorSamples`, mm, and optionally ``source (K,)``, integers. InputError if the file is
+    not a ``.npz`` of these, or belongs to other frames.
     """
     if file.suffix.lower() != ".npz":
         raise InputError(f"{file.name}: extension {file.suffix!r}, expected .npz")
@@ -128,7 +110,7 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
 
 
 def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]) -> None:
-    """Write samples so that they are read back unchanged."""
+    """Write error samples to a ``.npz`` file."""
     arrays: dict[str, Any] = {"vertices": samples.vertices, "tips": samples.tips}
     if samples.source is not None:
         arrays["source"] = samples.source
@@ -136,19 +118,14 @@ def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]
 
 
 TEXTS = ("name", "description", "source", "licence", "simulated")
-"""Fields that a case and its file have in common."""
+"""Fields of both a case and its file."""
 
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
-"""Leaflets tracked in echocardiography are about 1 mm off, and smoothly so."""
+"""Leaflets tracked in echocardiography have smooth errors of about 1 mm."""
 
 
 def read_case(path: Path | str) -> ValveCase:
-    """Read a case folder.
-
-    Parameters
-    ----------
-    path
-        The folder with ``case.yaml``.
+    """Read a case folder (the folder with ``case.yaml``).
 
     Raises
     ------
@@ -188,14 +165,14 @@ def read_case(path: Path | str) -> ValveCase:
     )
     if entry is not None:
         with folder.at("chordae"):
-            _ = case.valve  # whose chordae start at its tips and end on its leaflets
+            _ = case.valve  # checks that its chordae connect tips and leaflets
     return case
 
 
 def _observation(
     folder: CaseFolder, reference: SeenFrame
 ) -> tuple[Uncertainty, ErrorSamples | None]:
-    """How well vertices are seen, and the joint errors of all frames."""
+    """Errors of the vertices, and the joint errors of all frames."""
     given = folder.document.observation
     if given is None:
         folder.derived.append(
@@ -240,7 +217,7 @@ def _pressures(folder: CaseFolder) -> list[float]:
                 if document.pressure_curve is None:
                     folder.derived.append(
                         f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
-                        "transmitral curve, whose clock is taken to be that of the frames"
+                        "transmitral curve, assumed to have the clock of the frames"
                     )
             if frame.role != Role.REFERENCE:
                 check_closing_pressure(pressure, unit)
@@ -251,39 +228,29 @@ def _pressures(folder: CaseFolder) -> list[float]:
 def write_case(folder: Path | str, case: ValveCase) -> Path:
     """Write a case: ``case.yaml``, one ``.vtp`` per frame, loops and chordae as ``.csv``.
 
-    Everything is given explicitly, in mm, s and mmHg, so that nothing is derived anew on reading.
-    The folder, which must be new or empty, appears under its name only once it is complete; it is
-    returned.
-
-    Raises
-    ------
-    InputError
-        The folder is not empty or cannot be written, or the reference frame is not the surface of
-        the case.
+    Everything is stated explicitly, in mm, s and mmHg, so that nothing is derived on reading. The
+    folder must be new or empty, and appears only when it is complete. It is returned. InputError if
+    it is not empty or cannot be written, or the reference frame differs from the case's surface.
     """
     target = require_new(folder)
-    _check_reference(case)
-    return write_atomically(target, lambda part: _write_files(part, case))
-
-
-def require_new(folder: Path | str) -> Path:
-    """The folder, where a case may be written; InputError if it has any content."""
-    target = Path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
-    return target
-
-
-def _check_reference(case: ValveCase) -> None:
     frame, surface = case.frame(Role.REFERENCE), case.surface
     own = {name: getattr(surface, name) for name in ("vertices", "triangles", "region")}
     own |= {name: surface.vertices[getattr(case, name)] for name in LOOPS}
     for name, wanted in own.items():
         if not np.array_equal(getattr(frame, name), wanted):
             raise InputError(
-                f"case {case.name}: {name} of the reference frame {frame.name!r} is not as the "
-                "surface has it"
+                f"case {case.name}: {name} of the reference frame {frame.name!r} differs from the "
+                "surface's"
             )
+    return write_atomically(target, lambda part: _write_files(part, case))
+
+
+def require_new(folder: Path | str) -> Path:
+    """The folder to write a case to; InputError if it has any content."""
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
+    return target
 
 
 def _write_files(folder: Path, case: ValveCase) -> None:
@@ -315,18 +282,9 @@ def _write_files(folder: Path, case: ValveCase) -> None:
         "derived": list(case.derived),
     }
     families = [chordae.family_names[k] for k in chordae.family]
-    write_columns(
-        folder / "chordae.csv",
-        CHORD_COLUMNS,
-        zip(
-            chordae.tip.tolist(),
-            *chordae.insertion.T.tolist(),
-            families,
-            chordae.rest_length.tolist(),
-            chordae.axial_stiffness.tolist(),
-            strict=True,
-        ),
-    )
+    lengths, stiffness = chordae.rest_length.tolist(), chordae.axial_stiffness.tolist()
+    columns = (chordae.tip.tolist(), *chordae.insertion.T.tolist(), families, lengths, stiffness)
+    write_columns(folder / "chordae.csv", CHORD_COLUMNS, zip(*columns, strict=True))
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
     (folder / CASE_FILE).write_text(text, encoding="utf-8")
 

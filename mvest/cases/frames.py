@@ -32,25 +32,21 @@ LOOPS = ("annulus", "free_edge")
 
 
 class SeenFrame(NamedTuple):
-    """One entry of ``frames`` with its files read; lengths in mm, all else as in `Frame`.
-
-    ``loops`` has vertex numbers ``(k,)``, points ``(k, 3)`` mm, or None if not given, for each of
-    `LOOPS`. ``ears`` are the triangles whose inner edge was turned (`mvest.cases.band`).
-    """
+    """One entry of ``frames`` with its files, unchecked; lengths in mm."""
 
     entry: FrameEntry
-    where: str
+    where: str  #: field
     vertices: FloatArray
     triangles: IntArray
-    ears: IntArray
+    ears: IntArray  #: triangles whose inner edge was flipped (`mvest.cases.band`)
     region: IntArray | None
     point_data: Mapping[str, NDArray[np.generic]]
-    loops: Mapping[str, FloatArray | IntArray | None]
+    loops: Mapping[str, FloatArray | IntArray | None]  #: vertices (k,) or points (k, 3)
     tips: FloatArray
 
 
 class CheckedFrame(NamedTuple):
-    """A frame that was checked to be a band of leaflets, with its labels and boundary loops."""
+    """A frame whose surface is a band of leaflets, with its labels and boundary loops."""
 
     seen: SeenFrame
     region: IntArray
@@ -64,7 +60,7 @@ class CheckedFrame(NamedTuple):
 
 
 def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
-    """Read the files of one entry of ``frames``; what they hold is not yet checked."""
+    """Read the files of one entry of ``frames``."""
     entry, where = folder.document.frames[number], f"frames.{number}"
     scale, given = MM_PER[folder.document.units.length], entry.surface
     files: Path | dict[str, Path]
@@ -75,26 +71,18 @@ def read_frame(folder: CaseFolder, number: int) -> SeenFrame:
     with folder.at(f"{where}.surface"):
         surface = read_regions(files, folder.document.regions)
     triangles, ears = without_ears(surface.triangles)
-    return SeenFrame(
-        entry,
-        where,
-        scale * surface.vertices,
-        triangles,
-        ears,
-        surface.region,
-        surface.point_data,
-        {
-            name: _read_loop(folder, getattr(entry, name), f"{where}.{name}", scale)
-            for name in LOOPS
-        },
-        scale * np.array(entry.papillary_tips, dtype=np.float64),
-    )
+    loops = {
+        name: _read_loop(folder, getattr(entry, name), f"{where}.{name}", scale) for name in LOOPS
+    }
+    tips = scale * np.array(entry.papillary_tips, dtype=np.float64)
+    shape = scale * surface.vertices, triangles, ears, surface.region
+    return SeenFrame(entry, where, *shape, surface.point_data, loops, tips)
 
 
 def _read_loop(
     folder: CaseFolder, given: str | list[int] | None, where: str, scale: float
 ) -> FloatArray | IntArray | None:
-    """Vertex numbers ``(k,)`` or points ``(k, 3)`` mm, by the table's header."""
+    """Vertex numbers ``(k,)`` or points ``(k, 3)`` mm, depending on the table's header."""
     if not isinstance(given, str):
         return None if given is None else np.array(given, dtype=np.int64)
     file = folder.file(given, where)
@@ -112,7 +100,7 @@ def _read_loop(
 
 
 def reference_band(folder: CaseFolder, seen: SeenFrame) -> CheckedFrame:
-    """The reference frame with its loops, or an error with the first thing that is wrong."""
+    """The checked reference frame with its loops."""
     for name, given in seen.loops.items():
         if given is not None and given.ndim != 1:
             what = "holds points; expected vertex numbers of the reference surface"
@@ -128,7 +116,7 @@ def reference_band(folder: CaseFolder, seen: SeenFrame) -> CheckedFrame:
 
 
 def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> CheckedFrame:
-    """The regions and loops of a frame that is checked to be a band."""
+    """Check that a frame is a band, and find its loops."""
     with folder.at(f"{seen.where}.surface"):
         check_band(seen.vertices, seen.triangles, self_intersections=self_intersections)
         if seen.region is None:
@@ -144,7 +132,7 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> C
         loops = find_loops(seen.vertices, seen.triangles, seen.tips, *numbers)
     if len(seen.ears):
         folder.derived.append(
-            f"surface of frame {seen.entry.name!r}: inner edge turned of triangles "
+            f"surface of frame {seen.entry.name!r}: inner edge flipped of triangles "
             f"{seen.ears[:5].tolist()} ({len(seen.ears)} in all), which had all three corners on "
             "one edge of the valve"
         )
@@ -154,10 +142,7 @@ def _band(folder: CaseFolder, seen: SeenFrame, *, self_intersections: bool) -> C
 def place_frame(
     folder: CaseFolder, reference: CheckedFrame, seen: SeenFrame, pressure_mmhg: float
 ) -> tuple[Frame, CheckedFrame]:
-    """A frame with its annulus and free edge where they are.
-
-    It is checked that annulus, tips and triangles lie to each other as in a valve.
-    """
+    """A frame with its annulus and free edge; its annulus, tips and normals are checked."""
     corresponds = _corresponds(folder, reference.seen, seen)
     if seen is reference.seen:
         band = reference
@@ -175,7 +160,17 @@ def place_frame(
             check_annulus_size(seen.vertices[band.annulus])
         check_normals(seen.vertices, seen.triangles, band.annulus, seen.tips)
     with folder.at(f"{seen.where}.annulus"):
-        annulus = _annulus(folder, reference, band, corresponds) if stated is None else stated
+        if stated is not None:
+            annulus = stated
+        elif corresponds:
+            annulus = seen.vertices[reference.annulus]
+        else:
+            labelled = reference.labelled, reference.annulus, band.labelled, band.annulus
+            annulus = match_annulus(*labelled)
+            folder.derived.append(
+                f"annulus of frame {seen.entry.name!r}: matched to the reference by its share of "
+                "the arc length between the commissures"
+            )
         if len(annulus) != len(reference.annulus):
             raise InputError(
                 f"{len(annulus)} points, expected {len(reference.annulus)}: one for every annulus "
@@ -211,12 +206,8 @@ def _corresponds(folder: CaseFolder, first: SeenFrame, seen: SeenFrame) -> bool:
     if stated is None or seen is first:
         return same
     if stated and not same:
-        raise folder.wrong(
-            where,
-            f"true, but frame {seen.entry.name!r} has {len(seen.vertices)} vertices and "
-            f"{len(seen.triangles)} triangles and the reference {len(first.vertices)} and "
-            f"{len(first.triangles)}, or others; expected identical triangles",
-        )
+        what = f"true, but the triangles of frame {seen.entry.name!r} differ from the reference's"
+        raise folder.wrong(where, f"{what}; expected identical triangles")
     return stated
 
 
@@ -236,17 +227,3 @@ def _check_same_valve(folder: CaseFolder, seen: SeenFrame, reference: CheckedFra
                 f"{seen.where}.{name}",
                 "other vertices than in the reference frame, to which this frame corresponds",
             )
-
-
-def _annulus(
-    folder: CaseFolder, reference: CheckedFrame, band: CheckedFrame, corresponds: bool
-) -> FloatArray:
-    """Where the annulus vertices of the reference are in a frame, ``(k, 3)`` mm."""
-    if corresponds:
-        return band.seen.vertices[reference.annulus]
-    matched = match_annulus(reference.labelled, reference.annulus, band.labelled, band.annulus)
-    folder.derived.append(
-        f"annulus of frame {band.seen.entry.name!r}: matched to the reference by its share of the "
-        "arc length between the commissures"
-    )
-    return matched

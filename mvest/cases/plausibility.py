@@ -1,13 +1,13 @@
-"""Implausible values of a case: what contradicts itself or the literature.
+"""Implausible values of a case: contradictions within it, or to the literature.
 
-`mvest.cases.folder` refuses what cannot be read or computed. What is judged here can be computed,
-but gives moduli without meaning: leaflets that shrink to half when the valve closes, the two
-leaflets exchanged, thickness in centimetres. No valve is closed here; it takes milliseconds.
+`mvest.cases.folder` refuses what cannot be read or computed. These values can be computed, but give
+meaningless moduli: leaflets that shrink to half when the valve closes, exchanged leaflets or
+frames, thickness in centimetres. No valve is closed here; it takes milliseconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
@@ -34,18 +34,11 @@ class HumanRange(NamedTuple):
     unit: str
     why: str
 
-    def holds(self, value: float) -> bool:
-        """Whether a value lies within."""
-        return self.low <= value <= self.high
 
-    def __str__(self) -> str:
-        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
-
-
-RANGES: Mapping[str, HumanRange] = {
+RANGES = {
     name: HumanRange(low, high, unit, why)
     for name, low, high, unit, why in (
-        ("ap_diameter", 15.0, 51.0, "mm", "24 ± 3 to 36 ± 5 mm, and three of them beyond: 3D "
+        ("ap_diameter", 15.0, 51.0, "mm", "24 ± 3 to 36 ± 5 mm, and three SD beyond: 3D "
          "echocardiography of normal and regurgitant valves, means and standard deviations"),
         ("commissural_diameter", 20.0, 58.0, "mm", "35 ± 5 to 43 ± 5 mm, likewise"),
         ("anterior_length", 13.0, 40.0, "mm", "20 to 25 mm in adults, 40 % more in myxomatous "
@@ -71,44 +64,34 @@ RANGES: Mapping[str, HumanRange] = {
         ("tip_motion", 0.0, 15.0, "mm", "papillary muscles shorten by less than a centimetre"),
     )
 }  # fmt: skip
-"""What is expected of a human mitral valve."""
+"""Expected ranges of a human mitral valve."""
 
 LOST = (0.2, 4.0)
-"""Stretches of which vertices do not correspond at all."""
+"""Stretches of vertices that do not correspond at all."""
 REACH_MM = 4.0
-"""Distance over which stretch is judged: several edges, so that noise counts less."""
+"""Distance over which stretch is measured: several edges, so that noise counts less."""
 ORDER_STDS = 3.0
-"""Standard deviations by which leaflets must lie the wrong way before pressures are questioned."""
+"""Standard deviations by which leaflets must lie on the wrong side to question the pressures."""
 MAX_VERTICES = 1500
-"""Number of vertices, evenly chosen, whose stretch is judged."""
+"""Number of vertices, evenly chosen, whose stretch is measured."""
 EXTREME_SHARE = 0.02
 """Share of stretches left out at each end."""
 
 
 @dataclass(frozen=True, slots=True)
 class Implausible:
-    """An implausible value of a case.
+    """An implausible value of a case."""
 
-    Attributes
-    ----------
-    field : str
-        Field of ``case.yaml`` that states it.
-    text : str
-        What is found, with its numbers, and what the mistake may be.
-    mistake : bool
-        Whether a mistake makes such a value, and hardly any valve does.
-    """
-
-    field: str
-    text: str
-    mistake: bool = False
+    field: str  #: of case.yaml
+    text: str  #: the value, the expected range, and the likely mistake
+    mistake: bool = False  #: a mistake makes such a value, and hardly any valve does
 
     def __str__(self) -> str:
         return f"{self.field}: {self.text}"
 
 
 Value: TypeAlias = tuple[str, str, float, str, str]
-"""Field, quantity, value, its entry in `RANGES`, and the mistake that is likely (empty: none)."""
+"""Field, quantity, value, its entry in `RANGES`, and the likely mistake (empty: none)."""
 
 
 def implausible_values(case: ValveCase) -> tuple[Implausible, ...]:
@@ -118,18 +101,19 @@ def implausible_values(case: ValveCase) -> tuple[Implausible, ...]:
         values += _closing(case, case.closed)
     found = [*_exchanged(case)]
     for field, what, value, name, hint in values:
-        expected = RANGES[name]
-        if not expected.holds(value):
-            text = f"{what} is {f'{value:.3g} {expected.unit}'.rstrip()}, expected {expected}"
-            # Single vertices that were seen elsewhere are no mistake of the whole case: with one in
-            # fifty of them, 38 of 40 intervals held. Vertices in another order are far beyond.
+        low, high, unit, _ = RANGES[name]
+        if not low <= value <= high:
+            text = f"{what} is {value:.3g} {unit}".rstrip()
+            text += f", expected {low:g} to {high:g} {unit}".rstrip()
+            # A few outliers are not a mistake of the whole case: with one vertex in fifty wrong, 38
+            # of 40 intervals held. Vertices in another order are far beyond.
             mistake = bool(hint) and (name != "stretch" or not LOST[0] < value < LOST[1])
             found.append(Implausible(field, f"{text}: {hint}" if hint else text, mistake=mistake))
-    return tuple(sorted(found, key=lambda doubt: not doubt.mistake))
+    return tuple(sorted(found, key=lambda value: not value.mistake))
 
 
 def require_plausible(case: ValveCase) -> None:
-    """Raise InputError that names all implausible values of a case, if it has any."""
+    """Raise InputError with all implausible values of a case, if it has any."""
     found = implausible_values(case)
     if found:
         raise InputError(f"case {case.name} is not plausible: " + "; ".join(map(str, found)))
@@ -139,7 +123,8 @@ def _anatomy(case: ValveCase) -> Iterator[Value]:
     """Thickness, chordae, annulus of each frame, leaflets and open orifice."""
     reference = case.frame(Role.REFERENCE)
     typical = float(np.median(case.surface.thickness))
-    hint = "is it in cm?" if RANGES["thickness"].holds(10 * typical) else ""
+    low, high, *_ = RANGES["thickness"]
+    hint = "is it in cm?" if low <= 10 * typical <= high else ""
     yield "thickness", "the leaflets' typical thickness", typical, "thickness", hint
     tips = reference.papillary_tips[case.chordae.tip]
     length = np.linalg.norm(case.chordae.insertion - tips, axis=1)
@@ -171,18 +156,15 @@ def _leaflets(case: ValveCase) -> dict[str, IntArray]:
 
 def _leaflet_lengths(case: ValveCase) -> dict[str, float]:
     """Length (mm) of the anterior and the posterior leaflet; empty for other leaflets."""
-    x, plane, leaflets = (
-        case.surface.vertices,
-        _plane(case, case.frame(Role.REFERENCE)),
-        _leaflets(case),
-    )
+    plane, leaflets = _plane(case, case.frame(Role.REFERENCE)), _leaflets(case)
     if set(leaflets) != {"anterior", "posterior"} or plane is None:
         return {}
+    x = case.surface.vertices
     return {name: leaflet_length(x, own, plane) for name, own in leaflets.items()}
 
 
 def _motion(case: ValveCase) -> Iterator[Value]:
-    """How far each frame is from the reference."""
+    """Differences of each frame from the reference."""
     reference = case.frame(Role.REFERENCE)
     for frame in case.frames:
         if frame is reference:
@@ -200,7 +182,7 @@ def _motion(case: ValveCase) -> Iterator[Value]:
 
 
 def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
-    """Pressures, and what they do to leaflets and chordae."""
+    """Pressures, and the deformation of leaflets and chordae by them."""
     for frame in (closed, *case.fitted):
         pressure = frame.pressure_mmHg
         # 120 mmHg are 16 kPa.
@@ -209,12 +191,12 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
         yield field, "the pressure on the closed valve", pressure, "closing_pressure", hint
     surface, chordae, field = case.surface, case.chordae, f"frames.{closed.name}.surface"
     for number, (name, own) in enumerate(_leaflets(case).items()):
-        before = _area(surface.vertices, own)
-        after = _area(closed.vertices, closed.triangles[closed.region == number])
+        before = areas(surface.vertices, own).sum()
+        after = areas(closed.vertices, closed.triangles[closed.region == number]).sum()
         if before <= 0 or after <= 0:
             continue
         what = f"area of the {name} leaflet, closed over open,"
-        yield field, what, after / before, "area_change", ""
+        yield field, what, float(after / before), "area_change", ""
         what = (
             f"the distance of points of the {name} leaflet {0.7 * REACH_MM:.1f} to {REACH_MM:g} mm "
             "apart, closed over open,"
@@ -224,7 +206,7 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
     if closed.corresponds and len(chordae):
         _, at = cKDTree(surface.vertices).query(chordae.insertion)
         length = np.linalg.norm(closed.vertices[at] - closed.papillary_tips[chordae.tip], axis=1)
-        # Not the extremes: noise moves the ends of single chords.
+        # Quantiles, because noise moves the ends of single chords.
         tight, middle = np.quantile(length / chordae.rest_length - 1.0, [0.9, 0.5])
         too_tight = tight > RANGES["chord_strain"].high
         share, strain = ("a tenth", tight) if too_tight else ("half", middle)
@@ -233,7 +215,7 @@ def _closing(case: ValveCase, closed: Frame) -> Iterator[Value]:
 
 
 def _stretches(rest: FloatArray, closed: Frame, members: IntArray) -> tuple[float, ...]:
-    """The least and the largest stretch of a leaflet, where its vertices correspond."""
+    """The least and the largest stretch of a leaflet; none if vertices do not correspond."""
     if not closed.corresponds:
         return ()
     members = members[:: max(1, len(members) // MAX_VERTICES)]
@@ -247,9 +229,9 @@ def _stretches(rest: FloatArray, closed: Frame, members: IntArray) -> tuple[floa
 
 
 def _exchanged(case: ValveCase) -> Iterator[Implausible]:
-    """Leaflets, frames and pressures that seem to be exchanged."""
+    """Exchanged leaflets, frames and pressures."""
     reference, closed, length = case.frame(Role.REFERENCE), case.closed, _leaflet_lengths(case)
-    part = _annulus_share(case, "anterior") if length else 0.0
+    part = _anterior_share(case) if length else 0.0
     if part > 0.5 and length["anterior"] < length["posterior"]:
         text = (
             f"the anterior leaflet has {100 * part:.0f} % of the annulus and is "
@@ -278,23 +260,19 @@ def _exchanged(case: ValveCase) -> Iterator[Implausible]:
             yield Implausible(f"frames.{other.name}.pressure", text, mistake=True)
 
 
-def _annulus_share(case: ValveCase, name: str) -> float:
-    """Share of the annulus' length that belongs to a leaflet."""
+def _anterior_share(case: ValveCase) -> float:
+    """Share of the annulus' length that belongs to the anterior leaflet of two."""
     annulus = case.surface.vertices[case.annulus]
     step = np.linalg.norm(np.roll(annulus, -1, axis=0) - annulus, axis=1)
     length = {}
-    for leaflet, triangles in _leaflets(case).items():
+    for name, triangles in _leaflets(case).items():
         own = np.isin(case.annulus, triangles)
-        length[leaflet] = float(step[own & np.roll(own, -1)].sum())
-    return length[name] / max(sum(length.values()), 1e-12)
-
-
-def _area(vertices: FloatArray, triangles: IntArray) -> float:
-    return float(areas(vertices, triangles).sum())
+        length[name] = float(step[own & np.roll(own, -1)].sum())
+    return length["anterior"] / max(sum(length.values()), 1e-12)
 
 
 def _rise_with_pressure(case: ValveCase, closed: Frame, other: Frame) -> float:
-    """How much nearer to the atrium (mm) the larger pressure moves the leaflets, if significant."""
+    """Motion of the leaflets (mm) towards the atrium by the larger pressure; 0 if insignificant."""
     heights = []
     for frame in (closed, other):
         plane, size = _plane(case, frame), lumped_areas(frame.vertices, frame.triangles)
@@ -304,23 +282,16 @@ def _rise_with_pressure(case: ValveCase, closed: Frame, other: Frame) -> float:
     rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
     seen = case.uncertainty
     correlated = 2.0 * np.pi * seen.correlation_length_mm**2
-    whole = _area(closed.vertices, closed.triangles)
+    whole = float(areas(closed.vertices, closed.triangles).sum())
     independent = len(closed.vertices) if correlated == 0.0 else max(whole / correlated, 1.0)
     significant = abs(rise) > ORDER_STDS * seen.typical_mm * np.sqrt(2.0 / independent)
     return float(rise) if significant else 0.0
 
 
 def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = None) -> float | None:
-    """Area (mm²) that the leaflets leave free in a frame, seen along the normal of the annulus.
+    """Orifice area (mm²) in a frame along the normal of the annulus; None without such a plane.
 
-    None if the annulus has no plane.
-
-    Parameters
-    ----------
-    case : ValveCase
-    frame : Frame
-    vertices : (n, 3) mm, optional
-        Where a model has the vertices of the reference frame, instead of what was seen.
+    ``vertices (n, 3)`` mm are those of the reference in a model, instead of the observed ones.
     """
     plane = _plane(case, frame)
     if plane is None:
@@ -336,7 +307,7 @@ def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = No
 def _plane(case: ValveCase, frame: Frame) -> AnnulusPlane | None:
     """The plane of the annulus in a frame, if it has one.
 
-    The anterior direction is to the leaflet of that name, or to the first.
+    Its anterior direction is that of the anterior leaflet, or of the first if none has that name.
     """
     leaflets = _leaflets(case)
     own = leaflets.get("anterior", next(iter(leaflets.values())))

@@ -1,9 +1,8 @@
-"""What may stand in the file ``case.yaml`` (its fields, version 1), and the files of its folder.
+"""The fields of ``case.yaml`` (version 1), and the files of a case folder.
 
-The models define the fields and the kinds of their values. The modules that read the files check
-whether the values make sense together.
-
-The files of a case folder are found by name, never outside the folder, and hashed.
+The models define the fields and their types. The modules that read the files check whether the
+values are consistent. The files of a case folder are found by name, never outside the folder, and
+hashed.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ from mvest.reading.text import MAX_NUMBER, one_line
 VERSION = 1
 """The version of the format that is read and written."""
 MAX_TEXT, MAX_NAME = 10_000, 200
-"""Characters of a text, and of what heads a page or names a file."""
+"""Largest number of characters of a text, and of a name or a file name."""
 
 
 def _kind(value: Any) -> str:
-    """Which alternative of a field a value belongs to; no key of a file holds the character NUL."""
+    """Alternative of a field that a value belongs to; no key of a file contains NUL."""
     if isinstance(value, dict):
         return "\0point data" if "point_data" in value else "\0mapping"
     if isinstance(value, list):
@@ -76,7 +75,7 @@ class _Model(BaseModel):
 
 
 class Units(_Model):
-    """Units of everything in the folder that does not carry one in its name."""
+    """Units of all values in the folder without a unit in their name."""
 
     length: Literal["mm", "cm", "m"] = Field(description="mm, cm or m, of all coordinates")
     pressure: Literal["mmHg", "kPa"] = Field("mmHg", description="mmHg or kPa")
@@ -97,8 +96,11 @@ Thickness = Annotated[
 ]
 
 
+LOOP = "a list of vertex numbers in the order of the loop, or a .csv file"
+
+
 class FrameEntry(_Model):
-    """One instant at which the valve was seen."""
+    """One instant at which the valve was observed."""
 
     name: Name = Field(description="text, different for every frame")
     time: Number = Field(description="a number in units.time, larger than that of the frame before")
@@ -109,12 +111,8 @@ class FrameEntry(_Model):
     surface: SurfaceFiles = Field(
         description="a file (.vtp, .vtu, .vtk, .stl, .obj, .ply), or one file for every region"
     )
-    annulus: Curve | None = Field(
-        None, description="a list of vertex numbers in the order of the loop, or a .csv file"
-    )
-    free_edge: Curve | None = Field(
-        None, description="a list of vertex numbers in the order of the loop, or a .csv file"
-    )
+    annulus: Curve | None = Field(None, description=LOOP)
+    free_edge: Curve | None = Field(None, description=LOOP)
     papillary_tips: Annotated[list[Point], Field(min_length=1)] = Field(
         description="a list of [x, y, z] in units.length, in the same order in all frames"
     )
@@ -129,7 +127,7 @@ class FrameEntry(_Model):
 
 
 class ChordaeEntry(_Model):
-    """The table of chordae, with what is common to all of them."""
+    """The table of chordae, and their common properties."""
 
     file: Name = Field(description="a .csv file with tip,x,y,z,family,rest_length_mm,stiffness_n")
     toe_strain: Number = Field(
@@ -154,7 +152,7 @@ ChordaeTable = Annotated[
 
 
 class ObservationEntry(_Model):
-    """How well the vertices of a frame are seen."""
+    """Errors of the vertices of a frame."""
 
     std_mm: Annotated[
         Annotated[Number, Field(gt=0), NUMBER] | Annotated[PointData, POINT_DATA], EITHER
@@ -208,7 +206,7 @@ class CaseFile(_Model):
     )
     derived: list[Text] = Field(
         default_factory=list,
-        description="sentences on what had been derived when the case was written by a program",
+        description="sentences, one for everything that a program derived when it wrote the case",
     )
 
     def files(self) -> list[tuple[str, str]]:
@@ -224,11 +222,6 @@ class CaseFile(_Model):
             for name in (*surfaces, frame.annulus, frame.free_edge):
                 named.append((f"frames.{number}", name))
         return [(where, name) for where, name in named if isinstance(name, str)]
-
-
-def case_schema() -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of ``case.yaml``."""
-    return CaseFile.model_json_schema()
 
 
 def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
@@ -261,7 +254,7 @@ PARTS: Mapping[str | int, type[BaseModel]] = {
     "observation": ObservationEntry,
     "std_mm": PointData,
 }
-"""The models of fields."""
+"""Fields that are models themselves."""
 
 
 def _place(path: Sequence[int | str]) -> tuple[type[BaseModel], str]:
@@ -280,25 +273,22 @@ CASE_FILE = "case.yaml"
 
 @dataclass(frozen=True)
 class CaseFolder:
-    """A case folder: its fields, the files that were used, and what was derived."""
+    """A case folder: its fields, used files, and sentences on derived values."""
 
     root: Path
     used: dict[str, Path] = field(default_factory=dict)
 
     @property
     def case(self) -> Path:
-        """The file with the fields, which every error names first."""
+        """``case.yaml``, which every error names first."""
         return self.root / CASE_FILE
 
     @cached_property
     def document(self) -> CaseFile:
         """The fields of the case.
 
-        Raises
-        ------
-        InputError
-            The file is no plain YAML mapping, or a field is missing, unknown or of the wrong kind:
-            one line with the field, what was found and what would be right.
+        InputError if the file is not a plain YAML mapping, or a field is missing, unknown or of the
+        wrong kind: one line with the field, what was found and what would be right.
         """
         data = read_yaml(self.file(CASE_FILE, "link"))
         version = data.get("version")
@@ -315,16 +305,16 @@ class CaseFolder:
 
     @cached_property
     def derived(self) -> list[str]:
-        """Sentences, one for everything that was not given but derived."""
+        """Sentences, one for everything that was derived instead of given."""
         return list(self.document.derived)
 
     def wrong(self, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
-        """The error for one field: file, field, and what is wrong with it, in one line."""
+        """The error of one field, in one line."""
         return kind(f"{self.case}: {one_line(field, 80)}: {one_line(what)}")
 
     @contextmanager
     def at(self, field: str) -> Iterator[None]:
-        """Put the file and the field before the message of any error raised inside."""
+        """Prepend file and field to the message of any error raised inside."""
         try:
             yield
         except InputError as fault:
@@ -348,7 +338,7 @@ class CaseFolder:
         return path
 
     def sha256(self) -> str:
-        """Over names and contents of all used files, in the order of the names."""
+        """Hash of names and contents of all used files, in the order of the names."""
         digest = hashlib.sha256()
         for name, path in sorted(self.used.items()):
             content = path.read_bytes()
@@ -358,9 +348,9 @@ class CaseFolder:
 
 
 def files_of_case(root: Path) -> dict[str, Path]:
-    """Name -> file of all that reading a case folder opens, up to the first that is missing."""
+    """Name -> file of all files that reading a case opens, up to the first missing one."""
     folder = CaseFolder(root)
-    with suppress(InputError):  # it is refused when it is read
+    with suppress(InputError):  # raised again on reading
         for where, name in folder.document.files():
             folder.file(name, where)
     return folder.used

@@ -1,12 +1,13 @@
-"""Thickness, fibres and chordae of a case, as given or as derived.
+"""Thickness, fibres and chordae of a case, given or derived.
 
-A two-leaflet valve that brings no chordae gets those of the template's layout, in its coordinates.
-The template (`mvest.valve.anatomy.template`) places its chordae by an angle phi, with the
-commissures at 0 and 180 degrees and the anterior leaflet between them, and by s from the annulus to
-the free edge. Any band has harmonic coordinates (`mvest.valve.geometry.surface_coordinates`), but
-their angle is not spread along the edges as the template's is, and the leaflets' common borders are
-no lines of it. So phi is the share of the arc length between the commissures, on the annulus (s =
-0) and on the free edge (s = 1), and between the two the harmonic angle of a phi is linear in s.
+A two-leaflet valve without chordae gets those of the template's layout, in the template's
+coordinates. The template (`mvest.valve.anatomy.template`) places its chordae by an angle phi, with
+the commissures at 0 and 180 degrees and the anterior leaflet between them, and by s from the
+annulus to the free edge. Any band has harmonic coordinates
+(`mvest.valve.geometry.surface_coordinates`), but their angle is not distributed along the edges as
+the template's is, and the borders between the leaflets are not lines of constant angle. So phi is
+the share of the arc length between the commissures, on the annulus (s = 0) and on the free edge (s
+= 1). Between the two, the harmonic angle of a phi is linear in s.
 """
 
 from __future__ import annotations
@@ -41,23 +42,23 @@ GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
 FAMILIES = ("marginal", "basal")
 
 CLOSED_DEPTH = 0.75
-"""Of the free edge below the annulus, closed over open, where no closed frame is known; the
-template's rises from 16.3 to 12.2 mm on average."""
+"""Depth of the free edge below the annulus, closed over open, if there is no closed frame; the
+template's falls from 16.3 to 12.2 mm on average."""
 
 SEEN_CLOSURE = replace(ChordLayout(), marginal_slack=1.007, basal_slack=0.985)
-"""The template's layout by where a closed valve was seen, rather than by the closure it intends.
+"""The template's layout for an observed closed valve instead of the template's intended closure.
 
-Under pressure a valve does not close just as intended, and its chordae are stretched: in thirty
-simulated virtual patients they are 1.007 (SD from chord to chord 0.028, marginal) and 0.985 (0.023,
-basal) times as long as their ends lie apart in the closed valve."""
+Under pressure a valve does not close exactly as intended, and its chordae are stretched. In thirty
+simulated virtual patients, rest length over the distance of their ends in the closed valve is 1.007
+(SD from chord to chord 0.028, marginal) and 0.985 (0.023, basal)."""
 
 SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
-"""The same where a `LeafletBand` places them, basal ones up to 1.7 mm elsewhere: there chordae are
-1.002 (SD 0.03, marginal) and 0.966 (0.013, basal) times as long in sixteen simulated valves."""
+"""The same for chordae placed by a `LeafletBand`, which shifts basal ones by up to 1.7 mm: 1.002
+(SD 0.03, marginal) and 0.966 (0.013, basal) in sixteen simulated valves."""
 
 
 def read_leaflets(folder: CaseFolder, reference: CheckedFrame) -> LeafletSurface:
-    """The midsurface of the reference frame; what was not given is added to ``derived``."""
+    """The midsurface of the reference frame; assumptions are added to ``derived``."""
     seen, names = reference.seen, tuple(folder.document.regions.values())
     n = len(seen.vertices)
     shape = seen.vertices, seen.triangles, reference.region, names
@@ -95,7 +96,7 @@ def _thickness(
     thickness = np.array([by_name[name] for name in names])[vertex_region]
     if given is not None:
         return thickness
-    # As that of the template: leaflets as thick at the free edge do not close tightly.
+    # Thinner at the free edge, as in the template: otherwise leaflets do not close tightly.
     loops = reference.annulus, reference.free_edge
     s = surface_coordinates(seen.vertices, seen.triangles, *loops).s
     return thickness * (1.0 - (1.0 - thinning) * smoothstep((s - 0.5) / 0.5))
@@ -134,7 +135,7 @@ def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
 def read_chordae(
     folder: CaseFolder, reference: CheckedFrame, placed: list[tuple[Frame, CheckedFrame]]
 ) -> Chordae:
-    """The chordae of the table, or those laid out; then this is added to ``derived``."""
+    """The chordae of the table, or laid out, which is added to ``derived``."""
     entry = folder.document.chordae
     if entry is None:
         with folder.at("chordae"):
@@ -185,7 +186,7 @@ def _laid_out(
     if closed.role is not Role.CLOSED:
         layout = ChordLayout()
         how = (
-            "an assumed closure: the free edges meet half-way between where they are open, at "
+            "an assumed closure: the free edges meet half-way between their open positions, at "
             f"{CLOSED_DEPTH:g} of their depth below the annulus"
         )
         goal = assumed_closure(opened, closed.annulus, closed.papillary_tips)
@@ -203,7 +204,7 @@ def _laid_out(
 
 
 class Places(NamedTuple):
-    """Vertices ``(n, 3)`` mm of a valve, and the function of `LeafletBand.locate` for it."""
+    """Vertices ``(n, 3)`` mm of a valve, and its function like `LeafletBand.locate`."""
 
     vertices: FloatArray
     locate: Callable[[FloatArray, FloatArray], tuple[IntArray, FloatArray]]
@@ -211,22 +212,12 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeafletBand:
-    """A two-leaflet surface whose points are found by the template's coordinates.
+    """A two-leaflet surface with the template's coordinates."""
 
-    Attributes
-    ----------
-    vertices : ndarray
-        ``(n, 3)`` mm.
-    coordinates : SurfaceCoordinates
-    annulus_angle, edge_angle : ndarray
-        ``(2, k)`` tables of phi (degrees, 0 to 360) and the harmonic angle (rad, unwrapped) along
-        the annulus and along the free edge.
-    """
-
-    vertices: FloatArray
+    vertices: FloatArray  #: (n, 3) mm
     coordinates: SurfaceCoordinates
-    annulus_angle: FloatArray
-    edge_angle: FloatArray
+    annulus_angle: FloatArray  #: (2, k): phi (0 to 360 degrees), harmonic angle (rad, unwrapped)
+    edge_angle: FloatArray  #: the same along the free edge
 
     @classmethod
     def of(
@@ -238,13 +229,10 @@ class LeafletBand:
         free_edge: IntArray,
         anterior: int,
     ) -> LeafletBand:
-        """Solve for the coordinates of a band, ``anterior`` being the number of that leaflet.
+        """Solve for the coordinates of a band; ``anterior`` is the number of that leaflet.
 
-        Raises
-        ------
-        GeometryError
-            The coordinates fold over, or a leaflet does not meet the annulus or the free edge in
-            one piece.
+        GeometryError if the coordinates fold over, or a leaflet does not meet the annulus or the
+        free edge in one piece.
         """
         around, edge = directed(annulus, triangles), directed(free_edge, triangles)
         coordinates = surface_coordinates(vertices, triangles, around, free_edge)
@@ -258,9 +246,8 @@ class LeafletBand:
     def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Corners ``(k, 3)`` and weights ``(k, 3)`` of points at phi (degrees) and s."""
         turn = np.mod(phi, 360.0)
-        theta = (1 - s) * np.interp(turn, *self.annulus_angle) + s * np.interp(
-            turn, *self.edge_angle
-        )
+        theta = (1 - s) * np.interp(turn, *self.annulus_angle)
+        theta += s * np.interp(turn, *self.edge_angle)
         triangle, weights = self.coordinates.locate(np.mod(theta, 2 * np.pi), s)
         return self.coordinates.triangles[triangle], weights
 
@@ -302,11 +289,11 @@ def assumed_closure(
 ) -> FloatArray:
     """Assumed positions ``(n, 3)`` mm of the vertices in the closed valve, from its open shape.
 
-    The free edges of the two leaflets meet half-way between where they are, point by point of equal
-    share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
-    follow in proportion to their coordinate s. The valve does not close like this, but the shape
-    determines how long chordae must be to let it. The annulus ``(k, 3)`` mm is in loop order, the
-    tips ``(t, 3)`` mm are on the side of the ventricle.
+    The free edges of the two leaflets meet half-way, at points of equal share between the
+    commissures, at ``closed_depth`` of their depth below the annulus. Leaflets follow in proportion
+    to their coordinate s. A valve does not close like this, but the shape determines how long
+    chordae must be to let it close. The annulus ``(k, 3)`` mm is in loop order, the tips ``(t, 3)``
+    mm are on the ventricular side.
     """
     phi, theta = open_valve.edge_angle
     here, there = (open_valve.position(turn, np.ones(len(phi))) for turn in (phi, 360.0 - phi))
@@ -327,29 +314,14 @@ def lay_out_chordae(
     closed_tips: FloatArray,
     layout: ChordLayout,
 ) -> Chordae:
-    """Place the chordae of a layout on a valve.
+    """Place the chordae of a layout on a valve with two papillary tips ``(2, 3)`` mm.
 
-    Every chord starts at the nearer of the two tips in the reference frame. As in the template, it
-    is as long as ``slack`` times its distance in the closed frame, and at least ``open_slack``
-    times its distance in the open one.
-
-    Parameters
-    ----------
-    open_valve
-        The reference frame.
-    open_tips, closed_tips
-        ``(2, 3)`` mm.
-    closed_valve
-        The closed frame: ``(n, 3)`` mm, positions of the reference's vertices, or a valve with
-        coordinates of its own if its vertices do not correspond.
-    layout
-        The template's for an intended closed frame (`assumed_closure`); for one that was seen
-        `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are of that kind.
-
-    Raises
-    ------
-    InputError
-        There are not two papillary tips.
+    Every chord starts at the nearer of the two tips in the reference frame. Its rest length is
+    ``slack`` times its length in the closed frame, and at least ``open_slack`` times that in the
+    open one, as in the template. The closed frame has positions ``(n, 3)`` mm of the reference's
+    vertices, or its own coordinates if its vertices do not correspond. The layout is the template's
+    for an intended closed frame (`assumed_closure`); for an observed one `SEEN_CLOSURE`, or
+    `SEEN_ON_BAND` if the valves are bands. InputError if there are not two tips.
     """
     if len(open_tips) != 2 or len(closed_tips) != 2:
         raise InputError(f"{len(open_tips)} papillary tips; the layout of chordae needs two")

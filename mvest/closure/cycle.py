@@ -1,9 +1,8 @@
 """A valve over a whole cycle, open to closed and back: all observed frames and their derivative.
 
 The state of the valve (positions, velocities, strains with their history) follows from the
-parameters through the dynamics. It is no unknown of its own: where parameters are updated, the
-state is that of the cycle run again with them, so that parameters and state are consistent at every
-frame. What is not estimated is a disturbance of the state that no parameter explains.
+parameters through the dynamics and is not estimated. With new parameters the whole cycle is run
+again, so that parameters and state are consistent in every frame.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from mvest.quantities import BeatTime, Pressure, TimeStep
 from mvest.typing import FloatArray
 
 DEFAULT_TIMES = tuple(round(0.05 * k, 2) for k in range(21))
-"""s, from the open valve until it is open again."""
+"""s, from the open valve until it opens again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +45,11 @@ class CycleProtocol:
     rise, hold, fall : float
         s, of the three parts.
     dt : float
-        s, the largest time step: the time between two frames is divided evenly into steps no
-        larger than this.
-        Leaflets flip within some milliseconds; where a step leaps over that, frames jump with the
-        parameters (`experiment=cycle` measures it).
+        s, largest time step; the time between two frames is divided evenly. Leaflets flip within
+        some milliseconds. If a step skips that, frames jump with the parameters
+        (`experiment=cycle` measures it).
     times : tuple of float
-        s at which the valve is looked at, strictly increasing from >= 0; the run ends at the last.
+        s of the observed frames, strictly increasing from >= 0; the run ends at the last.
     """
 
     pressure_mmHg: Pressure = 120.0
@@ -67,21 +65,15 @@ class CycleProtocol:
         if not np.isfinite(self.pressure_mmHg):
             raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
         times = np.asarray(self.times, dtype=float)
-        if not (
-            times.ndim == 1
-            and times.size
-            and np.all(np.isfinite(times))
-            and times[0] >= 0
-            and np.all(np.diff(times) > 0)
-            and times[-1] > 0
-        ):
+        increasing = times.size and times[0] >= 0 and np.all(np.diff(times) > 0) and times[-1] > 0
+        if not (increasing and np.isfinite(times).all()):
             raise InputError(
                 f"observed times {self.times} s, expected increasing ones from 0 on, "
                 f"at least one after it"
             )
 
     def phase(self, t: float, /) -> float:
-        """Share of the closure at time ``t`` (s)."""
+        """Phase of the closure at time ``t`` (s), from 0 (open) to 1 (closed)."""
         return smooth_step(t / self.rise) - smooth_step((t - self.rise - self.hold) / self.fall)
 
     def pressure(self, t: float, /) -> float:
@@ -90,12 +82,13 @@ class CycleProtocol:
 
     def steps(self) -> tuple[Step, ...]:
         """The time steps to the last observed frame."""
-        steps: list[Step] = []
-        last = 0.0
-        for time, n in zip(self.times, self._steps_between(), strict=True):
-            steps += [Step(last + (time - last) * (k + 1) / n) for k in range(n)]
-            last = time
-        return tuple(steps)
+        return tuple(
+            Step(last + (time - last) * (k + 1) / n)
+            for last, time, n in zip(
+                (0.0, *self.times[:-1]), self.times, self._steps_between(), strict=True
+            )
+            for k in range(n)
+        )
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -104,11 +97,11 @@ class CycleProtocol:
 
     @property
     def frame_steps(self) -> tuple[int, ...]:
-        """Number of steps taken when each frame is reached, ``(f,)``."""
+        """Number of steps up to each frame, ``(f,)``."""
         return tuple(np.cumsum(self._steps_between()).tolist())
 
     def frame_sets(self) -> dict[str, list[int]]:
-        """Sets of observed frames by name: ever more of them, and parts of the cycle.
+        """Sets of observed frames by name: increasing numbers, and parts of the cycle.
 
         Raises
         ------
@@ -135,7 +128,7 @@ class CycleProtocol:
         return {name: frames for name, frames in sets.items() if frames}
 
     def _steps_between(self) -> list[int]:
-        # A gap that is a multiple of dt but for rounding is not given one step more.
+        # Rounding of a gap that is a multiple of dt must not add a step.
         gaps = np.diff([0.0, *self.times]) / self.dt
         return np.ceil(gaps * (1 - 1e-9)).astype(int).tolist()
 
@@ -147,7 +140,7 @@ class CycleModel:
     Attributes
     ----------
     closure : ClosureModel
-        Valve, mesh, mechanics and names of the parameters; its own protocol plays no part.
+        Valve, mesh, mechanics and names of the parameters; its own protocol is not used.
     protocol : CycleProtocol
     """
 
@@ -162,30 +155,19 @@ class CycleModel:
     def run(self, m: FloatArray, *, sensitivities: bool = True) -> Simulation:
         """Run the cycle with parameters ``m (p,)`` from the open valve at rest.
 
-        Parameters
-        ----------
-        m : ndarray
-        sensitivities : bool
-            Whether all frames are differentiated.
-
-        Raises
-        ------
-        MaterialError
-            If a modulus is inadmissible.
+        ``sensitivities`` says whether all frames are differentiated. Raises MaterialError if a
+        modulus is inadmissible.
         """
-        closure = self.closure
-        system, parameters = closure.tuned(m)
+        own, (system, parameters) = self.closure, self.closure.tuned(m)
         return simulate(
             system,
-            boundary_loading(
-                system, closure.valve, closure.contact_valve, closure.settings, self.protocol
-            ),
+            boundary_loading(system, own.valve, own.contact_valve, own.settings, self.protocol),
             self.protocol.steps(),
-            damping=closure.damping(m),
-            newton=closure.settings.newton,
+            damping=own.damping(m),
+            newton=own.settings.newton,
             parameters=parameters if sensitivities else (),
-            solver=closure.solver,
-            on_step=closure.on_step,
+            solver=own.solver,
+            on_step=own.on_step,
         )
 
     def frames(self, m: FloatArray) -> FloatArray:
@@ -196,15 +178,15 @@ class CycleModel:
         MaterialError
             If a modulus is inadmissible.
         InputError
-            If the cycle cannot be followed to its end.
+            If the cycle does not converge.
         """
         simulation = self.run(m, sensitivities=False)
         if not simulation.converged:
             raise InputError(f"no cycle with the parameters {m}: {failure_of(simulation)}")
-        return self._seen(simulation.frames)
+        return self._observed(simulation.frames)
 
-    def _seen(self, steps: FloatArray) -> FloatArray:
-        """Observed vertices ``(f, n, 3)`` in the observed frames, of nodal values of all steps."""
+    def _observed(self, steps: FloatArray) -> FloatArray:
+        """Observed vertices ``(f, n, 3)`` in the observed frames, from nodal values of steps."""
         return np.stack([self.closure.observed(steps[k]) for k in self.protocol.frame_steps])
 
     def __call__(self, m: FloatArray, /) -> Prediction:
@@ -219,14 +201,14 @@ class CycleModel:
         if not simulation.converged:
             return Prediction.failed(failure_of(simulation))
         moved = np.moveaxis(simulation.sensitivities, 1, 0)
-        columns = [self._seen(by_one).ravel() for by_one in moved]
-        return Prediction(self._seen(simulation.frames).ravel(), np.stack(columns, axis=-1))
+        columns = [self._observed(by_one).ravel() for by_one in moved]
+        return Prediction(self._observed(simulation.frames).ravel(), np.stack(columns, axis=-1))
 
 
 def compare_time_steps(
     model: CycleModel, dts: Sequence[float], path: FloatArray
 ) -> list[dict[str, Any]]:
-    """What time steps do to the frames of a cycle, along a path of parameters.
+    """How the frames of a cycle depend on the time step, along a path of parameters.
 
     Parameters
     ----------
@@ -238,11 +220,10 @@ def compare_time_steps(
     Returns
     -------
     list of dict
-        Of each time step ``dt`` (s); ``change`` (mm), root mean square of all frames, when the
+        One for each time step ``dt`` (s): ``change`` (mm, root mean square over all frames) if the
         step is halved; its ``order``, the binary logarithm of the ratio of two such changes;
-        ``unevenness``, the largest change of all frames over the median one along the path, large
-        where frames jump; and the ``reason`` why the path could not be followed to its end. None
-        where a number is not known.
+        ``unevenness``, the largest change along the path over the median one, large if frames jump;
+        and the ``reason`` why the path ended early. None for unknown numbers.
 
     Raises
     ------
@@ -253,7 +234,13 @@ def compare_time_steps(
         raise InputError(f"time steps {list(dts)} s, expected each to be half of the one before")
     first, uneven, reasons = list[FloatArray | None](), list[float | None](), list[str]()
     for dt in dts:
-        frames, reason = _followed(replace(model, protocol=replace(model.protocol, dt=dt)), path)
+        of_step = replace(model, protocol=replace(model.protocol, dt=dt))
+        frames, reason = list[FloatArray](), ""
+        try:
+            for m in path:
+                frames.append(of_step.frames(m))
+        except InputError as error:
+            reason = str(error)
         along = [_rms(b - a) for a, b in pairwise(frames)]
         first.append(frames[0] if frames else None)
         uneven.append(None if reason else max(along) / float(np.median(along)))
@@ -265,10 +252,14 @@ def compare_time_steps(
     return [dict(zip(names, row, strict=True)) for row in rows]
 
 
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def with_mesh_error(
     found: Estimate, R: NoiseCovariance, other: CycleModel
 ) -> tuple[Estimate, FloatArray, float]:
-    """An estimate from a whole cycle with what its own mesh may have done to it.
+    """An estimate from a whole cycle, with the error of its mesh in its covariance.
 
     Parameters
     ----------
@@ -277,12 +268,11 @@ def with_mesh_error(
     R : noise covariance
         Of the observation.
     other : CycleModel
-        The same cycle on another, finer mesh; it is run once.
+        The same cycle on a finer mesh; it is run once.
 
     Returns
     -------
     Estimate
-        Its covariance includes the shift.
     ndarray, (p,)
         Shift by the mesh, in units of the parameters.
     float
@@ -300,18 +290,3 @@ def with_mesh_error(
     shift = shift_by_model_error(found, R, off.ravel())
     moved = shift * found.transform.derivative(found.transformed.mean)
     return with_shift(found, shift), moved, float(np.linalg.norm(off, axis=-1).mean())
-
-
-def _followed(model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], str]:
-    """Frames of the parameters along a path, up to the first that has none, and why it has none."""
-    frames: list[FloatArray] = []
-    try:
-        for m in path:
-            frames.append(model.frames(m))
-    except InputError as error:
-        return frames, str(error)
-    return frames, ""
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

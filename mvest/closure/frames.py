@@ -1,10 +1,9 @@
 """Several closed frames of one valve as one prediction, each under a pressure of its own.
 
-The tissue, the chordae and everything else are those of one valve. Each frame is the equilibrium
-under its own pressure, annulus and papillary tips, reached from the one before it. A pressure of P
-mmHg that is stated may be in error in three ways: it is truly ``scale (P + offset + error)``, with
-one scale and one offset for all frames (how the measurement is calibrated, and where its zero is),
-and an error of each frame alone.
+All frames share the tissue, the chordae and everything else. Each frame is the equilibrium under
+its own pressure, annulus and papillary tips, reached from the one before it. A stated pressure P in
+mmHg may be wrong in three ways: the true one is ``scale (P + offset + error)``, with one scale and
+one offset for all frames (calibration and zero of the measurement) and an error of each frame.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvest.closure.anchors import ClosedState
+from mvest.closure.continuation import ClosedState
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
@@ -23,14 +22,14 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 
 OFFSET, ERROR = "pressure_offset", "pressure_error"
-"""Parameters in mmHg: the offset of all stated pressures, and (``ERROR.FRAME``) that of one."""
+"""Parameters in mmHg: offset of all stated pressures, and (``ERROR.FRAME``) error of one."""
 
 SCALE = "pressure_scale"
 """The factor on all of them, a parameter of the closure."""
 
 
 def is_frame_pressure(name: str) -> bool:
-    """Whether a parameter is an error of stated pressures that only several frames tell apart."""
+    """Whether a parameter is an error of stated pressures, unknowable from one frame."""
     return name.partition(".")[0] in (OFFSET, ERROR)
 
 
@@ -43,19 +42,19 @@ class FramesModel:
     model : ClosureModel
         Closes the valve to the closed frame, under the pressure of its protocol.
     closed_name : str
-        Of that frame.
+        Name of that frame.
     states : mapping of str to HeldState
-        Frame -> what it is held by, on the contact valve's annulus. They are gone to in this order.
+        Frame -> its loads, on the contact valve's annulus, in the order in which they are reached.
     pressure_mmHg : float
-        Stated of the closed frame, as the protocol of the model has it.
+        Stated pressure of the closed frame, as in the model's protocol.
     errors : tuple of str
-        Parameters that are errors of stated pressures; with any of them, the factor on the pressure
-        is a parameter of the model.
+        Parameters that are errors of stated pressures; with any of them, `SCALE` must be a
+        parameter of the model.
 
     Raises
     ------
     InputError
-        If an error is of no frame, or the factor is missing.
+        If an error belongs to no frame, or `SCALE` is missing.
     """
 
     model: ClosureModel
@@ -89,12 +88,12 @@ class FramesModel:
 
     @property
     def valve(self) -> Valve:
-        """That of the closure."""
+        """The valve of the closure."""
         return self.model.valve
 
     @property
     def closed(self) -> ClosedState | None:
-        """Where the next prediction would start from."""
+        """Start of the next prediction."""
         return self.model.closed
 
     def restart(self, closed: ClosedState | None) -> None:
@@ -109,19 +108,14 @@ class FramesModel:
         return own
 
     def under(self, m: FloatArray, states: Mapping[str, HeldState]) -> list[HeldState]:
-        """What frames are truly held by, those of ``states`` or others without an own error.
+        """The true loads of ``states``; frames that are not fitted have no error of their own.
 
-        The pressures are those that the closure with parameters `of_closure` multiplies.
+        The closure multiplies these pressures by its own factor, see `of_closure`.
         """
-        errors, share = self._errors(m), self._true_over_stated(m)
-        offset = errors.get(OFFSET, 0.0)
+        share = self._true_over_stated(m)
         return [
-            replace(
-                one,
-                pressure_mmHg=(one.pressure_mmHg + offset + errors.get(f"{ERROR}.{name}", 0.0))
-                / share,
-            )
-            for name, one in states.items()
+            replace(state, pressure_mmHg=self._unscaled(m, frame, state.pressure_mmHg) / share)
+            for frame, state in states.items()
         ]
 
     def __call__(self, m: FloatArray, /) -> Prediction:
@@ -136,26 +130,27 @@ class FramesModel:
         if not parts[-1].converged:
             where = self.closed_name if len(parts) == 1 else list(self.states)[len(parts) - 2]
             return Prediction.failed(f"{parts[-1].reason} in frame {where}")
-        closed, *others = parts
+        parts = [*parts[1:], parts[0]]
         rest = self.valve.surface.vertices.ravel()
         stated = [*(one.pressure_mmHg for one in self.states.values()), self.pressure_mmHg]
         jacobian = [
             self._by_all(part.jacobian, m, frame, pressure)
-            for part, frame, pressure in zip((*others, closed), self.frames, stated, strict=True)
+            for part, frame, pressure in zip(parts, self.frames, stated, strict=True)
         ]
         return Prediction(
-            np.concatenate([rest, *(part.y for part in others), closed.y]),
+            np.concatenate([rest, *(part.y for part in parts)]),
             np.concatenate([np.zeros((len(rest), len(m))), *jacobian]),
         )
 
-    def _errors(self, m: FloatArray) -> dict[str, float]:
-        return dict(zip(self.errors, map(float, m[len(self.model.names) :]), strict=True))
+    def _unscaled(self, m: FloatArray, frame: str, stated: float) -> float:
+        """Pressure (mmHg) of a frame with its offset and error, but without the scale."""
+        errors = dict(zip(self.errors, map(float, m[len(self.model.names) :]), strict=True))
+        return stated + errors.get(OFFSET, 0.0) + errors.get(f"{ERROR}.{frame}", 0.0)
 
     def _true_over_stated(self, m: FloatArray) -> float:
         """Of the closed frame's pressure, without the scale."""
-        errors = self._errors(m)
-        off = errors.get(OFFSET, 0.0) + errors.get(f"{ERROR}.{self.closed_name}", 0.0)
-        return 1.0 + off / self.pressure_mmHg
+        stated = self.pressure_mmHg
+        return 1.0 + (self._unscaled(m, self.closed_name, stated) - stated) / stated
 
     def _by_all(
         self, by_closure: FloatArray, m: FloatArray, frame: str, stated: float
@@ -163,15 +158,15 @@ class FramesModel:
         """Derivatives ``(k, p)`` of a frame by all parameters from those by the closure's."""
         if not self.errors:
             return by_closure
-        errors, at = self._errors(m), self.model.names.index(SCALE)
-        # The pressure is scale * unscaled; the closure has a factor of its own on another product.
-        scale = float(m[at])
-        unscaled = stated + errors.get(OFFSET, 0.0) + errors.get(f"{ERROR}.{frame}", 0.0)
+        at = self.model.names.index(SCALE)
+        # The true pressure is scale * unscaled; the closure has a factor of its own on another
+        # product.
+        unscaled = self._unscaled(m, frame, stated)
         whole = np.zeros((len(by_closure), len(m)))
         whole[:, : by_closure.shape[1]] = by_closure
         by_pressure = by_closure[:, at] * (self._true_over_stated(m) / unscaled)
         whole[:, at] = by_pressure * unscaled
         for k, name in enumerate(self.errors, start=by_closure.shape[1]):
             if name in (OFFSET, f"{ERROR}.{frame}"):
-                whole[:, k] = by_pressure * scale
+                whole[:, k] = by_pressure * float(m[at])
         return whole

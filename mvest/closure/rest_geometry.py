@@ -1,8 +1,8 @@
 """How errors of a valve's geometry move its closed state: open shape, boundary, thickness, fibres.
 
-A change of the surface at rest is carried into the mesh and to the points where contact is sampled:
-each of them keeps its place on the surface and its share of the thickness. All embeddings stay as
-they are, so that the same material points are observed, touch and are held.
+A change of the surface at rest is carried into the mesh and to the contact samples: each of them
+keeps its position on the surface and its share of the thickness. All embeddings stay as they are,
+so that the same material points are observed, touch and are held.
 """
 
 from __future__ import annotations
@@ -32,23 +32,24 @@ from mvest.valve.geometry.triangles import unit_rows
 from mvest.valve.mesh.solid_mesh import Embedding, embed
 
 PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "insertions")
-"""Of a geometry, by the methods of `RestGeometry` that say what each is a change of."""
+"""Parts of a geometry; each has a method of `RestGeometry`."""
 
 
 class RestGeometry:
-    """The geometry at rest of a closing valve, and what changes of it do to its closed state.
+    """The geometry at rest of a closing valve, and how its closed state changes with it.
 
     Parameters
     ----------
     model : ClosureModel
         Its protocol must end in an equilibrium.
     seen : ClosureModel, optional
-        The one that it was displaced from, if changes are meant from there.
+        The model before it was displaced, if changes are measured from there.
 
     Raises
     ------
     InputError
-        If it does not: a valve that still moves has a history, which depends on the geometry too.
+        If the protocol does not end in equilibrium: a moving valve has a history, which depends on
+        the geometry too.
     """
 
     def __init__(self, model: ClosureModel, seen: ClosureModel | None = None) -> None:
@@ -56,37 +57,31 @@ class RestGeometry:
             raise InputError("derivatives by the geometry need a closure that ends in equilibrium")
         self.model, self.seen = model, seen or model
         self.surface, nodes = self.seen.valve.surface, self.seen.mesh.nodes
+        vertices, triangles = self.surface.vertices, self.surface.triangles
         self._normals = leaflet_normals(self.surface)
-        self._closest = closest_points(nodes, self.surface.vertices, self.surface.triangles)
+        self._closest = closest_points(nodes, vertices, triangles)
         self._normal = unit_rows(self._at(self._closest, self._normals))
-        self._height, self._nodes = self._feet()
-
-    def _feet(self) -> tuple[FloatArray, ClosestPoints]:
-        """Heights ``(n,)`` mm of the mesh's nodes, and where along the normals they stand.
-
-        Feet lie in the plane of the closest triangle, and possibly beyond its sides: with them a
-        node is exactly foot plus height times normal, so that it turns as the surface does.
-        """
-        surface, nodes, normal = self.surface, self.seen.mesh.nodes, self._normal
-        a, b, c = np.moveaxis(surface.vertices[surface.triangles[self._closest.triangle]], 1, 0)
+        # Each node is exactly foot + height * normal, so that it turns with the surface. The foot
+        # lies in the plane of the closest triangle, and possibly outside of it.
+        a, b, c = np.moveaxis(vertices[triangles[self._closest.triangle]], 1, 0)
         across = np.cross(b - a, c - a)
-        height = np.sum((nodes - a) * across, axis=1) / np.sum(normal * across, axis=1)
-        foot = nodes - height[:, None] * normal
+        height = np.sum((nodes - a) * across, axis=1) / np.sum(self._normal * across, axis=1)
+        foot = nodes - height[:, None] * self._normal
         area = np.sum(across**2, axis=1)
         at_b = np.sum(np.cross(foot - a, c - a) * across, axis=1) / area
         at_c = np.sum(np.cross(b - a, foot - a) * across, axis=1) / area
         weights = np.stack([1.0 - at_b - at_c, at_b, at_c], axis=1)
-        return height, replace(self._closest, barycentric=weights)
+        self._height, self._feet = height, replace(self._closest, barycentric=weights)
 
     @cached_property
     def _samples(self) -> ClosestPoints:
-        """Where the samples of contact are on the surface."""
+        """Positions of the contact samples on the surface."""
         points = self.seen.contact_valve.surface.vertices
         return closest_points(points, self.surface.vertices, self.surface.triangles)
 
     @cached_property
     def _sampled(self) -> Embedding:
-        """The samples of contact in the mesh."""
+        """The contact samples embedded in the mesh."""
         return embed(self.seen.mesh, self.seen.contact_valve.surface.vertices)
 
     @cached_property
@@ -99,21 +94,26 @@ class RestGeometry:
     def _at(self, points: ClosestPoints, values: FloatArray) -> FloatArray:
         return points.interpolate(values, self.surface.triangles)
 
+    def _ends(self, values: FloatArray) -> FloatArray:
+        """Values at the chordal insertions, from values ``(n, ...)`` at the surface's vertices."""
+        own, chordae = self.surface, self.seen.valve.chordae
+        return self._at(closest_points(chordae.insertion, own.vertices, own.triangles), values)
+
     def _still(self, q: int) -> FloatArray:
         return np.zeros((q, *self.model.mesh.nodes.shape))
 
     def shape(self, moves: FloatArray) -> RestVariation:
-        """Of the open shape, by displacements ``(q, n, 3)`` mm of the surface's vertices.
+        """Change of the open shape by displacements ``(q, n, 3)`` mm of the surface's vertices.
 
-        The annulus and the papillary tips of the closed valve stay where they are; the chordae go
-        with the leaflets.
+        The annulus and the papillary tips of the closed valve stay where they are; the chordae
+        follow the leaflets.
         """
         contact, by_vertex = self.model.contact_valve.surface, np.moveaxis(moves, 0, -1)
         members, weights, slope = self._patches
         turn = self._at(self._closest, leaflet_normals_change(self.surface, by_vertex))
         turn /= np.linalg.norm(self._at(self._closest, self._normals), axis=1)[:, None, None]
         turn -= self._normal[:, :, None] * np.einsum("ni,niq->nq", self._normal, turn)[:, None]
-        nodes = self._at(self._nodes, by_vertex) + self._height[:, None, None] * turn
+        nodes = self._at(self._feet, by_vertex) + self._height[:, None, None] * turn
         samples = self._sampled(nodes)
         areas = lumped_areas_change(contact.vertices, contact.triangles, samples).T
         ends = self._ends(by_vertex)[:, None] - samples[members]
@@ -126,16 +126,11 @@ class RestGeometry:
         )
 
     def along_ends(self) -> FloatArray:
-        """Two directions ``(c, 2, 3)`` along the leaflet where each chord ends."""
+        """Two directions ``(c, 2, 3)`` along the leaflet at each chordal insertion."""
         return np.linalg.svd(unit_rows(self._ends(self._normals))[:, None])[2][:, 1:]
 
-    def _ends(self, values: FloatArray) -> FloatArray:
-        """Values at the chordae's ends, of those ``(n, ...)`` at the surface's vertices."""
-        own, chordae = self.surface, self.seen.valve.chordae
-        return self._at(closest_points(chordae.insertion, own.vertices, own.triangles), values)
-
     def thickness(self, factors: FloatArray) -> RestVariation:
-        """Of the thickness, by relative changes ``(q, n)`` at the surface's vertices."""
+        """Relative changes ``(q, n)`` of the thickness at the surface's vertices."""
         nodes = [
             (self._height * self._at(self._closest, factor))[:, None] * self._normal
             for factor in factors
@@ -145,57 +140,51 @@ class RestGeometry:
         return RestVariation(np.array(nodes), thickness=np.array(thickness))
 
     def fibres(self, angles: FloatArray) -> RestVariation:
-        """Of the fibres, by turns ``(q, regions)`` rad of each region's about its normals."""
+        """Rotation of each region's fibres about its normals by ``(q, regions)`` rad."""
         mesh = self.model.mesh
         across = np.cross(self._normal[mesh.elements], mesh.fibre)
         turned = [angle[mesh.region][:, None, None] * across for angle in angles]
         return RestVariation(self._still(len(angles)), fibre=np.array(turned))
 
     def annulus(self, moves: FloatArray) -> RestVariation:
-        """Of the closed annulus, by displacements ``(q, a, 3)`` mm of the contact valve's."""
+        """Displacements ``(q, a, 3)`` mm of the contact valve's closed annulus."""
         copies = 2 if self.model.settings.support == "clamp" else 1
         return RestVariation(self._still(len(moves)), supports=np.tile(moves, (1, copies, 1)))
 
     def tips(self, moves: FloatArray, rest_length: FloatArray | None = None) -> RestVariation:
-        """Of the closed valve's papillary tips, by displacements ``(q, t, 3)`` mm.
+        """Displacements ``(q, t, 3)`` mm of the closed valve's papillary tips.
 
-        ``rest_length (q, c)`` is how much longer the chordae then are at rest, relative, where that
-        follows from the tips.
+        ``rest_length (q, c)`` is the relative change of the chordae's rest length, if it follows
+        from the tips.
         """
         return RestVariation(self._still(len(moves)), tips=moves, rest_length=rest_length)
 
     def rest_lengths(self, changes: FloatArray) -> RestVariation:
-        """Of the chordae's rest lengths, by relative changes ``(q, c)``."""
+        """Relative changes ``(q, c)`` of the chordae's rest lengths."""
         share = self.seen.valve.chordae.rest_length / self.model.valve.chordae.rest_length
         return RestVariation(self._still(len(changes)), rest_length=changes * share)
 
     def insertions(self, moves: FloatArray) -> RestVariation:
-        """Of where the chordae end, by displacements ``(q, c, 3)`` mm at rest."""
+        """Displacements ``(q, c, 3)`` mm of the chordal insertions at rest."""
         members, weights, slope = self._patches
         ends = np.broadcast_to(moves[:, :, None], (len(moves), *slope.shape))
         patches = patch_change(weights, slope, ends)
         return RestVariation(self._still(len(moves)), patches=patches, members=members)
 
     def variation(self, parts: Mapping[str, FloatArray]) -> RestVariation:
-        """Of several parts of the geometry at once, each ``(q, ...)`` as its method takes it.
-
-        Parameters
-        ----------
-        parts : mapping
-            Some of `PARTS` -> as many quantities of each.
-        """
+        """Change of several `PARTS` at once, each ``(q, ...)`` as its method takes it."""
         return RestVariation.summed([getattr(self, name)(values) for name, values in parts.items()])
 
     def displaced(self, parts: Mapping[str, FloatArray]) -> ClosureModel:
         """The model of the valve with another geometry, its guide's too; it has closed nothing.
 
-        Everything embedded stays where it is in the material. A displacement of the open shape
-        carries the mesh along as its derivative says.
+        All embeddings stay where they are in the material. A displacement of the open shape moves
+        the mesh as its derivative predicts.
 
         Parameters
         ----------
         parts : mapping
-            Some of `PARTS` -> what `variation` takes, of one quantity.
+            Some of `PARTS` -> one quantity, as `variation` takes several.
 
         Raises
         ------
@@ -203,10 +192,10 @@ class RestGeometry:
             If a leaflet would have no thickness, or a chord no length.
         """
         own = {name: np.asarray(values)[None] for name, values in parts.items()}
-        model, still = self.model, np.zeros_like(self.model.mesh.nodes)
-        shape = self.shape(own["shape"]).nodes[0] if "shape" in own else still
-        thicker = self.thickness(own["thickness"]).nodes[0] if "thickness" in own else still
-        nodes = shape + thicker
+        model, nodes = self.model, np.zeros_like(self.model.mesh.nodes)
+        for name in ("shape", "thickness"):
+            if name in own:
+                nodes = nodes + getattr(self, name)(own[name]).nodes[0]
         mesh = replace(model.mesh, nodes=model.mesh.nodes + nodes)
         if "fibres" in own:
             angle, normal = parts["fibres"][mesh.region][:, None, None], self._normal[mesh.elements]
@@ -220,7 +209,6 @@ class RestGeometry:
             insertion=model.valve.chordae.insertion + ends,
             rest_length=model.valve.chordae.rest_length * (1.0 + parts.get("rest_lengths", 0.0)),
         )
-        thickness = parts.get("thickness", np.zeros(len(self.surface.vertices)))
 
         def moved(
             valve: Valve, by: FloatArray, thicker: FloatArray, to: FloatArray | float
@@ -237,16 +225,14 @@ class RestGeometry:
             motion = replace(valve.motion, annulus=annulus, papillary_tips=tips)
             return replace(valve, surface=surface, chordae=chordae, motion=motion)
 
-        to = parts.get("annulus", 0.0)
-        contact = moved(
-            model.contact_valve, self._sampled(nodes), self._at(self._samples, thickness), to
-        )
+        thickness = parts.get("thickness", np.zeros(len(self.surface.vertices)))
+        thicker = self._at(self._samples, thickness)
+        annulus = parts.get("annulus", 0.0)
+        contact = moved(model.contact_valve, self._sampled(nodes), thicker, annulus)
         same = model.contact_valve is model.valve
         valve = contact if same else moved(model.valve, model.observed(nodes), thickness, 0.0)
         guide = None if model.guide is None else RestGeometry(model.guide).displaced(parts)
-        return replace(
-            model, valve=valve, contact_valve=contact, mesh=mesh, guide=guide, anchors=None
-        )
+        return replace(model, valve=valve, contact_valve=contact, mesh=mesh, guide=guide)
 
     def change(
         self,
@@ -255,17 +241,17 @@ class RestGeometry:
         states: Sequence[HeldState] = (),
         tolerance: float = EXACT,
     ) -> FloatArray | str:
-        """Derivatives ``(f, n, 3, q)`` of the observed open and closed valve, or why none.
+        """Derivatives ``(f, n, 3, q)`` of the observed valve, or why there are none.
 
-        Those of the states come between them.
+        Frames are the open valve, the equilibria under ``states``, and the closed valve.
 
         Parameters
         ----------
         m : (p,)
-            Parameters of the closure; it is gone to from the last closed state, if that is another.
+            Parameters of the closure; the valve is closed with them if it is not already.
         variation : RestVariation
         states : sequence of HeldState
-            Under other loads, gone to from the closed valve.
+            Other loads, reached from the closed valve.
         tolerance : float
             Of each derivative, relative.
         """

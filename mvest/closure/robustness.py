@@ -1,9 +1,8 @@
-"""Is the closed valve one state? A gate that every anatomy is asked to pass.
+"""Is the closed state unique? A gate that every anatomy should pass.
 
-An estimate is worth what the closed valve is worth: if a smaller time step, a finer mesh or a
-slightly different modulus sends the leaflets into another pleat, the moduli fitted to that state
-mean nothing. The gate closes the valve under variations that must not matter and compares the
-closed surfaces; and it follows the closed surface along changing moduli
+Fitted moduli mean nothing if a smaller time step, a finer mesh or a slightly different modulus
+folds the leaflets differently. The gate closes the valve under variations that must not matter and
+compares the closed surfaces. It also follows the closed surface along changing moduli
 (:mod:`mvest.closure.smoothness`), where it may bend but must not jump.
 """
 
@@ -23,18 +22,17 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 MEAN_LIMIT = 0.1
 MAX_LIMIT = 0.5
-"""mm, the largest accepted mean and maximal distance between closed states."""
+"""mm, largest accepted mean and maximal distance between closed states."""
 
 PERTURBATION = 1.0
 WAVELENGTH = 30.0
-"""mm, largest displacement of a perturbed start, and of the waves that it consists of: so long that
-the warped leaflets, thickness and all, do not pass through each other."""
+"""mm, largest displacement of a perturbed start, and wavelength of its waves: so long that the
+thick, warped leaflets do not pass through each other."""
 WAVES = 4
 
 COMMON = (0.8, 0.95, 1.05, 1.2)
 SINGLE = (0.8, 1.2)
-"""Factors on all moduli together and on one alone at which the path of closed states begins to be
-looked at."""
+"""First factors of a path, on all moduli together and on one alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +55,11 @@ class GateCase:
     sampling : float
         Factor on the density of the contact samples along both directions.
     guided : bool
-        Whether the closure is followed on the coarser meshes of the model's guide.
+        Whether the model's guide is used.
     perturbed : int
         Seed of a smooth displacement of the open leaflets before they close; 0 for none.
     start : float
-        Factor on all moduli E_f at which the valve is closed first, and from where it goes on; 1:
+        Factor on all moduli E_f at which the valve is closed first, and continued from; 1: closed
         from the open valve.
     """
 
@@ -119,25 +117,21 @@ class GateRow:
     reason: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class GateReport:
-    """All cases, the paths along the moduli, and the verdict.
+    """All cases, the reference first, and the paths along the moduli.
 
-    Attributes
-    ----------
-    rows : tuple of GateRow
-        The reference first.
-    paths : tuple of Path
-        Along a common factor on all moduli, and along each modulus where there are several.
-    closed : (n, 3) mm or None
-        Observed vertices of the reference's closed state.
-    passed : bool
+    There is a path along a common factor on all moduli and, if there are several, along each of
+    them. Without a closed reference there is none.
     """
 
     rows: tuple[GateRow, ...]
-    paths: tuple[Path, ...]
-    closed: FloatArray | None
-    passed: bool
+    paths: tuple[Path, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """The verdict."""
+        return all(one.passed for one in (*self.rows, *self.paths))
 
 
 def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
@@ -152,20 +146,17 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
         raise InputError(f"gate case {case.name!r} needs the anatomy to be meshed or sampled anew")
     fresh, settings = model.fresh(), model.settings
     protocol, newton, contact = settings.protocol, settings.newton, settings.contact
-    dt, ramp = protocol.dt * case.dt, protocol.ramp * case.ramp
     tolerance = newton.tolerance if case.converged_path else newton.path_tolerance
+    distance = contact.activation_distance * case.activation
     return replace(
         fresh,
         settings=replace(
             settings,
-            protocol=replace(protocol, dt=dt, ramp=ramp),
+            protocol=replace(protocol, dt=protocol.dt * case.dt, ramp=protocol.ramp * case.ramp),
             newton=replace(newton, path_tolerance=tolerance),
-            contact=replace(
-                contact, activation_distance=contact.activation_distance * case.activation
-            ),
+            contact=replace(contact, activation_distance=distance),
         ),
         guide=fresh.guide if case.guided else None,
-        anchors=None,
         continuation=case.start != 1,
         reach=np.inf,
         perturbation=_perturbation(model.mesh, case.perturbed) if case.perturbed else None,
@@ -173,7 +164,7 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
 
 
 def _perturbation(mesh: SolidMesh, seed: int) -> FloatArray:
-    """A sum of plane waves ``(n, 3)`` mm at the nodes, the largest displacement as stated."""
+    """A sum of plane waves ``(n, 3)`` mm at the nodes, scaled to the stated displacement."""
     rng = np.random.default_rng(seed)
     normals, sides = rng.standard_normal((2, WAVES, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -186,8 +177,8 @@ def run_gate(
     build: Callable[[GateCase], ClosureModel],
     m: FloatArray,
     cases: Sequence[GateCase] = GATE_CASES,
-    on_case: Callable[[GateRow], None] | None = None,
-    on_path: Callable[[Path], None] | None = None,
+    on_case: Callable[[GateRow], None] = lambda row: None,
+    on_path: Callable[[Path], None] = lambda path: None,
 ) -> GateReport:
     """Close the valve in all cases and along the moduli, and compare.
 
@@ -205,64 +196,42 @@ def run_gate(
     is_modulus = np.array([name.startswith("E_f.") for name in model.names])
     reference = model(m)
     rows = [GateRow(REFERENCE.name, 0.0, 0.0, reference.converged, reference.reason)]
-    if on_case is not None:
-        on_case(rows[0])
+    on_case(rows[0])
     if not reference.converged:
-        return GateReport(tuple(rows), (), None, False)
-    at_rest = _closed_state(reference, m * is_modulus)
+        return GateReport(tuple(rows))
+    closed = _closed(reference.y)
     for case in cases:
         varied = build(case)
         prediction = varied(np.where(is_modulus, case.start * m, m))
         if case.start != 1 and prediction.converged:
             prediction = varied(m)
-        rows.append(_row(case.name, prediction, at_rest.y))
-        if on_case is not None:
-            on_case(rows[-1])
+        mean = largest = float("nan")
+        if prediction.converged:
+            distance = np.linalg.norm(_closed(prediction.y) - closed, axis=1)
+            mean, largest = float(distance.mean()), float(distance.max())
+        passed = mean <= MEAN_LIMIT and largest <= MAX_LIMIT
+        rows.append(GateRow(case.name, mean, largest, passed, prediction.reason))
+        on_case(rows[-1])
+    moduli = np.flatnonzero(is_modulus).tolist()
+    directions = [("E_f", is_modulus.astype(np.float64), COMMON)] if moduli else []
+    if len(moduli) > 1:
+        directions += [(model.names[k], np.eye(len(m))[k], SINGLE) for k in moduli]
     paths = []
-    for name, which, factors in _directions(model.names, is_modulus):
+    for name, which, factors in directions:
+
+        def state(prediction: Prediction, rates: FloatArray) -> PathState:
+            return PathState(_closed(prediction.y), _closed(prediction.jacobian @ rates))
 
         def close(factor: float, which: FloatArray = which) -> PathState | str:
             at = m * factor**which
             prediction = model(at)
-            return (
-                _closed_state(prediction, at * which) if prediction.converged else prediction.reason
-            )
+            return state(prediction, at * which) if prediction.converged else prediction.reason
 
-        centre = _closed_state(reference, m * which)
-        paths.append(follow(name, close, centre, factors))
-        if on_path is not None:
-            on_path(paths[-1])
-    passed = all(r.passed for r in rows) and all(path.passed for path in paths)
-    return GateReport(tuple(rows), tuple(paths), at_rest.y, passed)
+        paths.append(follow(name, close, state(reference, m * which), factors))
+        on_path(paths[-1])
+    return GateReport(tuple(rows), tuple(paths))
 
 
-def _row(name: str, prediction: Prediction, closed: FloatArray) -> GateRow:
-    mean = largest = float("nan")
-    if prediction.converged:
-        distance = np.linalg.norm(_closed_part(prediction.y) - closed, axis=1)
-        mean, largest = float(distance.mean()), float(distance.max())
-    passed = bool(mean <= MEAN_LIMIT and largest <= MAX_LIMIT)
-    return GateRow(name, mean, largest, passed, prediction.reason)
-
-
-def _closed_part(y: FloatArray) -> FloatArray:
+def _closed(y: FloatArray) -> FloatArray:
     """The closed frame's vertices ``(n, 3)`` mm of both frames."""
     return y.reshape(2, -1, 3)[1]
-
-
-def _closed_state(prediction: Prediction, rates: FloatArray) -> PathState:
-    """The closed frame and its derivative along parameters that change at ``rates (p,)``."""
-    return PathState(_closed_part(prediction.y), _closed_part(prediction.jacobian @ rates))
-
-
-def _directions(
-    names: Sequence[str], is_modulus: FloatArray
-) -> list[tuple[str, FloatArray, tuple[float, ...]]]:
-    """What is changed together: its name, 1 for its parameters, and the first factors."""
-    moduli = np.flatnonzero(is_modulus).tolist()
-    found: list[tuple[str, FloatArray, tuple[float, ...]]] = []
-    if moduli:
-        found.append(("E_f", is_modulus.astype(np.float64), COMMON))
-    if len(moduli) > 1:
-        found += [(names[k], np.eye(len(names))[k], SINGLE) for k in moduli]
-    return found

@@ -1,29 +1,28 @@
-r"""Does the closed valve jump while a modulus changes? Curvature told from jumps.
+r"""Does the closed valve jump while a modulus changes? Tells curvature from jumps.
 
-A closed state bends with the moduli, and the more the farther they are changed, so that differences
-over wide steps disagree with the derivative in any healthy valve. What a healthy valve does not do
-is jump. With the exact derivative d = dx / d log E at every state, the way from one state to the
-next is known but for what their derivatives do not explain,
+The closed state of any valve is a curved function of the moduli, so that differences over wide
+steps disagree with the derivative. A healthy valve does not jump, though. With the exact derivative
+d = dx / d log E at two states, their distance is explained up to
 
 .. math:: r = x_b - x_a - \tfrac12 (d_a + d_b) \log (E_b / E_a) .
 
-The trapezoidal rule leaves of a smooth response a third-order term, -x''' h^3 / 12: half the step,
-an eighth. A jump stays whole, whatever the step. A kink (a slope that changes by k) leaves at most
-k h / 2, which falls in proportion. So a piece with more than `JUMP_LIMIT` unexplained at any one
-vertex, or more than `SLOPE_LIMIT` of its way over all vertices, is halved until it is explained or
-narrower than `RESOLUTION`. A path is not passed if then
+For a smooth response this error of the trapezoidal rule is -x''' h^3 / 12: half the step leaves an
+eighth. A jump does not shrink with the step. A kink (a slope that changes by k) leaves at most
+k h / 2. A piece of the path is halved if more than `JUMP_LIMIT` of any vertex or more than
+`SLOPE_LIMIT` of the motion of all vertices is unexplained, until it is narrower than `RESOLUTION`.
+The path then fails if
 
-* a vertex moves by more than `JUMP_LIMIT` unexplained: a jump, which no mean may hide;
-* or more than `SLOPE_LIMIT` of a piece's way is unexplained and it can be seen: a vertex moves by
-  more than `SEEN`. A share of a way that is itself too short to be seen says nothing;
-* or what is unexplained adds up to more than `SLOPE_LIMIT` of the whole way: derivatives that are
-  wrong everywhere, or many small jumps, which no piece shows;
-* or a state's derivative explains neither of its two sides to `SIDE_LIMIT`. At a kink it is right
-  on one of them.
+* a vertex moves by more than `JUMP_LIMIT` unexplained, which is a jump;
+* more than `SLOPE_LIMIT` of a piece's motion is unexplained, and some vertex moves by more than
+  `SEEN` unexplained;
+* the unexplained parts add up to more than `SLOPE_LIMIT` of the whole motion, as with derivatives
+  that are wrong everywhere or with many small jumps;
+* a state's derivative explains neither of its two sides to `SIDE_LIMIT`. At a kink it is right on
+  one side.
 
-What this cannot see: states that leave and come back between two neighbours; a jump smaller than
-the limit; a derivative that is wrong at an end of the path alone; and whether a change steeper than
-the resolution is continuous, which to an estimator of that modulus is the same.
+Not detected are: states that leave and return between two neighbours; jumps smaller than the limit;
+a derivative that is wrong only at an end of the path; and whether a change steeper than the
+resolution is continuous, which makes no difference to an estimate of that modulus.
 """
 
 from __future__ import annotations
@@ -37,19 +36,19 @@ import numpy as np
 from mvest.typing import FloatArray
 
 JUMP_LIMIT = 0.1
-"""mm, largest accepted unexplained move of any vertex: what other numerics may move in the mean."""
+"""mm, largest accepted unexplained motion of any vertex, as the mean over other numerics may be."""
 SLOPE_LIMIT = 0.05
-"""Largest accepted unexplained part of a way, over all vertices, piece by piece and in all."""
+"""Largest accepted unexplained share of the motion of all vertices, of a piece and in total."""
 SEEN = 0.02
-"""mm, what no estimator sees of a single point: as `resolution_mm` of the errors that are learned
-(:class:`mvest.observation.learned.ErrorBeliefs`)."""
+"""mm, smallest motion of a single point that an estimator can see: `resolution_mm` of
+:class:`mvest.observation.learned.ErrorBeliefs`."""
 SIDE_LIMIT = 0.2
-"""Unexplained part of the way on both sides of a state from which its derivative is called wrong,
-by half (of one half too large: h d / 4 in 5 h d / 4), and with it the width of an interval."""
+"""Unexplained share on both sides of a state above which its derivative, and with it the width of
+an interval, is wrong by half (if it is half too large: h d / 4 of 5 h d / 4)."""
 RESOLUTION = 0.02
 """Width in log E below which a piece is not halved any more."""
 ROUND_OFF = 1e-6
-"""mm, unexplained moves that are none."""
+"""mm, unexplained motion below this counts as zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,19 +68,18 @@ class PathState:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """From one state to the next.
+    """The part of a path between two neighbouring states.
 
     Attributes
     ----------
     low, high : float
         Factors on the moduli.
     unexplained_mm : float
-        Of the vertex at which it is largest.
+        Largest unexplained motion of a vertex.
     vertices : int
-        How many have more than the limit.
+        How many exceed `JUMP_LIMIT`.
     unexplained, way : float
-        mm, of all vertices (the root of the sum of squares): what the derivatives do not explain of
-        the way, and its length by the derivatives.
+        mm, unexplained motion and whole motion by the derivatives; norms over all vertices.
     """
 
     low: float
@@ -104,7 +102,7 @@ class Piece:
 
     @property
     def share(self) -> float:
-        """The unexplained over the way; 0 where there is no more than round-off."""
+        """Unexplained share of the motion; 0 for mere round-off."""
         return 0.0 if self.unexplained_mm <= ROUND_OFF else _share(self.unexplained, self.way)
 
     @property
@@ -119,15 +117,15 @@ class Piece:
 
     @property
     def fault(self) -> str:
-        """Why it fails where it cannot be halved; empty if it passes."""
+        """Why it fails if it is not halved any more; empty if it passes."""
         if self.explained or self.unexplained_mm <= SEEN:
             return ""
         where = f"between {_percent(self.low)} and {_percent(self.high)}"
         if self.unexplained_mm > JUMP_LIMIT:
             return f"a jump of {self.unexplained_mm:.2g} mm at {self.vertices} vertices {where}"
         return (
-            f"{100 * self.share:.2g} % of the way {where}, up to {self.unexplained_mm:.2g} mm, is "
-            "not what the derivatives say"
+            f"the derivatives do not explain {100 * self.share:.2g} % of the motion {where}, up to "
+            f"{self.unexplained_mm:.2g} mm"
         )
 
 
@@ -140,11 +138,11 @@ class Path:
     name : str
         What is changed.
     pieces : tuple of Piece
-        In ascending order, after halving; up to the first that cannot be explained.
+        In ascending order, after halving; up to the first that fails.
     closures : int
-        How many states were computed, without the middle one.
+        How many states were computed, without the central one.
     reason : str
-        Why it is not passed; empty if it is.
+        Why it fails; empty if it passes.
     """
 
     name: str
@@ -154,7 +152,7 @@ class Path:
 
     @property
     def share(self) -> float:
-        """Unexplained share of the whole way: over all pieces, nothing cancels."""
+        """Unexplained share of the whole motion; contributions of pieces do not cancel."""
         unexplained = sum(piece.unexplained for piece in self.pieces if piece.share > 0)
         return _share(unexplained, sum(piece.way for piece in self.pieces))
 
@@ -180,13 +178,13 @@ def follow(
     centre : PathState
         At the factor 1.
     factors : sequence of float
-        Where else the path is looked at first, below and above 1.
+        First other factors, below and above 1.
     """
     states: dict[float, PathState] = {1.0: centre}
     pieces: list[Piece] = []
-    tried, reason = 0, ""
+    tried = 0
 
-    def missing(factor: float) -> str:
+    def failure(factor: float) -> str:
         nonlocal tried
         tried += 1
         found = close(factor)
@@ -196,9 +194,10 @@ def follow(
         return ""
 
     for factor in factors:
-        if reason := missing(factor):
+        if reason := failure(factor):
             return Path(name, (), tried, reason)
-    # The last one is looked at first, so that pieces come in ascending order.
+    reason = ""
+    # A stack, so that pieces come in ascending order.
     waiting = [*pairwise(sorted(states))][::-1]
     while waiting and not reason:
         low, high = waiting.pop()
@@ -208,22 +207,22 @@ def follow(
             reason = piece.fault
             continue
         middle = float(np.sqrt(low * high))
-        reason = missing(middle)
+        reason = failure(middle)
         waiting += [(middle, high), (low, middle)]
     path = Path(name, tuple(pieces), tried, reason)
     return replace(path, reason=reason or _overall(path))
 
 
 def _overall(path: Path) -> str:
-    """Why pieces that pass one by one do not pass together; empty if they do."""
+    """Why pieces that pass one by one fail together; empty if they pass."""
     for left, right in pairwise(path.pieces):
         if min(left.share, right.share) > SIDE_LIMIT:
             return (
-                f"the derivative at {_percent(left.high)} explains neither side of it: "
-                f"{100 * left.share:.2g} and {100 * right.share:.2g} % of the way are left"
+                f"the derivative at {_percent(left.high)} explains neither side: "
+                f"{100 * left.share:.2g} and {100 * right.share:.2g} % of the motion are left"
             )
     if path.share > SLOPE_LIMIT:
-        return f"{100 * path.share:.2g} % of the whole way is not what the derivatives say"
+        return f"the derivatives do not explain {100 * path.share:.2g} % of the whole motion"
     return ""
 
 

@@ -9,11 +9,9 @@ from .filters.iterated import IteratedFilter as IteratedFilter
 from .filters.paper import PaperFilter as PaperFilter
 from .filters.unscented import UnscentedFilter as UnscentedFilter
 from .gaussian import Gaussian as Gaussian
-from .information.consistency import ZTest as ZTest
 from .information.consistency import chi_square_band as chi_square_band
 from .information.consistency import moran as moran
 from .information.consistency import nees as nees
-from .information.consistency import zero_mean as zero_mean
 from .information.design import Design as Design
 from .information.design import together as together
 from .information.identifiability import Identifiability as Identifiability

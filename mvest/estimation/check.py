@@ -13,18 +13,17 @@ from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 DISTANCE_LIMIT = 0.25
-"""Error of a distance of one standard deviation. Twice as far a distance is wrong by about four
-times as much: an end of a 95 % interval by a fifth of the interval."""
+"""Error of a distance of one standard deviation. Twice that distance is wrong by about four times
+as much: an end of a 95 % interval by a fifth of the interval."""
 
 STEP_LIMIT = 0.5
 """Standard deviations by which one more update may move an estimate."""
 
 TIMES_LIMIT = 2.0
-"""How many times too far or too near a point may be in the posterior, if it is within `BEYOND` by
-the posterior or by the model."""
+"""Largest relative error of a distance that is within `BEYOND` by the posterior or by the model."""
 
 BEYOND = 6.0
-"""Standard deviations beyond which a point is out of the question."""
+"""Standard deviations beyond which a point is practically impossible."""
 
 NEAREST, FURTHEST = 0.2, 10.0
 """Standard deviations between which a run measures the curvature at the estimate."""
@@ -51,7 +50,7 @@ class ApproximationCheck:
     compared : str
         What was compared.
     value : float
-        The difference; infinite where it could not be computed.
+        The difference; infinite if it could not be computed.
     limit : float
         Largest value at which the estimate's interval is valid.
     runs : int
@@ -85,7 +84,7 @@ class ApproximationCheck:
 
 
 def worst(checks: Sequence[ApproximationCheck]) -> ApproximationCheck | None:
-    """The check that is furthest beyond, or nearest to, its limit; None of none."""
+    """The check that exceeds its limit most, or comes nearest to it; None without checks."""
     return max(checks, key=lambda check: check.value / check.limit, default=None)
 
 
@@ -101,20 +100,21 @@ def check_against_runs(
 ) -> list[ApproximationCheck]:
     """Compare N(z, P) with the objective J at runs of the model, and with one more update.
 
-    Were the posterior N(z, P) with P = C Cᵀ, a point at the distance ``δ = |C⁻¹ (zₖ − z)|`` would
-    have ``τ = √(2 (J(zₖ) − J(z))) = δ``, the profile of Bates and Watts (Nonlinear Regression
+    If the posterior were N(z, P) with P = C Cᵀ, a point at the distance ``δ = |C⁻¹ (zₖ − z)|``
+    would have ``τ = √(2 (J(zₖ) − J(z))) = δ``, the profile of Bates and Watts (Nonlinear Regression
     Analysis and Its Applications, 1988, section 6.1). Two comparisons are made at every run:
 
-    * τ with δ, wherever the point is probable by either, and roughly where it is within `BEYOND` by
-      either. This finds a point that is as likely as the estimate but far beyond its intervals.
-    * The residual of linearisation q = W (h(zₖ) − h(z) − H (zₖ − z)), which grows with δ², brought
+    * τ with δ, closely if the point is probable by either of them, and roughly if it is within
+      `BEYOND` by either. This finds a point that is as likely as the estimate but far outside of
+      its intervals.
+    * The residual of linearisation q = W (h(zₖ) − h(z) − H (zₖ − z)), which grows with δ², scaled
       to one standard deviation: q/δ² (their curvature, section 7.1). With e = W (y − h(z)),
       a = W H (zₖ − z)/δ and x = L⁻¹ (zₖ − z)/δ for a prior covariance L Lᵀ, J differs at a distance
       of ± 1 from its Gaussian by ``½ (|a|² + |x|² − 1) − (q/δ²)·(e ∓ a) + ½ |q/δ²|²``, where the
       brackets are 0 unless P includes second derivatives. A run with derivatives gives
       ½ W (Hₖ − H) C u/δ for other directions u as well.
 
-    Further, with H and e an update of the prior should lead to N(z, P) itself.
+    Further, an update of the prior with H and e should give N(z, P) itself.
 
     ``prior`` and ``posterior`` are in filter coordinates. ``predicted (n,)`` and its derivative or
     slope ``H (n, p)`` are those at the posterior's mean.
@@ -160,25 +160,20 @@ def check_against_runs(
                     more = 0.5 * float(u @ counted @ v)
                     curved.append(_change_of_distance(M @ v, e, WC @ v, more))
 
-    checks = []
-    for values, limit, what in (
-        (apart, DISTANCE_LIMIT, "error of distances from the estimate in the posterior"),
-        (times, TIMES_LIMIT, "times too far or too near that the posterior holds a place to be"),
-        (curved, DISTANCE_LIMIT, "curvature of the model over one posterior standard deviation"),
-    ):
-        if values:
-            checks.append(ApproximationCheck(what, max(values), limit, compared))
     update = kalman_update(prior, y - predicted + H @ (z - prior.mean), H, noise)
-    step = _coordinates(C, update.posterior.mean - z)[0]
-    checks.append(
-        ApproximationCheck(
-            "one more update moves the estimate by standard deviations",
-            float(np.linalg.norm(step)),
-            STEP_LIMIT,
-            1,
-        )
-    )
-    return checks
+    step = float(np.linalg.norm(_coordinates(C, update.posterior.mean - z)[0]))
+    return [
+        *(
+            ApproximationCheck(what, max(values), limit, compared)
+            for values, limit, what in (
+                (apart, DISTANCE_LIMIT, "error of distances from the estimate in the posterior"),
+                (times, TIMES_LIMIT, "relative error of a distance in the posterior"),
+                (curved, DISTANCE_LIMIT, "curvature of the model over one standard deviation"),
+            )
+            if values
+        ),
+        ApproximationCheck("step of one more update in standard deviations", step, STEP_LIMIT, 1),
+    ]
 
 
 def _change_of_distance(q: FloatArray, e: FloatArray, a: FloatArray, more: float) -> float:

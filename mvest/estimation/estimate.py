@@ -12,14 +12,12 @@ from mvest.errors import InputError
 from mvest.estimation.check import ApproximationCheck
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.information.consistency import chi_square_band
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Transform, covariance_to_physical
-from mvest.estimation.update import Update
 from mvest.typing import FloatArray
 
 NOT_THE_POSTERIOR = ", but the posterior is not what the filter assumes"
-"""Stands before the sentence of a check that fails."""
+"""Joins the reason and the sentence of a check that fails."""
 
 OnIterate: TypeAlias = Callable[[int, FloatArray, float], None]
 """Called after each iterate with its number, the parameters (p,) and the objective."""
@@ -31,13 +29,13 @@ class Reason(Enum):
     CONVERGED = "converged: the change of every parameter is below the tolerance"
     MAX_ITERATIONS = "not converged: the largest permitted number of iterations is reached"
     NO_DECREASE = "not converged: no step along the search direction lowers the objective"
-    COMPLETED = "completed: every update that was planned is done"
+    COMPLETED = "completed: every planned update is done"
     NOT_SAMPLED = "not converged: the draws from the posterior do not yet agree with each other"
     MODEL_FAILED = "not converged: the model gives no prediction where the filter needs one"
 
     @property
     def converged(self) -> bool:
-        """Whether the estimate is one."""
+        """Whether the estimate may be used."""
         return self in (Reason.CONVERGED, Reason.COMPLETED)
 
 
@@ -46,11 +44,8 @@ class InnovationSummary:
     """The innovation of the prior, and how well its covariance S explains it.
 
     The innovation e = y − h(z) + H (z − m) is linearised at the estimate z. For a linear model it
-    is y less the prediction at the prior's mean m. The residual y − h(z) of the estimate is
-    smaller.
-
-    The paper's filter sees the same y in each round. There y depends on the state it is compared
-    with, and `nis` is smaller than a chi-square number.
+    is y less the prediction at the prior's mean m. The paper's filter uses the same y in each
+    round, so that its `nis` is smaller than a chi-square number.
 
     Attributes
     ----------
@@ -63,7 +58,7 @@ class InnovationSummary:
     nis_band : (float, float)
         Band that holds such a number with 95 % probability.
     residual_rms : float, in units of the observation
-        Root mean square of the residual.
+        Root mean square of the residual y − h(z) of the estimate.
     """
 
     size: int
@@ -73,24 +68,10 @@ class InnovationSummary:
     nis_band: tuple[float, float]
     residual_rms: float | None = None
 
-    @classmethod
-    def of(
-        cls, innovation: FloatArray, update: Update, residual: FloatArray
-    ) -> "InnovationSummary":
-        """Summarise the innovation of one update, and the residual after it."""
-        return cls(
-            size=innovation.size,
-            rms=float(np.sqrt(np.mean(innovation**2))),
-            max_abs=float(np.max(np.abs(innovation))),
-            nis=update.nis,
-            nis_band=chi_square_band(innovation.size),
-            residual_rms=float(np.sqrt(np.mean(residual**2))),
-        )
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Estimate of p parameters after k iterates, the start included; the last is the estimate.
+    """Estimate of p parameters after k iterates, from the start to the estimate.
 
     Filter coordinates are z = T(m) of the transform. Covariances are transformed to first order.
 
@@ -98,29 +79,29 @@ class Estimate:
     ----------
     names : tuple of str, (p,)
     prior : Gaussian
-        Prior of the parameters as it was given.
+        Prior of the parameters themselves.
     transform : Transform
     transformed_iterates : (k, p), filter coordinates
     transformed_iterate_covariances : (k, p, p), filter coordinates
-        Paper's filter: covariance after round k, row 0 the prior's. Iterated filter: covariance of
-        the posterior linearised at iterate k. Others: see each filter.
+        Paper's filter: covariance after round k, with the prior's in row 0. Iterated filter:
+        covariance of the posterior linearised at iterate k. Others: see each filter.
     objective : (k,)
-        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Others: the same plus the prior's term; filters that
-        run the model around an iterate take the mean of these predictions for h. NaN in the last
+        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Others: the same plus the prior's term; for filters
+        that run the model around an iterate, h is the mean of these predictions. NaN in the last
         row if the model failed there.
     log_likelihood : (k,)
-        log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`, and where a filter
+        log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`, and if a filter
         does not compute it.
     prediction : Prediction or None
-        At the estimate; None if the model failed there. Without derivatives of the model its
+        At the estimate; None if the model failed there. If the model has no derivatives, its
         Jacobian is the slope between the filter's points.
     innovation : InnovationSummary or None
         At the last iterate; None if the model failed there.
     standardised : (n,) or None
-        S^(-1/2) e of the same, to be tested for whiteness.
+        S^(-1/2) e of that innovation; white if the model and its covariances are right.
     reason : Reason
     detail : str
-        Numbers to the reason, or the failed model's reason.
+        Numbers that belong to the reason, or the failed model's reason.
     forward_solves : int
         Runs of the model, failed ones included.
     transformed_samples : (s, p), filter coordinates, or None
@@ -128,10 +109,10 @@ class Estimate:
     learned : LearnedNoise or None
         The noise, if it was learned.
     check : ApproximationCheck or None
-        Whether the posterior is as the filter assumes; None where nothing was compared.
+        The worst check of the posterior; None if nothing was compared.
     curvature : (p, p), filter coordinates, or None
         Second derivatives of the objective that its linearisation leaves out,
-        ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, if the filter found them.
+        ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, if the filter computed them.
     """
 
     names: tuple[str, ...]
@@ -187,7 +168,7 @@ class Estimate:
 
     @property
     def iterations(self) -> int:
-        """Number of updates, one less than the number of iterates."""
+        """Number of updates."""
         return len(self.transformed_iterates) - 1
 
     @property
@@ -229,20 +210,19 @@ class Estimate:
     def interval(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
         """Lower and upper ends (p,) of each parameter's central credible interval.
 
-        The interval is symmetric in filter coordinates: that of a parameter estimated by its
-        logarithm stays positive. With `transformed_samples` its ends are their quantiles.
+        It is symmetric in filter coordinates, so that a parameter estimated by its logarithm stays
+        positive. With `transformed_samples` its ends are their quantiles.
         """
         if not 0.0 < level < 1.0:
             raise InputError(f"an interval's level must lie between 0 and 1; got {level:g}")
         if self.transformed_samples is not None:
             tails = (0.5 - 0.5 * level, 0.5 + 0.5 * level)
             low, high = np.quantile(self.transformed_samples, tails, axis=0)
-            return self.transform.inverse(low), self.transform.inverse(high)
-        z = self.transformed
-        half_width = float(scipy.special.ndtri(0.5 + 0.5 * level)) * z.std
-        return self.transform.inverse(z.mean - half_width), self.transform.inverse(
-            z.mean + half_width
-        )
+        else:
+            z = self.transformed
+            half_width = float(scipy.special.ndtri(0.5 + 0.5 * level)) * z.std
+            low, high = z.mean - half_width, z.mean + half_width
+        return self.transform.inverse(low), self.transform.inverse(high)
 
 
 def _std(covariances: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Learns the noise together with the parameters, from one linearisation of a model.
+"""Learns the noise together with the parameters, from one linearisation of the model.
 
 With the innovation e = y − h(z) + H (z − m) of the prior N(m, P), linearised at z, and the noise
 R(θ) of quantities θ (see `mvest.estimation.noise`)::
@@ -6,12 +6,12 @@ R(θ) of quantities θ (see `mvest.estimation.noise`)::
     log p(e | θ) = log N(e; 0, S),   S = R(θ) + H P Hᵀ + C Cᵀ
 
 is the evidence of θ (MacKay 1992, Neural Comput. 4:415), maximised together with the prior of
-log θ. All columns are projected once on the basis of the smooth part and across it, where only
-their triangular factor is needed. A few hundred rows remain of n observations. They are independent
-for every θ, so that an evaluation with derivatives costs p² times their number.
+log θ. All columns are projected once on the basis of the smooth part and across it, where their
+triangular factor suffices. A few hundred rows remain of n observations. They are independent for
+every θ, so that an evaluation with derivatives costs p² times their number.
 
-The uncertainty of θ widens the covariance of z (Kass and Steffey 1989, J. Am. Stat. Assoc. 84:717),
-with the covariance of log θ from the second derivatives (Laplace) and the mean over it::
+The uncertainty of θ widens the covariance of z (Kass and Steffey 1989, J. Am. Stat. Assoc. 84:717).
+The covariance of log θ follows from the second derivatives (Laplace), E is the mean over it::
 
     P⁺ = E P⁺(θ) + (dz/dθ) cov(θ) (dz/dθ)ᵀ
 """
@@ -31,27 +31,27 @@ from mvest.estimation.spectrum import BANDS, Basis, LogNormal, matern, spread_po
 from mvest.typing import FloatArray
 
 TOLERANCE = 1e-3
-"""Slope of the evidence, per standard deviation of the prior, at which it is greatest."""
+"""Slope of the evidence at its maximum, per standard deviation of the prior."""
 
 DIFFERENCE = 1e-4
 """Step in differences of exact derivatives, in standard deviations of the prior."""
 
 SHELLS, CENTRES = 60, 60
-"""Distances at which the correlation of the smooth part is known, and points about which."""
+"""Distances at which the correlation of the smooth part is sampled, and points around which."""
 
 RANGE = 1.5
-"""Of these distances, in lengths of the reference correlation."""
+"""Largest of these distances, in lengths of the reference correlation."""
 
 SMOOTH, LENGTH = "smooth part", "length of the smooth part"
-"""Names of the two quantities that summarise the bands."""
+"""Quantities that summarise the bands."""
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedQuantity:
     """Prior and posterior of one quantity of the noise.
 
-    It is a factor (of a frame, of added columns) or has the unit of the observation (a length: of
-    the points).
+    It is a factor (of a frame, of added columns), or has the unit of the observation or, as a
+    length, of the points.
     """
 
     name: str
@@ -69,20 +69,20 @@ class LearnedQuantity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedNoise:
-    """What was learned of the noise.
+    """Posterior of the noise.
 
     Attributes
     ----------
     posterior : Gaussian
         Of the logarithms of the family's quantities.
     quantities : tuple of LearnedQuantity
-        For a reader: standard deviation and length of the smooth part (the length at which its
-        correlation is that of a Matérn one at its own), and all others; the rough part includes the
+        For a reader: standard deviation and length of the smooth part (at which its correlation is
+        that of a Matérn correlation at its length), and all others; the rough part includes the
         resolution.
     noise : ObservationNoise
         At the mean, added columns included.
     covariance : (p, p) in filter coordinates
-        What the uncertainty of θ adds to the covariance of the estimate.
+        Added to the covariance of the estimate by the uncertainty of θ.
     """
 
     posterior: Gaussian
@@ -93,7 +93,7 @@ class LearnedNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """Of coordinates u: the mode, the mean, and a root of the covariance."""
+    """Mode, mean and a root of the covariance of coordinates u."""
 
     mode: FloatArray
     mean: FloatArray
@@ -101,10 +101,9 @@ class Posterior:
 
 
 class Evidence:
-    """log p(e | θ) as a function, after everything is projected.
+    """log p(e | θ) of the innovation e (n,) and B = H L (n, p), with the prior covariance P = L Lᵀ.
 
-    It is made of the innovation e (n,) and of B = H L (n, p), with the prior's covariance P = L Lᵀ.
-    Coordinates u are those in which the prior of log θ is N(0, I): log θ = mean + root u.
+    The prior of log θ is N(0, I) in coordinates u: log θ = mean + root u.
 
     Attributes
     ----------
@@ -115,11 +114,11 @@ class Evidence:
     rows : (r, 1 + p + q)
         Innovation, columns of the parameters, and added columns.
     kind : (r,)
-        Which of the variances is that of a row.
+        Index of each row's variance.
     count : (v,)
-        Observations of each variance, for the determinant.
+        Observations with each variance, for the determinant.
     added : list of (int, slice)
-        Which quantity is the factor of which columns.
+        Index of a quantity, and the columns of which it is the factor.
     log_scale : float
         log det D².
     """
@@ -162,10 +161,10 @@ class Evidence:
     def posterior(self, start: FloatArray | None = None) -> Posterior:
         """Approximate posterior of u.
 
-        The most probable value of a variance is too small if few observations tell it. The mean is
-        to first order ``u − ½ H⁻¹ d(log det H)/du`` with the second derivatives H (Tierney and
-        Kadane 1986, J. Am. Stat. Assoc. 81:82); with the columns s of a root of H⁻¹ and the slope g
-        of the objective that is ``u − ½ H⁻¹ Σ (g(u + s) − 2 g(u) + g(u − s))``.
+        With few observations, the most probable variance is too small. The mean is to first order
+        ``u − ½ H⁻¹ d(log det H)/du`` with the second derivatives H (Tierney and Kadane 1986, J. Am.
+        Stat. Assoc. 81:82). With the columns s of a root of H⁻¹ and the slope g of the objective,
+        that is ``u − ½ H⁻¹ Σ (g(u + s) − 2 g(u) + g(u − s))``.
         """
         h = self.prior.size
         u = np.zeros(h) if start is None else start
@@ -181,7 +180,7 @@ class Evidence:
             step = DIFFERENCE * np.eye(h)[k]
             hessian[k] = self.objective(u + step)[1] - self.objective(u - step)[1]
         values, V = np.linalg.eigh((hessian + hessian.T) / (4.0 * DIFFERENCE))
-        # Data make nothing less certain than before.
+        # Data never reduce certainty.
         values = np.maximum(values, 1.0)
         spread = V / np.sqrt(values)
         slope = self.objective(u)[1]
@@ -193,7 +192,7 @@ class Evidence:
         return Posterior(u, u + spread @ moved, spread)
 
     def objective(self, u: FloatArray) -> tuple[float, FloatArray]:
-        """−log p(e | θ) − log p(θ) but for a constant, and its derivatives by u."""
+        """−log p(e | θ) − log p(θ) up to a constant, and its derivatives by u."""
         value, slope = self.misfit(self.log(u))
         return value + 0.5 * float(u @ u), self.root.T @ slope + u
 
@@ -212,12 +211,12 @@ class Evidence:
         half = _forward(root, B.T)
         log_det = float(self.count @ np.log(v)) + self.log_scale
         log_det += 2.0 * float(np.sum(np.log(np.diagonal(root))))
-        # Derivative by the logarithm of the standard deviation of each variance.
+        # Derivative by the logarithm of each standard deviation.
         by_row = np.sum(half**2, axis=0) + residual**2
         by_std = self.count - np.bincount(self.kind, by_row, len(v))
         slope = np.zeros(len(log) + 1)
         np.add.at(slope, of.rough, by_std * rough)
-        # Rows without a frame's factor have the index -1: they add to the entry that is dropped.
+        # Rows without a frame's factor have the index -1 and add to the entry that is dropped.
         np.add.at(slope, of.frame, by_std)
         if self.family.bands is not None:
             np.add.at(slope, of.band, by_std * smooth)
@@ -237,9 +236,9 @@ class Evidence:
     def _solved(
         self, log: FloatArray, v: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Weighed innovation and columns, the root of M, and M⁻¹ Bᵀ V⁻¹ e."""
-        weighed = self.rows / np.sqrt(v)[self.kind][:, None]
-        e, B = weighed[:, 0], weighed[:, 1:]
+        """Weighted innovation and columns, the root of M, and M⁻¹ Bᵀ V⁻¹ e."""
+        weighted = self.rows / np.sqrt(v)[self.kind][:, None]
+        e, B = weighted[:, 0], weighted[:, 1:]
         for k, members in self.added:
             B[:, members] *= np.exp(log[k])
         M = B.T @ B
@@ -248,11 +247,11 @@ class Evidence:
         return e, B, root, scipy.linalg.cho_solve((root, True), B.T @ e, check_finite=False)
 
     def learned(self, posterior: Posterior, L: FloatArray) -> LearnedNoise:
-        """The noise learned, for a prior covariance P = L Lᵀ of the parameters."""
+        """The learned noise, for a prior covariance P = L Lᵀ of the parameters."""
         u, h, p = posterior.mean, self.prior.size, len(L)
         P = self.update(self.log(u), p)[1]
         more = np.zeros((p, p))
-        # Points of a cubature rule of third degree: those of h normal numbers are √h away.
+        # Points of a cubature rule of third degree for h normal numbers are √h away.
         for direction in np.sqrt(h) * posterior.spread.T:
             up, P_up = self.update(self.log(u + direction), p)
             down, P_down = self.update(self.log(u - direction), p)
@@ -261,7 +260,7 @@ class Evidence:
         found = Gaussian(self.log(u), spread @ spread.T)
         return LearnedNoise(
             found,
-            _in_words(self.family, self.prior, found),
+            _quantities(self.family, self.prior, found),
             self.family.at(found.mean),
             L @ more @ L.T,
         )
@@ -271,56 +270,46 @@ def _forward(root: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(scipy.linalg.solve_triangular(root, columns, lower=True, check_finite=False))
 
 
-def _in_words(
+def _quantities(
     family: NoiseFamily, prior: Gaussian, posterior: Gaussian
 ) -> tuple[LearnedQuantity, ...]:
     """The quantities of a family for a reader."""
     quantities, first = [], 0
-    factors = {block.frame for block in family.blocks} | {c.name for c in family.columns}
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:
         first = BANDS
         for name, amount in _amounts(basis).items():
-            believed, learned = (
-                _log_normal(amount, Gaussian(of.mean[:BANDS], of.covariance[:BANDS, :BANDS]))
-                for of in (prior, posterior)
-            )
-            quantities.append(LearnedQuantity(name, believed, learned))
+            two = (_log_normal(amount, of.mean, of.covariance) for of in (prior, posterior))
+            quantities.append(LearnedQuantity(name, *two))
+    factors = {block.frame for block in family.blocks} | {c.name for c in family.columns}
     rough = {block.rough for block in family.blocks}
     for k, name in enumerate(family.names[first:], first):
         least = family.resolution**2 if name in rough else 0.0
-        believed, learned = (
-            _with_resolution(float(of.mean[k]), float(of.std[k]), least)
-            for of in (prior, posterior)
-        )
-        quantities.append(LearnedQuantity(name, believed, learned, name in factors))
+        two = []
+        for of in (prior, posterior):
+            variance = np.exp(2.0 * of.mean[k])
+            factor = np.exp(of.std[k] * variance / (variance + least))
+            two.append(LogNormal(float(np.sqrt(variance + least)), float(factor)))
+        quantities.append(LearnedQuantity(name, *two, name in factors))
     return tuple(quantities)
 
 
-def _with_resolution(log: float, std: float, least: float) -> LogNormal:
-    """A standard deviation of given logarithm together with a variance of ``least``."""
-    variance = np.exp(2.0 * log)
-    total = variance + least
-    return LogNormal(float(np.sqrt(total)), float(np.exp(std * variance / total)))
-
-
-def _log_normal(amount: Callable[[FloatArray], float], of: Gaussian) -> LogNormal:
-    """The logarithm of an amount, to first order."""
-    step = 1e-3
+def _log_normal(
+    amount: Callable[[FloatArray], float], mean: FloatArray, covariance: FloatArray
+) -> LogNormal:
+    """The exponential of an amount of the bands, which come first, to first order."""
+    m, step = mean[:BANDS], 1e-3
     slope = np.array(
-        [
-            (amount(of.mean + step * e) - amount(of.mean - step * e)) / (2.0 * step)
-            for e in np.eye(of.size)
-        ]
+        [(amount(m + step * e) - amount(m - step * e)) / (2.0 * step) for e in np.eye(BANDS)]
     )
-    variance = max(0.0, float(slope @ of.covariance @ slope))
-    return LogNormal(float(np.exp(amount(of.mean))), float(np.exp(np.sqrt(variance))))
+    variance = max(0.0, float(slope @ covariance[:BANDS, :BANDS] @ slope))
+    return LogNormal(float(np.exp(amount(m))), float(np.exp(np.sqrt(variance))))
 
 
 def _amounts(basis: Basis) -> dict[str, Callable[[FloatArray], float]]:
     """Logarithms of the smooth part's standard deviation and length as functions of its bands.
 
-    From its covariance at the shells' distances per unit s_b².
+    They follow from its covariance at the distances of the shells per unit s_b².
     """
     centres = spread_points(basis.points, min(len(basis.points), CENTRES))
     apart = cdist(basis.points[centres], basis.points)
@@ -348,7 +337,7 @@ def _amounts(basis: Basis) -> dict[str, Callable[[FloatArray], float]]:
         return float(0.5 * np.log(np.exp(2.0 * bands) @ by_band[:, 0]))
 
     def log_length(bands: FloatArray) -> float:
-        """Of the distance at which the correlation is as a Matérn one's at its length."""
+        """Distance at which the correlation is that of a Matérn correlation at its length."""
         covariance = np.exp(2.0 * bands) @ by_band
         below = np.flatnonzero(covariance[1:] < level * covariance[0])
         if not below.size:

@@ -9,10 +9,10 @@ from mvest.estimation.prediction import read_only, require_finite
 from mvest.typing import FloatArray
 
 SYMMETRY_TOLERANCE = 1e-10
-"""Largest asymmetry of a covariance taken for round-off, relative to the standard deviations."""
+"""Asymmetry of a covariance below this is round-off, relative to the standard deviations."""
 
 DEFINITENESS_TOLERANCE = 1e-12
-"""Most negative eigenvalue of a correlation matrix taken for round-off, per parameter."""
+"""Negative eigenvalues of a correlation matrix above minus this are round-off, per parameter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,8 +64,8 @@ class Gaussian:
     def factor(self) -> FloatArray:
         """A square root L (p, p) of the covariance, P = L Lᵀ.
 
-        Triangular (Cholesky) where P is positive definite; from the eigenvectors where P is only
-        semi-definite. Scaled by the standard deviations first, so that units play no part.
+        Triangular (Cholesky) if P is positive definite, otherwise from the eigenvectors; scaled by
+        the standard deviations first, so that units do not matter.
         """
         correlation, std = _correlation(self.covariance)
         try:
@@ -81,7 +81,7 @@ def standard(prior: Gaussian, other: Gaussian) -> Gaussian:
     """Another Gaussian of the same parameters, in coordinates in which the prior is N(0, I)."""
     inverse = np.linalg.pinv(prior.factor)
     P = inverse @ other.covariance @ inverse.T
-    # What the prior holds fixed keeps the unit variance that these coordinates give it.
+    # Fixed parameters have unit variance in these coordinates.
     fixed = np.eye(len(P)) - inverse @ prior.factor
     return Gaussian(inverse @ (other.mean - prior.mean), P + fixed @ fixed.T)
 
@@ -97,7 +97,7 @@ def as_covariance(variance: float | FloatArray, size: int, what: str) -> FloatAr
 
 
 def checked_covariance(covariance: FloatArray, size: int, what: str) -> FloatArray:
-    """A symmetrised copy (p, p) of a covariance, or InputError saying what is wrong with it."""
+    """A symmetrised copy (p, p) of a covariance; InputError if it is none."""
     P = np.array(covariance, dtype=np.float64)
     if P.shape != (size, size):
         raise InputError(f"{what} must have shape ({size}, {size}); got {P.shape}")

@@ -1,15 +1,15 @@
 """The noise of an observation: covariance R, used only through W with Wᵀ W = R⁻¹.
 
-R is known, or known up to a few quantities. Errors of neighbouring points are correlated in part.
+R is known, or known up to a few quantities. Errors of neighbouring points are partly correlated.
 For a block of k points, each observed in several independent coordinates::
 
     R = f² D (Σ s_b² U_b diag(w_b) U_bᵀ + τ² I + δ² I) D
 
 U_b and w_b belong to the bands of `mvest.estimation.spectrum`. s_b is the standard deviation of the
-smooth part in one band, τ that of the rough part, δ the resolution, the least standard deviation of
-a point, f the factor of a frame and D the scales of single points. The logarithms of the quantities
-have a normal prior; `mvest.estimation.evidence` learns them. Other unknown quantities, which change
-the observation by columns C, add C Cᵀ.
+smooth part in one band, τ that of the rough part, δ the resolution, which is the smallest standard
+deviation of a point, f the factor of a frame and D the scales of single points. The logarithms of
+the quantities have a normal prior; `mvest.estimation.evidence` learns them. Other unknown
+quantities, which change the observation by columns C, add C Cᵀ.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mvest.estimation.spectrum import BANDS, Basis, LogNormal, bands_of
 from mvest.typing import FloatArray, IntArray
 
 LARGEST = 300.0
-"""Largest logarithm of a standard deviation; a search may try any."""
+"""Bound on the logarithm of a standard deviation; a search may try any value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +84,8 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
         return kronecker_noise(1.0, root, 1)
     require_positive(values, "variance in R")
     weight = 1.0 / np.sqrt(values)
-
-    def whiten(observed: FloatArray) -> FloatArray:
-        return (weight * observed.T).T
-
     log_determinant = float(np.sum(np.log(np.broadcast_to(values, (size,)))))
-    return ObservationNoise(size, log_determinant, whiten)
+    return ObservationNoise(size, log_determinant, lambda observed: (weight * observed.T).T)
 
 
 def kronecker_noise(variance: float, root: FloatArray, copies: int) -> ObservationNoise:
@@ -118,9 +114,8 @@ def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
         pieces = np.split(values, ends[:-1])
         return np.concatenate([p.whiten(v) for p, v in zip(parts, pieces, strict=True)])
 
-    return ObservationNoise(
-        int(ends[-1]), float(sum(part.log_determinant for part in parts)), whiten
-    )
+    log_determinant = float(sum(part.log_determinant for part in parts))
+    return ObservationNoise(int(ends[-1]), log_determinant, whiten)
 
 
 def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
@@ -135,12 +130,10 @@ def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
     if factor.shape != (base.size,):
         raise InputError(f"scale of noise has shape {factor.shape}, expected ({base.size},)")
     require_positive(factor, "scale of noise")
-
-    def whiten(values: FloatArray) -> FloatArray:
-        return base.whiten((np.asarray(values).T / factor).T)
-
     return ObservationNoise(
-        base.size, base.log_determinant + 2.0 * float(np.sum(np.log(factor))), whiten
+        base.size,
+        base.log_determinant + 2.0 * float(np.sum(np.log(factor))),
+        lambda values: base.whiten((np.asarray(values).T / factor).T),
     )
 
 
@@ -176,7 +169,7 @@ def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseBlock:
-    """Observations of points that share their kind of error, independent of other blocks.
+    """Points with the same kind of error, independent of other blocks.
 
     Attributes
     ----------
@@ -185,7 +178,7 @@ class NoiseBlock:
     scale : (k,)
         Factor of each point on the standard deviations.
     coordinates : int
-        Observed of each point; they are independent and follow one another in the observation.
+        Observed coordinates of each point; they are independent and follow one another.
     basis : Basis or None
         Of the smooth part, if there is one.
     frame : str or None
@@ -205,7 +198,7 @@ class NoiseBlock:
 
     @property
     def variance_count(self) -> int:
-        """Number of different variances: those along the basis, and the one across it."""
+        """Number of different variances: along the basis, and one across it."""
         return 1 if self.basis is None else 1 + len(self.basis.w)
 
     def noise(self, variances: FloatArray) -> ObservationNoise:
@@ -235,9 +228,9 @@ class ErrorColumns:
     name : str
         Of the factor s.
     columns : (n, q) in units of the observation
-        C: what one standard deviation of each does to the observation.
+        C: change of the observation by one standard deviation of each quantity.
     factor : float
-        To which s is known, about 1; 1 holds it there.
+        One standard deviation of s, about 1; 1 fixes it.
     """
 
     name: str
@@ -251,9 +244,9 @@ class VarianceTerms(NamedTuple):
     Attributes
     ----------
     weight : (r,)
-        w; of each block those of its basis, then that across it.
+        w; for each block along its basis, then across it.
     band, rough, frame : (r,)
-        Which of the quantities are s_b, τ and f; no f where it is -1.
+        Indices of the quantities s_b, τ and f; -1 without f.
     """
 
     weight: FloatArray
@@ -266,7 +259,7 @@ class VarianceTerms(NamedTuple):
 class NoiseFamily:
     """Noise of n observations as a function of a few positive quantities.
 
-    Code that expects a known noise gets that at the medians.
+    Code that expects a fixed noise gets the noise at the medians.
 
     Attributes
     ----------
@@ -279,7 +272,12 @@ class NoiseFamily:
     resolution : float
         δ.
     columns : tuple of ErrorColumns
-        Added, each with a factor of its own.
+        Added noise.
+
+    Raises
+    ------
+    InputError
+        If the blocks' quantities are not those given, or names repeat.
     """
 
     blocks: tuple[NoiseBlock, ...]
@@ -331,7 +329,7 @@ class NoiseFamily:
         return replace(self, columns=(*self.columns, columns))
 
     def without_columns(self) -> NoiseFamily:
-        """The errors of single observations alone."""
+        """The family without added columns."""
         return replace(self, columns=())
 
     def at(self, log: FloatArray, beats: float = 1.0) -> ObservationNoise:
@@ -342,9 +340,9 @@ class NoiseFamily:
         log : (h,)
             Logarithms of the quantities; those of columns come last.
         beats : float
-            Heart beats whose mean is observed, may be infinite. The smooth and the rough part are
-            independent from beat to beat, so that their variance falls by this factor. Resolution
-            and added columns are the same in every beat and stay.
+            Heart beats whose mean is observed, may be infinite. It divides the variances of the
+            smooth and the rough part, which are independent from beat to beat. Resolution and added
+            columns are the same in every beat.
 
         Raises
         ------

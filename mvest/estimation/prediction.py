@@ -1,7 +1,4 @@
-"""What a filter needs from a model: the observation it predicts, and its Jacobian.
-
-Some models wrap another one: a function of fewer parameters, a model with a cache.
-"""
+"""What a filter needs from a model: the predicted observation and its Jacobian."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -20,16 +17,16 @@ class Prediction:
     Attributes
     ----------
     y : (n,) in units of the observation
-        Predicted observation; empty where the model failed.
+        Predicted observation; empty if the model failed.
     jacobian : (n, p) in units of the observation per unit of each parameter
-        Derivative of `y`; empty where the model failed, of shape (n, 0) where the model does not
+        Derivative of `y`; empty if the model failed, of shape (n, 0) if the model does not
         differentiate (`Prediction.undifferentiated`).
     converged : bool
-        False if the model found no answer. Filters then read nothing but `reason`.
+        False if the model has no solution. Filters then read only `reason`.
     reason : str
-        Why the model stopped; not empty where it failed.
+        Why the model stopped; not empty if it failed.
     aux : object
-        Anything else for the caller of the filter, which passes it on unread.
+        Anything else for the caller of the filter, which ignores it.
 
     Raises
     ------
@@ -74,12 +71,12 @@ class Prediction:
 
     @property
     def differentiated(self) -> bool:
-        """Whether the Jacobian is there."""
+        """Whether there is a Jacobian."""
         return self.jacobian.shape[1] > 0
 
     @classmethod
     def failed(cls, reason: str) -> "Prediction":
-        """The prediction of a model that found no answer, and why."""
+        """The prediction of a model without a solution, and why."""
         return cls(np.empty(0), np.empty((0, 0)), converged=False, reason=reason)
 
 
@@ -88,9 +85,9 @@ Predicted: TypeAlias = Prediction | tuple[FloatArray, FloatArray]
 
 
 class ObservationModel(Protocol):
-    """Any function from parameters (p,) to a prediction; this is all a filter knows of a model.
+    """Any function from parameters (p,) to a prediction; a filter knows nothing else of a model.
 
-    The model must accept every finite m. Where m is inadmissible, or the computation does not
+    The model must accept every finite m. If m is inadmissible, or the computation does not
     converge, it returns `Prediction.failed(reason)`: filters shorten a step that fails.
     """
 
@@ -104,7 +101,7 @@ def predict(
 ) -> Prediction:
     """Run a model at m (p,) and check its prediction, see `as_prediction`.
 
-    Where the model raises MaterialError the prediction has failed.
+    If the model raises MaterialError the prediction has failed.
     """
     try:
         returned = model(np.array(m, dtype=np.float64))
@@ -116,13 +113,12 @@ def predict(
 def as_prediction(
     returned: Predicted, p: int, n: int | None = None, *, derivatives: bool = False
 ) -> Prediction:
-    """Check what a model of p parameters returned; n observations are expected, if n is given.
+    """Check what a model of p parameters returned, n observations if n is given.
 
     Raises
     ------
     InputError
-        If that is no prediction, its shapes are not (n,) and (n, p), or ``derivatives`` are needed
-        and missing.
+        If it is no prediction, its shapes are not (n,) and (n, p), or ``derivatives`` are missing.
     """
     if isinstance(returned, Prediction):
         prediction = returned
@@ -154,8 +150,8 @@ def of_some(
 ) -> Callable[[FloatArray], Prediction]:
     """A model as a function of its parameters ``kept (k,)``; the others stay at ``values (p,)``.
 
-    A parameter within the relative distance ``snap`` of its value is set to it, so that a cached
-    run is found again bit for bit.
+    A parameter within the relative distance ``snap`` of its value is set to it, so that a run of
+    `SharedStart` or `Remembered` is found again.
     """
 
     def part(m: FloatArray) -> Prediction:
@@ -203,10 +199,9 @@ class Remembered:
 class SharedStart:
     """A model for many estimations that all begin at the same parameters ``start (p,)``.
 
-    The prediction there is computed once. Each request for it also resets the model to its state
-    after that run, so that an estimation gives the same numbers, bit for bit, alone or after
-    others. ``model.closed`` is that state and ``model.restart(closed)`` resets the model; no other
-    code may use the model meanwhile.
+    The prediction there is computed once. Each request for it resets the model to its state after
+    that run (``model.restart(model.closed)``), so that an estimation gives the same numbers, bit
+    for bit, alone or after others. No other code may use the model meanwhile.
     """
 
     def __init__(self, model: Any, start: FloatArray) -> None:

@@ -10,6 +10,7 @@ from mvest.errors import InputError
 from mvest.estimation.check import ApproximationCheck, Run, check_against_runs, worst
 from mvest.estimation.estimate import Estimate, InnovationSummary, OnIterate, Reason
 from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.consistency import chi_square_band
 from mvest.estimation.noise import NoiseCovariance, observation_noise
 from mvest.estimation.prediction import (
     ObservationModel,
@@ -32,14 +33,14 @@ class FilterRun:
     ----------
     model : ObservationModel
     physical_prior : Gaussian
-        Prior of the parameters as it was given.
+        Prior of the parameters themselves.
     R : NoiseCovariance
-        As it was given.
+        As given.
     prior : Gaussian
         Prior in filter coordinates.
     L : (p, p)
-        Root of its covariance. With z = m + L x the prior of x is N(0, I), also where the prior
-        holds a parameter fixed.
+        Root of its covariance. With z = m + L x the prior of x is N(0, I), also if the prior holds
+        a parameter fixed.
     unit : Gaussian
         N(0, I) of p parameters.
     y : (n,) in units of the observation
@@ -87,7 +88,7 @@ class FilterRun:
     def predict(self, z: FloatArray, *, derivatives: bool = True) -> Prediction:
         """Run the model at filter coordinates z (p,), unless it was just run there.
 
-        See `as_prediction` for the errors; a filter that needs no ``derivatives`` takes any model.
+        See `as_prediction` for the errors. Without ``derivatives`` any model will do.
         """
         if self._last is not None and np.array_equal(self._last[0], z):
             return self._last[1]
@@ -112,9 +113,9 @@ class FilterRun:
         return 0.5 * float(e @ e)
 
     def negligible(self, change: FloatArray, z: FloatArray, P: FloatArray, limit: float) -> bool:
-        """Whether a change of z moves no parameter by more than `limit`, relatively.
+        """Whether a change of z moves no parameter by more than the relative `limit`.
 
-        Relative to ``|m|``, or to the standard deviation of m where that is larger.
+        Relative to ``|m|``, or to the standard deviation of m if that is larger.
         """
         D = np.abs(self.transform.derivative(z))
         std = D * np.sqrt(np.diagonal(P))
@@ -127,32 +128,6 @@ class FilterRun:
         if self._on_iterate is not None:
             number = len(self._history) - 1
             self._on_iterate(number, self.transform.inverse(z).copy(), objective)
-
-    def finish(
-        self,
-        reason: Reason,
-        detail: str,
-        prediction: Prediction,
-        innovation: FloatArray,
-        update: Update,
-        *,
-        prior: Gaussian | None = None,
-        **more: Any,
-    ) -> Estimate:
-        """The estimate at the last recorded iterate, at which `prediction` was made.
-
-        ``prior`` was updated last, if not that of the problem; ``more`` are further fields of the
-        `Estimate`. Noise that was ``learned`` widens the covariance.
-        """
-        summary = InnovationSummary.of(innovation, update, self.y - prediction.y)
-        if "check" not in more:
-            # The posterior for this noise is checked, before the noise's uncertainty widens it.
-            more["check"] = self.check(prediction, prior=prior)
-        if learned := more.get("learned"):
-            z, P, *values = self._history[-1]
-            self._history[-1] = (z, P + learned.covariance, *values)
-        more["standardised"] = update.standardised_innovation
-        return self._estimate(reason, detail, prediction=prediction, innovation=summary, **more)
 
     def check(
         self,
@@ -179,6 +154,39 @@ class FilterRun:
         )
         return worst([*checks, *others])
 
+    def finish(
+        self,
+        reason: Reason,
+        detail: str,
+        prediction: Prediction,
+        innovation: FloatArray,
+        update: Update,
+        *,
+        prior: Gaussian | None = None,
+        **more: Any,
+    ) -> Estimate:
+        """The estimate at the last recorded iterate, at which `prediction` was made.
+
+        ``prior`` was updated last, if not that of the problem; ``more`` are further fields of the
+        `Estimate`. Noise that was ``learned`` widens the covariance.
+        """
+        if "check" not in more:
+            # The posterior for this noise is checked before the noise's uncertainty widens it.
+            more["check"] = self.check(prediction, prior=prior)
+        if learned := more.get("learned"):
+            z, P, *values = self._history[-1]
+            self._history[-1] = (z, P + learned.covariance, *values)
+        more["innovation"] = InnovationSummary(
+            size=innovation.size,
+            rms=float(np.sqrt(np.mean(innovation**2))),
+            max_abs=float(np.max(np.abs(innovation))),
+            nis=update.nis,
+            nis_band=chi_square_band(innovation.size),
+            residual_rms=float(np.sqrt(np.mean((self.y - prediction.y) ** 2))),
+        )
+        standardised = update.standardised_innovation
+        return self._estimate(reason, detail, prediction, standardised=standardised, **more)
+
     def finish_with_slope(
         self,
         z: FloatArray,
@@ -189,14 +197,14 @@ class FilterRun:
         samples: FloatArray | None = None,
         checks: Sequence[ApproximationCheck] = (),
     ) -> Estimate:
-        """Run the model at the estimate N(z, P), record it, and end there.
+        """Run the model at the estimate N(z, P), record it, and finish.
 
         Parameters
         ----------
         z, P : (p,), (p, p)
             In filter coordinates.
         slope : (n, p)
-            dh/dz between the filter's points, used where the model has no derivative.
+            dh/dz between the filter's points, used if the model has no derivative.
         reason, detail
             See `Estimate`.
         samples : (s, p), optional
@@ -213,11 +221,11 @@ class FilterRun:
         H = self.jacobian(z, prediction)
         innovation = self.y - prediction.y + H @ (z - self.prior.mean)
         update = kalman_update(self.prior, innovation, H, self.noise)
-        # What the prior holds fixed has no part in its term.
+        # Fixed parameters have no share in the prior's term.
         x = np.linalg.lstsq(self.L, z - self.prior.mean, rcond=None)[0]
         objective = self.misfit(prediction) + 0.5 * float(x @ x)
         self.record(z, P, objective, update.log_likelihood)
-        check = worst(checks) if samples is not None else self.check(prediction, others=checks)
+        check = self.check(prediction, others=checks) if samples is None else worst(checks)
         drawn = None if samples is None else read_only(samples)
         return self.finish(
             reason, detail, prediction, innovation, update, check=check, transformed_samples=drawn
@@ -227,9 +235,11 @@ class FilterRun:
         """End a run whose next iterate (z, P) has no prediction."""
         self.record(z, P, np.nan, np.nan)
         detail = f"at {self.transform.inverse(z)}: {prediction.reason}"
-        return self._estimate(Reason.MODEL_FAILED, detail, prediction=None, innovation=None)
+        return self._estimate(Reason.MODEL_FAILED, detail, None, innovation=None)
 
-    def _estimate(self, reason: Reason, detail: str, **more: Any) -> Estimate:
+    def _estimate(
+        self, reason: Reason, detail: str, prediction: Prediction | None, **more: Any
+    ) -> Estimate:
         iterates, covariances, objective, log_likelihood = (
             read_only(np.array(column)) for column in zip(*self._history, strict=True)
         )
@@ -241,6 +251,7 @@ class FilterRun:
             transformed_iterate_covariances=covariances,
             objective=objective,
             log_likelihood=log_likelihood,
+            prediction=prediction,
             reason=reason,
             detail=detail,
             forward_solves=self.forward_solves,
@@ -279,7 +290,7 @@ class Filter:
         R : NoiseCovariance
         names : sequence of str, (p,), optional
         transform : Transform, optional
-            Coordinates to work in; default `Identity`.
+            Filter coordinates; default `Identity`.
         on_iterate : callable, optional
             Called with each iterate.
 
@@ -296,5 +307,5 @@ class Filter:
 
 
 def by_filter(slope: FloatArray, L: FloatArray) -> FloatArray:
-    """dh/dz (n, p) from dh/dx where z = m + L x; 0 for what the prior holds fixed."""
+    """dh/dz (n, p) from dh/dx where z = m + L x; 0 for parameters that the prior holds fixed."""
     return np.asarray(np.linalg.lstsq(L.T, slope.T, rcond=None)[0].T, dtype=np.float64)

@@ -1,16 +1,16 @@
-"""Errors of an observation that are known by samples, and what they do to the intervals.
+"""Errors of an observation that are known by samples, and the intervals that follow.
 
 Errors of a model's geometry are correlated over the whole observation, and known by few samples d₁
 ... d_K of the error of the innovation y − h. The noise R + 1/K Σ d dᵀ includes them, but a filter
 that assumes it avoids just these K directions and is too certain: with twelve samples its 95 %
-intervals held the truth in 70 % (simulated). So this noise only weighs the observations. The
-covariance of the estimate is computed from the samples, each with a gain that has not seen it::
+intervals held the truth in 70 % (simulated). So this noise only weights the observations. The
+covariance of the estimate is computed from the samples, each with a gain computed without it::
 
     P⁺ = (I − K H) P (I − K H)ᵀ + c / K Σ (K₋ₖ dₖ)(K₋ₖ dₖ)ᵀ + (K C)(K C)ᵀ
 
-the form of Joseph, which holds for any gain (Bucy and Joseph, Filtering for Stochastic Processes
-with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but the k-th and those of the
-same source. Second derivatives S of a curved model are part of the Hessian of the objective, and so
+Joseph's form, which holds for any gain (Bucy and Joseph, Filtering for Stochastic Processes with
+Applications to Guidance, 1968), with K₋ₖ the gain without the k-th sample and those of the same
+source. Second derivatives S of a curved model are part of the Hessian of the objective, and so
 of the gain, by the implicit function theorem (Nocedal and Wright, Numerical Optimization, 2006,
 appendix A.2)::
 
@@ -34,7 +34,7 @@ from mvest.estimation.prediction import require_finite
 from mvest.typing import BoolArray, FloatArray, IntArray
 
 LEVEL = 0.95
-"""Of the intervals that are to be right."""
+"""Of the intervals that should be exact."""
 
 SEEN = 1e-5
 """Standard deviations of the base noise below which a direction of the samples is left out."""
@@ -48,7 +48,7 @@ class SampledPosterior:
     ----------
     covariance, from_samples : (p, p)
     moved : (p, K)
-        How each sample moves the estimate, with a gain that has not seen it; scaled so that
+        Shift of the estimate by each sample, with a gain computed without it; scaled so that
         ``moved @ moved.T`` is ``from_samples``.
     """
 
@@ -59,7 +59,7 @@ class SampledPosterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledErrors:
-    """Samples of the error of an innovation, beside the noise that the filter weighs with.
+    """Samples of the error of an innovation, in addition to other noise.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class SampledErrors:
         Samples with the same number are not independent; K₋ₖ leaves all of them out, and Student's
         distribution has one degree of freedom for each source. None: all are independent.
     beside : (n, q) or None
-        C: one standard deviation of each error that the samples do not contain but the base does.
+        C: one standard deviation of each error that is part of the base but not of the samples.
     """
 
     base: ObservationNoise
@@ -97,7 +97,7 @@ class SampledErrors:
 
     @property
     def columns(self) -> FloatArray:
-        """C ``(n, q)``: what the filter adds to its noise is C Cᵀ."""
+        """C ``(n, q)``: the filter adds C Cᵀ to its noise."""
         return self.samples / np.sqrt(self.samples.shape[1])
 
     @property
@@ -123,15 +123,15 @@ class SampledErrors:
         UH, count = U.T @ H, self.samples.shape[1]
 
         def gain(used: BoolArray) -> tuple[FloatArray, FloatArray]:
-            """Gain ``(p, n)`` by some samples, and the factor M on an error of the prior.
+            """Gain ``(p, n)`` from some samples, and the factor M on an error of the prior.
 
             For whitened observations with noise I + U B Uᵀ, U orthonormal, the gain is M P Hᵀ R⁻¹
             with M = (I + P (Hᵀ R⁻¹ H + S))⁻¹ and R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ.
             """
             B = parts[:, used] @ parts[:, used].T / max(int(used.sum()), 1)
-            weighed = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
-            M = np.asarray(np.linalg.inv(np.eye(len(P)) + P @ (weighed.T @ H + S)), np.float64)
-            return M @ P @ weighed.T, M
+            weighted = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
+            M = np.asarray(np.linalg.inv(np.eye(len(P)) + P @ (weighted.T @ H + S)), np.float64)
+            return M @ P @ weighted.T, M
 
         K, rest = gain(np.ones(count, dtype=np.bool_))
         moved = np.empty((len(P), count))
@@ -153,7 +153,7 @@ class SampledErrors:
         return SampledPosterior(covariance, part, moved)
 
     def _seen(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal directions ``(n, r)`` of the whitened samples, and their parts ``(r, K)``."""
+        """Orthonormal directions ``(n, r)`` of the whitened samples, and coordinates ``(r, K)``."""
         columns = self.base.whiten(self.columns)
         U, s, Vt = np.linalg.svd(columns, full_matrices=False)
         kept = s > SEEN

@@ -1,16 +1,16 @@
-"""Smooth errors over points in bands of their length of variation, and the prior of each band.
+"""Smooth errors of points in bands of their length of variation, and the prior of each band.
 
-U and w are eigenvectors and eigenvalues of a smooth correlation K over k points, in bands b of half
-a decade of w / k. Errors whose standard deviation is s_b in each band have the covariance ``Σ s_b²
+U and w are eigenvectors and eigenvalues of a smooth correlation K of k points, in bands b of half a
+decade of w / k. Errors whose standard deviation is s_b in each band have the covariance ``Σ s_b²
 U_b diag(w_b) U_bᵀ``, so that no kernel is assumed. A kernel of a few parameters, fitted to
-thousands of points, follows the finest detail, while the parameters of a model depend on the
-coarse: fitted to fields of an exponential or a Gaussian kernel, a Matérn kernel with a nugget gave
+thousands of points, follows the finest detail, but the parameters of a model depend on the coarse
+one. Fitted to fields of an exponential or a Gaussian kernel, a Matérn kernel with a nugget gave
 95 % intervals that held 84 and 75 %; bands gave 92 to 95 %.
 
-K enters by an approximation of low rank. Its columns for m points that are spread evenly (Gonzalez
-1985, Theoret. Comput. Sci. 38:293) give that of Nyström (Rasmussen and Williams, Gaussian Processes
-for Machine Learning, 2006, section 8.1); the rest is spread evenly over all directions across them.
-It costs k m² once, and k m for whitening a vector.
+K is approximated with low rank. Its columns for m evenly spread points (Gonzalez 1985, Theoret.
+Comput. Sci. 38:293) give Nyström's approximation (Rasmussen and Williams, Gaussian Processes for
+Machine Learning, 2006, section 8.1). The rest is spread evenly over all directions across them. It
+costs k m² once, and k m for whitening a vector.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.typing import FloatArray, IntArray
 
 MAX_RANK = 500
-"""Points by which a smooth part is represented."""
+"""Largest number of points that represent a smooth part."""
 
 MAX_BASIS_SIZE = 2_000_000
-"""Numbers in the basis of a smooth part: of 10 000 points it has rank 200."""
+"""Largest number of entries in the basis of a smooth part: 10 000 points have rank 200."""
 
 JITTER = 1e-9
-"""Added to the correlation of the chosen points, above its rounding errors."""
+"""Added to the correlation of the chosen points; exceeds its rounding errors."""
 
 NEGLIGIBLE = 1e-9
-"""Part of the largest eigenvalue below which an eigenvalue is left out."""
+"""Eigenvalues below this share of the largest are left out."""
 
 BANDS = 14
-"""Bands of a smooth part: half decades of w / k from 1 down; what is finer is in the last."""
+"""Bands of a smooth part: half decades of w / k from 1 down; the last one is open."""
 
 SPECTRUM_POINTS = 400
-"""Points on which the bands of a stated correlation are computed."""
+"""Points for which the bands of a stated correlation are computed."""
 
 
 def matern(distance: FloatArray, length: float) -> FloatArray:
     """Matérn correlation of smoothness 3/2, ``(1 + √3 d / l) exp(−√3 d / l)``.
 
-    Positive definite in space whatever the points (Rasmussen and Williams, eq. 4.17).
+    Positive definite in space for any points (Rasmussen and Williams, eq. 4.17).
     """
     d = distance * (np.sqrt(3.0) / length)
     return np.asarray((1.0 + d) * np.exp(-d))
@@ -82,7 +82,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basis:
-    """K of k points as U diag(w) Uᵀ + r (I − U Uᵀ), r such that the variance is right.
+    """K of k points as U diag(w) Uᵀ + r (I − U Uᵀ), with the exact total variance.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ def smooth_basis(points: FloatArray, length: float) -> Basis:
     kept = values > NEGLIGIBLE * values[-1]
     w = values[kept]
     U = L @ (vectors[:, kept] / np.sqrt(w))
-    # Once more: the columns of small eigenvalues are orthogonal to rounding over these only.
+    # Repeated: columns of small eigenvalues are orthogonal only to rounding over these.
     U = _solved(U.T @ U, U.T).T
     across = max(0.0, k - float(w.sum())) / max(1, k - len(w))
     return Basis(points, U, w, bands_of(w / k), across, length)
@@ -131,12 +131,12 @@ def _solved(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def bands_of(level: FloatArray) -> IntArray:
-    """Band of eigenvalues, each as a part of the number of points."""
+    """Band of eigenvalues over the number of points."""
     return np.clip(np.floor(-2.0 * np.log10(level)), 0, BANDS - 1).astype(np.int64)
 
 
 def spread_points(points: FloatArray, count: int) -> IntArray:
-    """Indices of points spread evenly, each the farthest from those before; all different."""
+    """Indices of evenly spread, different points, each the farthest from those before."""
     chosen = [int(np.argmin(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))]
     nearest = np.full(len(points), np.inf)
     while len(chosen) < count:
@@ -155,12 +155,12 @@ class Spectrum:
     Attributes
     ----------
     std, length : LogNormal
-        Those of a Matérn correlation.
+        Of a Matérn correlation.
     deviation : float
         Factor by which a band may deviate from it, one standard deviation; neighbouring bands are
         correlated.
     reference : float
-        Length of K over the stated one. Eigenvectors of a short one mix coarse detail.
+        Length of K over the stated one; eigenvectors of a short one mix coarse detail.
     """
 
     std: LogNormal
@@ -185,7 +185,7 @@ class Spectrum:
 
         def log_std(length: float) -> FloatArray:
             share = np.bincount(band, np.sum(U * (matern(distance, length) @ U), axis=0), BANDS)
-            # Beyond the resolution of these points, spectra of one smoothness are parallel.
+            # Beyond the resolution of these points, spectra of the same smoothness are parallel.
             return np.interp(np.arange(BANDS), known, 0.5 * np.log(share[known] / whole[known]))
 
         median, step = self.length.median, 0.1

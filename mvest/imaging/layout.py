@@ -22,19 +22,13 @@ from mvest.valve.anatomy.valve import BandGrid, band_grid
 class ValveLayout:
     """A band of two leaflets in columns and rows.
 
-    Attributes
-    ----------
-    columns : int
-        Vertices around the valve, a multiple of 4, at least 8: the lines between the leaflets and
-        the middles of both are columns.
-    rows : int
-        Vertices from annulus to free edge, at least 3.
+    Its columns include the lines between the leaflets and the middles of both.
     """
 
-    columns: int = 64
-    rows: int = 15
+    columns: int = 64  #: vertices around the valve, a multiple of 4, at least 8
+    rows: int = 15  #: vertices from annulus to free edge, at least 3
     region_names: ClassVar[tuple[str, str]] = ("anterior", "posterior")
-    """Of the leaflet over phi in (0, 180), and of the other one."""
+    """Names of the leaflet with phi in (0, 180), and of the other one."""
 
     def __post_init__(self) -> None:
         if self.columns < 8 or self.columns % 4 or self.rows < 3:
@@ -54,22 +48,22 @@ class ValveLayout:
 
     @property
     def phi(self) -> FloatArray:
-        """``(n,)`` degrees."""
+        """Angles ``(n,)``, degrees."""
         return self._grid.phi
 
     @property
     def s(self) -> FloatArray:
-        """``(n,)`` from 0 to 1."""
+        """Coordinate ``(n,)`` from annulus (0) to free edge (1)."""
         return self._grid.s
 
     @property
     def triangles(self) -> IntArray:
-        """``(m, 3)``, normals to the ventricle where phi runs as in the template."""
+        """Triangles ``(m, 3)``, with normals to the ventricle if phi runs as in the template."""
         return self._grid.triangles
 
     @property
     def region(self) -> IntArray:
-        """``(m,)`` leaflet of each triangle."""
+        """Leaflet ``(m,)`` of each triangle."""
         return self._grid.region
 
     @property
@@ -83,7 +77,7 @@ class ValveLayout:
         return np.arange(self.columns) + (self.rows - 1) * self.columns
 
     def column(self, phi: float) -> int:
-        """The column at an angle in degrees, for one that the layout has."""
+        """The column at an angle in degrees; InputError if there is none."""
         exact = phi / 360.0 * self.columns
         if abs(exact - round(exact)) > 1e-9:
             raise InputError(f"no column of {self.columns} lies at {phi:g} degrees")
@@ -94,7 +88,7 @@ class ValveLayout:
         return (row % self.rows) * self.columns + self.column(phi)
 
     def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Corners and weights ``(k, 3)`` of the triangles that hold points ``phi``, ``s (k,)``.
+        """Corners and weights ``(k, 3)`` of the triangles that contain points ``phi``, ``s (k,)``.
 
         phi (degrees) and s (0 to 1) are linear between the corners.
         """

@@ -1,9 +1,9 @@
-"""Valves over time: simulated ones, detected ones, and their named points.
+"""Valves over time, simulated or detected, and their named points.
 
-A moving valve is imaged by the TEE simulator, and detectors learn from it. All its positions are mm
-in the valve's own axes: the annulus about the plane z = 0, z towards the atrium, y to the anterior
-side, x to the line between the leaflets at phi = 0. The image step returns one valve in every
-frame, with its confidence.
+The TEE simulator images moving valves, and detectors learn from them. Their positions are mm in the
+valve's own axes: the annulus about the plane z = 0, z towards the atrium, y to the anterior side, x
+to the line between the leaflets at phi = 0. The image step returns one valve in every frame, with
+its confidence.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mvest.typing import FloatArray, IntArray
 
 
 def _check(valve: Any, what: str, shapes: dict[str, tuple[int, ...]]) -> None:
-    """Refuse arrays that do not belong together, and times that do not increase."""
+    """Refuse arrays of inconsistent shapes, and times that do not increase."""
     for name, shape in shapes.items():
         given = np.shape(getattr(valve, name))
         if given != shape:
@@ -31,35 +31,17 @@ def _check(valve: Any, what: str, shapes: dict[str, tuple[int, ...]]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingValve:
-    """One simulated valve in every frame.
+    """One simulated valve in every frame."""
 
-    Attributes
-    ----------
-    name : str
-        Identifies the valve (not a frame) when some are held out.
-    layout : ValveLayout
-    times : (T,) s
-        Increasing.
-    vertices : (T, n, 3)
-        Midsurface.
-    tips : (T, 2, 3)
-        Papillary tips, the first that at phi = 0.
-    thickness : (n,) mm
-    chord_phi, chord_s : (c,)
-        Insertions of the chordae, degrees and 0 to 1.
-    chord_tip : (c,)
-        Their tips.
-    """
-
-    name: str
+    name: str  #: of the valve (not a frame)
     layout: ValveLayout
-    times: FloatArray
-    vertices: FloatArray
-    tips: FloatArray
-    thickness: FloatArray
-    chord_phi: FloatArray
-    chord_s: FloatArray
-    chord_tip: IntArray
+    times: FloatArray  #: (T,) s, increasing
+    vertices: FloatArray  #: (T, n, 3) midsurface
+    tips: FloatArray  #: (T, 2, 3) papillary tips, first the one at phi = 0
+    thickness: FloatArray  #: (n,) mm
+    chord_phi: FloatArray  #: (c,) degrees, insertions of the chordae
+    chord_s: FloatArray  #: (c,) 0 to 1
+    chord_tip: IntArray  #: (c,) their tips
 
     def __post_init__(self) -> None:
         t, n, c = len(self.times), self.layout.size, len(self.chord_phi)
@@ -68,46 +50,26 @@ class MovingValve:
 
 
 MIN_CONFIDENCE = 0.7
-"""Least confidence of a frame that shows a valve.
+"""Smallest confidence of a frame that shows a valve.
 
 A volume is accepted if its best frame reaches it; frames of a case are chosen among those that do.
-Set on separate simulated volumes: chamber walls alone reached 0.64, and one of 25 correctly
+It was set on separate simulated volumes: chamber walls alone reached 0.64, and one of 25 correctly
 detected valves stayed below 0.8.
 """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ValveSequence:
-    """A valve in every frame of a sequence; all positions LPS in mm.
+    """A valve in every frame of a sequence; all positions LPS in mm."""
 
-    Attributes
-    ----------
-    layout : ValveLayout
-        Vertex i is the same point of the tissue in all frames.
-    times : (T,) s
-        Increasing.
-    vertices : (T, n, 3)
-        Midsurface of the leaflets.
-    tips : (T, 2, 3)
-        Papillary tips, the first that at phi = 0.
-    frame_confidence : (T,)
-        0 (no valve) to 1.
-    vertex_confidence : (T, n)
-        0 (not seen) to 1.
-    std_mm : (n,)
-        Standard deviation of each coordinate of each vertex; NaN if it was never measured.
-    correlation_length_mm : float
-        Over which errors of neighbouring vertices are correlated along the leaflets.
-    """
-
-    layout: ValveLayout
-    times: FloatArray
-    vertices: FloatArray
-    tips: FloatArray
-    frame_confidence: FloatArray
-    vertex_confidence: FloatArray
-    std_mm: FloatArray
-    correlation_length_mm: float
+    layout: ValveLayout  #: vertex i is the same material point in all frames
+    times: FloatArray  #: (T,) s, increasing
+    vertices: FloatArray  #: (T, n, 3) midsurface
+    tips: FloatArray  #: (T, 2, 3) papillary tips, first the one at phi = 0
+    frame_confidence: FloatArray  #: (T,) 0 (no valve) to 1
+    vertex_confidence: FloatArray  #: (T, n) 0 (not seen) to 1
+    std_mm: FloatArray  #: (n,) of each coordinate of each vertex; NaN if it was never measured
+    correlation_length_mm: float  #: of the errors along the leaflets
 
     def __post_init__(self) -> None:
         t, n = len(self.times), self.layout.size
@@ -117,7 +79,7 @@ class ValveSequence:
 
     @property
     def confidence(self) -> float:
-        """Of the volume: the median of its frames."""
+        """Confidence of the volume: the median of its frames."""
         return float(np.median(self.frame_confidence))
 
     @property
@@ -149,11 +111,11 @@ TIPS: Final = ("tip_0", "tip_180")
 ANNULUS_LABELS: Final = "AnnulusLabelsMarkup"
 """SlicerHeart's name for its list of labelled points."""
 LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *TIPS)
-"""Every name, in the order of `landmarks`: those on the leaflets, then the papillary tips."""
+"""All names: those on the leaflets, then the papillary tips."""
 
 
 def landmark_vertices(layout: ValveLayout) -> dict[str, int]:
-    """Vertex of every landmark on the leaflets (all but the tips), in fixed order.
+    """Vertex of every landmark on the leaflets (all but the tips), in the order of `LANDMARKS`.
 
     ``commissure_0`` and ``commissure_180`` are where the lines between the leaflets meet the
     annulus. InputError if the layout has no column at a multiple of 45 degrees.
@@ -162,30 +124,25 @@ def landmark_vertices(layout: ValveLayout) -> dict[str, int]:
 
 
 def landmarks(sequence: ValveSequence, frame: int) -> dict[str, FloatArray]:
-    """Positions ``(3,)`` LPS mm of the landmarks named in `LANDMARKS`, in that order.
-
-    InputError if there is no such frame, see also `landmark_vertices`.
-    """
+    """Positions ``(3,)`` LPS mm of `LANDMARKS`; InputError if there is no such frame."""
     if not 0 <= frame < len(sequence.times):
         raise InputError(f"landmarks: frame {frame}, expected 0 to {len(sequence.times) - 1}")
-    vertices = sequence.vertices[frame]
-    positions = {name: vertices[v].copy() for name, v in landmark_vertices(sequence.layout).items()}
-    for name, tip in zip(TIPS, sequence.tips[frame], strict=True):
-        positions[name] = tip.copy()
-    return positions
+    at = list(landmark_vertices(sequence.layout).values())
+    positions = np.concatenate([sequence.vertices[frame, at], sequence.tips[frame]])
+    return dict(zip(LANDMARKS, positions, strict=True))
 
 
 def slicerheart_labels(ring: FloatArray, end: int, down: FloatArray) -> dict[str, FloatArray]:
-    """Points ``(3,)`` of the annulus by the labels that SlicerHeart gives them.
+    """Points ``(3,)`` of the annulus by SlicerHeart's labels.
 
-    ALC and PMC are the commissures, A and P the middles of the annulus between them, AL and PM
-    where the plane through the middle across the line from P to A meets the annulus, MC is the
-    middle (``ValveQuantificationLib/MeasurementPresetMitralValve.py`` there). From the atrium the
-    antero-lateral commissure lies on the left of the anterior leaflet.
+    ALC and PMC are the commissures, A and P the middles of the annulus between them. The plane
+    through the centre across the line from P to A meets the annulus at AL and PM, and MC is the
+    centre (``ValveQuantificationLib/MeasurementPresetMitralValve.py`` there). Seen from the atrium,
+    the antero-lateral commissure is on the left of the anterior leaflet.
 
-    The annulus is ``ring (k, 3)`` mm, whose points 0 to ``end`` bound the anterior leaflet, and
-    ``down (3,)`` leads from the atrium to the ventricle. GeometryError if it is no loop round its
-    middle.
+    The annulus is ``ring (k, 3)`` mm, whose points 0 to ``end`` bound the anterior leaflet;
+    ``down (3,)`` points from the atrium to the ventricle. GeometryError if the ring is not a loop
+    around its centre.
     """
     middle = ring.mean(axis=0)
     anterior = _half_way(ring[: end + 1])

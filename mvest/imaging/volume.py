@@ -1,4 +1,4 @@
-"""A volume over time, whatever file it came from."""
+"""A volume over time."""
 
 from __future__ import annotations
 
@@ -22,34 +22,16 @@ class Modality(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VolumeSequence:
-    """Frames of one region. World coordinates are LPS: x to the left, y to the back, z up.
+    """Frames of one region. World coordinates are LPS: x to the left, y to the back, z up."""
 
-    Attributes
-    ----------
-    frames : (T, I, J, K) uint8, int16 or float32
-    spacing : (3,) mm
-        Between voxels along i, j and k.
-    direction : (3, 3)
-        Its columns are the unit vectors of i, j and k in world coordinates; orthonormal.
-    origin : (3,) mm
-        World position of the centre of voxel (0, 0, 0).
-    times : (T,) s
-        Increasing, from any zero.
-    modality : Modality
-    source : str
-        Name of the file, or what simulated it.
-    sha256 : str
-        Of the file; empty if there is none.
-    """
-
-    frames: NDArray[np.generic]
-    spacing: FloatArray
-    direction: FloatArray
-    origin: FloatArray
-    times: FloatArray
+    frames: NDArray[np.generic]  #: (T, I, J, K) uint8, int16 or float32
+    spacing: FloatArray  #: (3,) mm between voxels along i, j and k
+    direction: FloatArray  #: (3, 3), its columns are the unit vectors of i, j and k; orthonormal
+    origin: FloatArray  #: (3,) mm, world position of the centre of voxel (0, 0, 0)
+    times: FloatArray  #: (T,) s, increasing
     modality: Modality = Modality.ULTRASOUND
-    source: str = ""
-    sha256: str = ""
+    source: str = ""  #: name of the file, or of the simulation
+    sha256: str = ""  #: of the file; empty if there is none
 
     def __post_init__(self) -> None:
         if self.frames.ndim != 4:

@@ -1,1 +1,1 @@
-"""What is seen of a valve, what a model predicts of it, and the errors of both."""
+"""Observations of a valve, their errors, and what a model predicts of them."""

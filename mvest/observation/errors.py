@@ -1,8 +1,8 @@
-"""Errors of a synthetic observation: what stands between the valve and what is seen of it.
+"""Errors of a synthetic observation.
 
 Each error is a frozen value that changes observed positions. Errors are applied one after another,
-with one random generator; a vertex that is not seen has the position NaN from then on. What a
-filter assumes of them is configured apart from them.
+with one random generator; vertices that are not seen become NaN. A filter's assumptions about them
+are configured separately.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 
 NUGGET = 1e-10
-"""Part of the variance that is uncorrelated, so that the correlation can be factorised where
-vertices nearly coincide."""
+"""Uncorrelated share of the variance, so that the correlation of vertices that nearly coincide can
+be factorised."""
 
 
 ObservationError: TypeAlias = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
-"""One way in which what is seen differs from what is there, a function of positions ``(f, n, 3)``
-mm as seen with the errors so far, of the true ones, and of a random generator. It returns a new
-array. If more than one frame is observed, the model's geometry is taken from the first."""
+"""A function of positions ``(f, n, 3)`` mm with the errors so far, of the true positions, and of a
+random generator; it returns new positions. If several frames are observed, the model's geometry is
+that of the first."""
 
 
 def observe(
     true: FloatArray, errors: Sequence[ObservationError], rng: np.random.Generator
 ) -> FloatArray:
-    """Positions ``(f, n, 3)`` mm as seen with all errors; NaN where a vertex is not seen."""
+    """Positions ``(f, n, 3)`` mm with all errors; NaN for vertices that are not seen."""
     seen = np.array(true, dtype=np.float64)
     for error in errors:
         seen = error(seen, true, rng)
@@ -76,8 +76,8 @@ class SpatialCorrelation:
     length : float
         Correlation length l, mm.
     factor : (n, n)
-        Lower triangular L with L Lᵀ = C and rows of length one. Made once: 3248 vertices take a
-        second and 84 MB.
+        Lower triangular L with L Lᵀ = C and rows of length one; 3248 vertices take a second and
+        84 MB.
     """
 
     points: FloatArray
@@ -124,9 +124,9 @@ class SpatialCorrelation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrelatedNoise:
-    """Normal noise that is alike at neighbouring vertices, as errors of tracking are.
+    """Normal noise that is correlated between neighbouring vertices, as errors of tracking are.
 
-    Coordinates and frames are independent of each other.
+    Coordinates and frames are independent.
 
     Attributes
     ----------
@@ -155,10 +155,10 @@ class CorrelatedNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoaptationDropout:
-    """Where leaflets have come together the image does not tell them apart: nothing is seen.
+    """Vertices at which leaflets touch are not seen: an image does not separate them.
 
-    A vertex is hidden in a frame in which it is nearer than ``distance`` to another leaflet and was
-    not so at rest. So the commissures, where leaflets are joined, stay in sight.
+    A vertex is hidden in a frame in which it is nearer than ``distance`` to another leaflet, if it
+    was not so near at rest. So the commissures, where leaflets are joined, stay visible.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class CoaptationDropout:
         return np.where(hidden[:, :, None], np.nan, seen)
 
     def _near(self, vertices: FloatArray) -> BoolArray:
-        """Which vertices ``(n,)`` are nearer than the distance to a leaflet not their own."""
+        """Which vertices ``(n,)`` are nearer than the distance to another leaflet."""
         surface = self.surface
         near = np.zeros(len(vertices), dtype=np.bool_)
         own = surface.vertex_region
@@ -201,12 +201,11 @@ class CoaptationDropout:
 
 @dataclass(frozen=True, slots=True)
 class AnnulusOffset:
-    """The annulus is seen displaced against the leaflets in every frame but the reference frame.
+    """The observed annulus is displaced against the leaflets in the closed frame.
 
-    The model is bounded by the annulus as it was seen, so that in the model's coordinates the
-    leaflets (and the papillary tips with them, on which the data have no say) are seen displaced by
-    ``offset`` as one. The open frame, from which the model's geometry is taken, agrees with it by
-    construction.
+    The model is bounded by the observed annulus, so that in its coordinates the leaflets (and the
+    papillary tips, which are not observed) are displaced by ``offset``. The model's geometry comes
+    from the open frame, which agrees with it.
 
     Attributes
     ----------

@@ -1,9 +1,9 @@
-"""What is believed of the errors of an observation before they are learned with the parameters.
+"""Prior of the errors of an observation, which are learned with the parameters.
 
-What is stated of the errors of a case, a standard deviation and over which length they are alike,
-is the median of a belief and no more: how smooth and how rough they are, each over which distance,
-and how much larger in one frame than in another follows from the observation itself, together with
-the parameters (see `mvest.estimation.noise` and `mvest.estimation.evidence`).
+The standard deviation and the correlation length that a case states are medians of this prior. How
+smooth and how rough the errors are, over which distance, and how much larger in one frame than in
+another follows from the observation itself (see `mvest.estimation.noise` and
+`mvest.estimation.evidence`).
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ ROUGH, CURVES = "rough part", "curves"
 """Names of the standard deviations of the rough part and of the points of curves."""
 
 NEIGHBOURS = 12
-"""Points over which where they are seen is averaged."""
+"""Neighbouring points over which positions are averaged."""
 
 FAR = 100.0
-"""Lengths over which errors are alike that leaflets are moved apart, so that theirs are not."""
+"""Correlation lengths by which leaflets are moved apart, so that their errors are independent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorBeliefs:
-    """How well the errors are known that a case states; factors are one standard deviation.
+    """Uncertainty of the stated errors; factors are one standard deviation.
 
-    The defaults are weak: twice or half as large or as far alike as stated is nothing unusual.
+    The defaults are weak: twice or half the stated size or length is not unusual.
 
     Attributes
     ----------
     std_factor, length_factor : float
-        Of the standard deviation that is stated, and of the length over which errors are alike.
+        Of the stated standard deviation and correlation length.
     length_mm : float
-        Median of that length where errors are stated to be independent.
+        Median correlation length of errors that are stated to be independent.
     deviation : float
-        Of errors that vary over one distance from what the two say of them.
+        Of a single band from the spectrum of the two.
     other_share : float
-        Median of the part of which nothing is stated, as a share of the stated standard deviation:
-        the rough part where errors are alike, the smooth part where they are not.
+        Median of the part that is not stated, as a share of the stated standard deviation: the
+        rough part of correlated errors, the smooth part of independent ones.
     other_factor : float
         Of that part.
     frame_factor : float
-        Of each frame before the last, against what is stated of it.
+        Of each frame before the last, relative to its stated errors.
     resolution_mm : float
-        Standard deviation below which no single point is believed: finer are neither meshes nor
-        images, and errors without any roughness have no end of detail from which to learn.
+        Smallest standard deviation of a single point: neither meshes nor images are finer, and
+        errors without any roughness would teach from infinite detail.
     """
 
     std_factor: Factor = 2.0
@@ -73,7 +73,7 @@ class ErrorBeliefs:
         require_numbers(self, "errors", "resolution_mm", least=0)
 
     def parts(self, std: float, length: float) -> tuple[LogNormal, LogNormal, LogNormal]:
-        """Smooth part, its length, and rough part of errors that are stated; all in mm."""
+        """Smooth part, its length, and rough part of stated errors; all in mm."""
         stated = LogNormal(std, self.std_factor)
         other = LogNormal(self.other_share * std, self.other_factor)
         smooth, rough = (stated, other) if length > 0.0 else (other, stated)
@@ -86,17 +86,17 @@ def error_family(
     length: float,
     points: FloatArray | None = None,
 ) -> NoiseFamily:
-    """The noise of an observation as it is to be learned.
+    """The noise of an observation, to be learned.
 
     Parameters
     ----------
     observation : Observation or SurfaceObservation
-        Its standard deviations are what is stated, per vertex and frame; not its correlation.
+        States the standard deviations, per vertex and frame; its correlation is not used.
     beliefs : ErrorBeliefs
     length : float
-        mm, over which errors are stated to be alike; 0: independent.
+        mm, stated correlation length; 0: independent.
     points : (n, 3) mm, optional
-        Vertices at rest, of an observation whose vertices correspond.
+        Vertices at rest, for corresponding vertices.
     """
     if isinstance(observation, Observation):
         if points is None or points.shape != observation.positions.shape[1:]:
@@ -110,15 +110,13 @@ def error_family(
         ]
     else:
         stated, coordinates = observation.std_mm, 1
-        parts = [
-            (
-                seen.frame,
-                _averaged(seen.apart(FAR * (length or beliefs.length_mm))),
-                np.ones(len(seen.points)) if seen.scale is None else seen.scale,
-                observation.size_of(seen) - len(seen.points),
-            )
-            for seen in observation.seen
-        ]
+        parts = []
+        for seen in observation.seen:
+            at, q = seen.apart(FAR * (length or beliefs.length_mm)), len(seen.points)
+            # A point's own error is part of its position; means of neighbours hardly contain it.
+            near = cKDTree(at).query(at, min(NEIGHBOURS, q))[1]
+            scale = np.ones(q) if seen.scale is None else seen.scale
+            parts.append((seen.frame, at[near].reshape(q, -1, 3).mean(1), scale, seen.size - q))
     smooth, far, rough = beliefs.parts(stated, length)
     spectrum = Spectrum(smooth, far, beliefs.deviation)
     quantities: dict[str, LogNormal] = {}
@@ -139,13 +137,3 @@ def error_family(
             quantities[name] = LogNormal(1.0, beliefs.frame_factor)
         blocks += own
     return NoiseFamily(tuple(blocks), quantities, bands, beliefs.resolution_mm)
-
-
-def _averaged(points: FloatArray) -> FloatArray:
-    """Points, each the mean of those about it.
-
-    Where points are seen their own errors are in it, which along the normal are then a linear
-    function of where they are: nothing would be as smooth.
-    """
-    near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))[1]
-    return np.asarray(points[near].reshape(len(points), -1, 3).mean(axis=1))

@@ -1,23 +1,22 @@
 """Observing surfaces without point correspondence: points and curves.
 
 A frame is seen as points somewhere on the leaflets and as a curve along the free edge. They are
-compared with the predicted surface, which is drawn finer and smoothed: of facets, derivatives jump
+compared with the predicted surface, which is refined and smoothed: on facets, derivatives jump
 across creases; points on the same closed valve were up to 0.3 mm off, and no estimate converged.
 
 * A point is compared by its signed distance to its own leaflet (`smooth_distances`). Beyond the
-  border the surface goes on as it ends.
-* A point of the curve is compared by the two components of its offset across the curve as it was
-  seen (`smooth_offsets`). A distance in space has a kink at zero; these have none, and two is what
-  a point across a curve can tell. If its leaflet is known, it is compared with the edge of that
-  leaflet, since in a closed valve the edge of the other lies beside it.
+  border the surface is extrapolated.
+* A point of the curve is compared by the two components of its offset across the observed curve
+  (`smooth_offsets`). They have no kink at zero, as a distance in space has, and a point across a
+  curve carries no more information. If its leaflet is known, it is compared with the edge of that
+  leaflet, since in a closed valve the edge of the other is close by.
 
-Sliding along the surface or the curve changes neither, so only what is seen enters the estimate.
-The derivatives are exact.
+Sliding along the surface or the curve changes neither. The derivatives are exact.
 
-What to know:
+Limits:
 
-* Where two parts of a surface are equally near (inside a fold, between leaflets for points of
-  unknown leaflet), the distance has a kink; the derivative is that of one of them.
+* If two parts of a surface are equally near (in a fold, or between leaflets for points of unknown
+  leaflet), the distance has a kink; the derivative is that of one of them.
 * Errors that are rougher than stated, as independent ones are, show in a normalised innovation far
   above one per observation.
 * A point counts at any distance; remove outliers first.
@@ -35,53 +34,39 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mvest.errors import InputError, require_numbers
-from mvest.estimation.noise import (
-    NoiseCovariance,
-    observation_noise,
-    scaled_noise,
-    stacked_noise,
-)
-from mvest.estimation.prediction import (
-    ObservationModel,
-    Prediction,
-    read_only,
-    require_finite,
-)
+from mvest.estimation.noise import NoiseCovariance, observation_noise, scaled_noise, stacked_noise
+from mvest.estimation.prediction import ObservationModel, Prediction, read_only, require_finite
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import FRAMES, observed_frames, require_frames, scales
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import Valve, lumped_areas
-from mvest.valve.geometry.moving_distance import (
-    across_curve,
-    smooth_distances,
-    smooth_offsets,
-)
+from mvest.valve.geometry.moving_distance import across_curve, smooth_distances, smooth_offsets
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import directed_edges, refined
 
 UNKNOWN = -1
-"""Region of a point that may be of any leaflet."""
+"""Region of a point that may belong to any leaflet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedSurface:
-    """One frame as it was seen, without correspondence.
+    """One frame seen without correspondence.
 
     Attributes
     ----------
     frame : str
         Name of the frame that the model predicts.
     points : (q, 3) mm
-        Points seen on the leaflets.
+        Points on the leaflets.
     region : (q,)
-        Leaflet of each point, ``UNKNOWN`` (-1) where it is not known.
+        Leaflet of each point, or ``UNKNOWN`` (-1).
     free_edge : (j, 3) mm or None
         Closed curve along the free edge; the last point joins the first.
     scale : (q,) or None
-        Standard deviation of each point as a part of that of the observation; None: all alike.
+        Standard deviation of each point over that of the observation; None: all 1.
     free_edge_region : (j,) or None
         Leaflet of each point of the free edge, with whose edge alone it is compared; ``UNKNOWN``
-        where it is not to be compared. None: all are, with the whole edge.
+        for points that are not compared. None: all are compared with the whole edge.
 
     Raises
     ------
@@ -101,8 +86,16 @@ class ObservedSurface:
         checked = {"points": _points(f"points {where}", self.points)}
         q, j = len(checked["points"]), 0
         if self.free_edge is not None:
-            checked["free_edge"] = _curve(f"free edge {where}", self.free_edge)
-            j = len(self.free_edge)
+            checked["free_edge"] = curve = _points(f"free edge {where}", self.free_edge)
+            j = len(curve)
+            if j < 3:
+                raise InputError(f"free edge {where}: {j} points, expected three or more")
+            repeated = np.flatnonzero(np.all(np.roll(curve, -1, axis=0) == curve, axis=1))
+            if repeated.size:
+                raise InputError(
+                    f"free edge {where}: point {repeated[0]} is the same as the next one; expected "
+                    "different points, the first not repeated at the end"
+                )
         if self.scale is not None:
             checked["scale"] = scales(f"scale of the points {where}", self.scale, q)
         numbers = {"region": _regions(f"regions {where}", self.region, q)}
@@ -126,28 +119,45 @@ class ObservedSurface:
     def apart(self, distance: float) -> FloatArray:
         """The points ``(q, 3)`` with leaflets moved ``distance`` mm apart.
 
-        Errors of different leaflets are independent: so nothing is alike there.
+        Errors of different leaflets are independent, and so are errors of distant points.
         """
         extent = float(np.ptp(self.points, axis=0).max())
         return self.points + (self.region * (extent + distance))[:, None]
 
+    @property
+    def compared(self) -> BoolArray:
+        """Which points of the free edge ``(j,)`` are compared."""
+        if self.free_edge_region is not None:
+            return np.asarray(self.free_edge_region != UNKNOWN)
+        return np.ones(0 if self.free_edge is None else len(self.free_edge), dtype=np.bool_)
+
+    @property
+    def size(self) -> int:
+        """Number of observations: one for each point, two for each point of the free edge."""
+        return len(self.points) + 2 * int(self.compared.sum())
+
+    def by_region(self) -> Iterator[tuple[int, BoolArray]]:
+        """Each region with a mask of its points ``(q,)``."""
+        for region in np.unique(self.region):
+            yield int(region), self.region == region
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedSurface:
-    """A surface through the positions that a model predicts, drawn finer and smoothed.
+    """A refined and smoothed surface through the positions that a model predicts.
 
     Attributes
     ----------
     triangles : (m, 3)
-        Of the drawn vertices; their normals point to one side throughout.
+        Of the refined vertices; their normals point to one side throughout.
     region : (m,)
         Leaflet of each triangle.
     weights : (r, n) sparse
-        The drawn vertices, of those that are predicted.
+        The refined vertices in terms of the predicted ones.
     width : float
         mm, over which the surface is smoothed.
     free_edge : (e,) or None
-        Drawn vertices in loop order; None if the curve is not to be compared.
+        Refined vertices in loop order; None if the curve is not compared.
     """
 
     triangles: IntArray
@@ -166,7 +176,7 @@ class PredictedSurface:
         edge_length: float,
         width: float,
     ) -> PredictedSurface:
-        """The surface of vertices ``rest (n, 3)`` mm with edges of a length; both lengths in mm."""
+        """The surface of vertices ``rest (n, 3)`` mm, with edges of a length in mm."""
         loops = () if free_edge is None else (free_edge,)
         fine = refined(rest, triangles, edge_length, loops)
         edge = fine.loops[0] if loops else None
@@ -182,11 +192,11 @@ class PredictedSurface:
 
     @property
     def size(self) -> int:
-        """Vertices n that the model predicts in each frame."""
+        """Number n of vertices that the model predicts in each frame."""
         return int(self.weights.shape[1])
 
     def drawn(self, predicted: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
-        """The drawn vertices, or some of them, of values of the predicted ones ``(n, ...)``."""
+        """Values at the refined vertices, or some of them, from the predicted ones ``(n, ...)``."""
         flat = self.weights[some] @ predicted.reshape(len(predicted), -1)
         return np.asarray(flat).reshape(flat.shape[0], *predicted.shape[1:])
 
@@ -204,10 +214,10 @@ class PredictedSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservation:
-    """What was seen without correspondence, and how well.
+    """Frames seen without correspondence, with the assumed noise.
 
     The observation of each frame is the distances of its points, then two components of each point
-    of the free edge. What is predicted are these distances; observed is zero.
+    of the free edge. The model predicts these distances; zero is observed.
 
     Attributes
     ----------
@@ -215,10 +225,10 @@ class SurfaceObservation:
         One for each observed frame, the closed one last.
     surface : PredictedSurface
     std_mm : float
-        Standard deviation of the seen points along the normal, and of each component of the points
-        of the free edge.
+        Standard deviation of the points along the normal, and of each component of the points of
+        the free edge.
     correlation_length_mm : float
-        Over which the errors of the distances are alike, see ``SpatialCorrelation``, within a frame
+        Correlation length of the errors of the distances, see `SpatialCorrelation`, within a frame
         and a leaflet; 0: independent. Errors of the free edge are independent.
     predicted : tuple of str
         Frames that the model predicts, in the order in which it stacks them.
@@ -247,7 +257,16 @@ class SurfaceObservation:
         require_numbers(self, "observation", "std_mm")
         require_numbers(self, "observation", "correlation_length_mm", least=0)
         for seen in self.seen:
-            self._require_counterpart(seen)
+            missing = set(seen.region.tolist()) - {UNKNOWN, *self.surface.region.tolist()}
+            if missing:
+                raise InputError(
+                    f"frame {seen.frame}: points of region {min(missing)}, of which the model's "
+                    f"surface has no triangle"
+                )
+            if seen.free_edge is not None and self.surface.free_edge is None:
+                raise InputError(
+                    f"frame {seen.frame}: the free edge is seen, but the model's surface has none"
+                )
         object.__setattr__(self, "R", self._noise())
 
     @property
@@ -257,18 +276,18 @@ class SurfaceObservation:
 
     @property
     def y(self) -> FloatArray:
-        """Zeros: the seen points have no distance to the surface that was seen."""
+        """Zeros: distances of the seen points to the seen surface."""
         return np.zeros(sum(self.sizes))
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many numbers of ``y`` are of each frame."""
-        return tuple(self.size_of(seen) for seen in self.seen)
+        """Length of each frame's part of ``y``."""
+        return tuple(seen.size for seen in self.seen)
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
-        """The distances of what was seen to what a model predicts.
+        """The distances of the observation to what a model predicts.
 
-        What it hands on with a prediction are the observed frames with all vertices, (f, n, 3) mm.
+        ``aux`` of a prediction are the observed frames with all vertices, (f, n, 3) mm.
 
         Parameters
         ----------
@@ -291,7 +310,7 @@ class SurfaceObservation:
             parts = [
                 part
                 for seen, vertices, moved in zip(self.seen, whole, motion, strict=True)
-                for part in _of_frame(self, seen, vertices, moved)
+                for part in self._of_frame(seen, vertices, moved)
             ]
             y, jacobian = (np.concatenate(column) for column in zip(*parts, strict=True))
             return replace(prediction, y=y, jacobian=jacobian)
@@ -302,69 +321,45 @@ class SurfaceObservation:
         """Unsigned distances ``(q,)`` mm of the last frame's points to fitted ``(f, n, 3)``."""
         seen, distance = self.seen[-1], np.empty(len(self.seen[-1].points))
         vertices = self.surface.drawn(fitted[-1])
-        for region, members in _by_region(seen):
+        for region, members in seen.by_region():
             triangles = self.surface.leaflet(region)
             distance[members] = surface_distance(seen.points[members], vertices, triangles)
         return distance
 
-    def _require_counterpart(self, seen: ObservedSurface) -> None:
-        missing = set(seen.region.tolist()) - {UNKNOWN, *self.surface.region.tolist()}
-        if missing:
-            raise InputError(
-                f"frame {seen.frame}: points of region {min(missing)}, of which the model's "
-                f"surface has no triangle"
-            )
-        if seen.free_edge is not None and self.surface.free_edge is None:
-            raise InputError(
-                f"frame {seen.frame}: the free edge is seen, but the model's surface has none"
-            )
-
-    def size_of(self, seen: ObservedSurface) -> int:
-        """How many numbers are observed in one of the frames."""
-        return len(seen.points) + 2 * int(_compared(seen).sum())
+    def _of_frame(
+        self, seen: ObservedSurface, vertices: FloatArray, motion: FloatArray
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Distances in a frame to the predicted surface, and their derivatives."""
+        surface, kept = self.surface, seen.compared
+        drawn = surface.drawn(vertices)
+        h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
+        for region, own in seen.by_region():
+            points, triangles = seen.points[own], surface.leaflet(region)
+            h[own], slopes = smooth_distances(points, drawn, triangles, surface.width)
+            H[own] = sum(slope @ surface.weights @ motion[:, k] for k, slope in enumerate(slopes))
+        yield h, H
+        if seen.free_edge is None or surface.free_edge is None or not kept.any():
+            return
+        curve, loop = seen.free_edge, surface.free_edge
+        across = across_curve(curve, self.std_mm)[kept]
+        same = None
+        if seen.free_edge_region is not None:
+            same = seen.free_edge_region[kept, None] == surface.leaflet_along(loop)
+        moved = surface.drawn(motion, loop)
+        yield smooth_offsets(curve[kept], across, drawn[loop], moved, surface.width, same)
 
     def _noise(self) -> NoiseCovariance:
-        parts = []
+        parts, length = [], self.correlation_length_mm
         for seen in self.seen:
-            q = len(seen.points)
-            if q and self.correlation_length_mm:
-                length = self.correlation_length_mm
-                apart = seen.apart(1000.0 * length)
-                noise = SpatialCorrelation(apart, length).noise(self.std_mm**2, 1)
-            elif q:
+            if q := len(seen.points):
                 noise = observation_noise(self.std_mm**2, q)
-            if q:
+                if length:
+                    apart = seen.apart(1000.0 * length)
+                    noise = SpatialCorrelation(apart, length).noise(self.std_mm**2, 1)
                 parts.append(noise if seen.scale is None else scaled_noise(noise, seen.scale))
-            if rest := self.size_of(seen) - q:
+            if rest := seen.size - q:
                 parts.append(observation_noise(self.std_mm**2, rest))
         return stacked_noise(parts)
-
-
-def _of_frame(
-    observation: SurfaceObservation,
-    seen: ObservedSurface,
-    vertices: FloatArray,
-    motion: FloatArray,
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Distances of what was seen in a frame to a predicted surface, and their derivatives."""
-    surface = observation.surface
-    drawn = surface.drawn(vertices)
-    h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
-    for region, members in _by_region(seen):
-        points, triangles = seen.points[members], surface.leaflet(region)
-        h[members], slopes = smooth_distances(points, drawn, triangles, surface.width)
-        H[members] = sum(slope @ surface.weights @ motion[:, k] for k, slope in enumerate(slopes))
-    yield h, H
-    kept = _compared(seen)
-    if seen.free_edge is None or surface.free_edge is None or not kept.any():
-        return
-    curve, loop = seen.free_edge, surface.free_edge
-    across = across_curve(curve, observation.std_mm)[kept]
-    there, moved = drawn[loop], surface.drawn(motion, loop)
-    own = None
-    if seen.free_edge_region is not None:
-        own = seen.free_edge_region[kept, None] == surface.leaflet_along(loop)
-    yield smooth_offsets(curve[kept], across, there, moved, surface.width, own)
 
 
 def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:
@@ -375,33 +370,17 @@ def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArr
 def mean_surface_distance(
     a: FloatArray, triangles_a: IntArray, b: FloatArray, triangles_b: IntArray
 ) -> float:
-    """Mean distance (mm) of two surfaces: from each to the other, and the mean of both.
+    """Mean distance (mm) between two surfaces, averaged over both directions.
 
-    Vertices ``(n, 3)`` mm count by the area that belongs to them, so that it does not matter where
-    a surface is finely triangulated.
+    Vertices ``(n, 3)`` mm are weighted by their area, so that the density of the triangulation
+    does not matter.
     """
     ways = ((a, triangles_a, b, triangles_b), (b, triangles_b, a, triangles_a))
-    return float(
-        np.mean(
-            [
-                np.average(surface_distance(x, y, other), weights=lumped_areas(x, own))
-                for x, own, y, other in ways
-            ]
-        )
-    )
-
-
-def _by_region(seen: ObservedSurface) -> Iterator[tuple[int, BoolArray]]:
-    """Each region that is seen, and which points ``(q,)`` are of it."""
-    for region in np.unique(seen.region):
-        yield int(region), seen.region == region
-
-
-def _compared(seen: ObservedSurface) -> BoolArray:
-    """Which points of the free edge ``(j,)`` are compared."""
-    if seen.free_edge_region is not None:
-        return np.asarray(seen.free_edge_region != UNKNOWN)
-    return np.ones(0 if seen.free_edge is None else len(seen.free_edge), dtype=np.bool_)
+    means = [
+        np.average(surface_distance(x, y, other), weights=lumped_areas(x, own))
+        for x, own, y, other in ways
+    ]
+    return float(np.mean(means))
 
 
 def _points(what: str, values: FloatArray) -> FloatArray:
@@ -410,19 +389,6 @@ def _points(what: str, values: FloatArray) -> FloatArray:
         raise InputError(f"{what}: shape {points.shape}, expected (q, 3) mm")
     require_finite(points, what)
     return read_only(points)
-
-
-def _curve(what: str, values: FloatArray) -> FloatArray:
-    curve = _points(what, values)
-    if len(curve) < 3:
-        raise InputError(f"{what}: {len(curve)} points, expected three or more")
-    repeated = np.flatnonzero(np.all(np.roll(curve, -1, axis=0) == curve, axis=1))
-    if repeated.size:
-        raise InputError(
-            f"{what}: point {repeated[0]} is the same as the next one; expected different points, "
-            f"the first not repeated at the end"
-        )
-    return curve
 
 
 def _regions(what: str, values: IntArray, size: int) -> IntArray:

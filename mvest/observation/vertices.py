@@ -1,4 +1,4 @@
-"""What is seen of a valve: an observation, and the same of what a model predicts."""
+"""Observations of corresponding vertices, and what a model predicts of them."""
 
 from __future__ import annotations
 
@@ -30,23 +30,22 @@ FRAMES = ("open", "closed")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What was seen, and how well.
+    """Observed positions of vertices, with the assumed noise.
 
     Attributes
     ----------
     frames : tuple of str, (f,)
         Observed frames, the closed one last.
     positions : (f, n, 3) mm
-        Positions of the vertices in each frame; NaN where a vertex is not seen, so that nobody can
-        read what was not observed.
+        Positions of the vertices in each frame; NaN for vertices that are not seen.
     variance : (f,) mm²
-        Variance of each coordinate in each frame that the filter is to assume.
+        Assumed variance of each coordinate in each frame.
+    correlation : SpatialCorrelation or None
+        Assumed correlation between vertices; None for independent errors.
     scale : (n,) or None
-        Standard deviation of each vertex as a part of that of its frame; None: all alike.
+        Standard deviation of each vertex over that of its frame; None: all 1.
     predicted : tuple of str
         Frames that the model predicts, in the order in which it stacks them.
-    correlation : SpatialCorrelation or None
-        Correlation between vertices that the filter is to assume; None for independent errors.
     """
 
     frames: tuple[str, ...]
@@ -58,33 +57,30 @@ class Observation:
 
     def __post_init__(self) -> None:
         require_frames(self.frames, self.predicted)
-        positions = np.array(self.positions, dtype=np.float64)
-        if positions.ndim != 3 or positions.shape[0] != len(self.frames) or positions.shape[2] != 3:
+        f, positions = len(self.frames), np.array(self.positions, dtype=np.float64)
+        if positions.ndim != 3 or positions.shape[::2] != (f, 3):
             raise InputError(
-                f"observed positions have shape {positions.shape}, expected "
-                f"({len(self.frames)}, n, 3): one row for each of {', '.join(self.frames)}"
+                f"observed positions have shape {positions.shape}, expected ({f}, n, 3): one row "
+                f"for each of {', '.join(self.frames)}"
             )
         unseen: BoolArray = np.all(np.isnan(positions), axis=2)
         require_finite(np.where(unseen[..., None], 0.0, positions), "the observed positions")
         if np.all(unseen):
             raise InputError("no observed position is finite: no vertex is seen")
         variance = np.array(self.variance, dtype=np.float64)
-        if variance.shape not in ((), (len(self.frames),)):
+        if variance.shape not in ((), (f,)):
             raise InputError(
-                f"R has shape {variance.shape}; expected one variance, or one for each of the "
-                f"{len(self.frames)} observed frames"
+                f"R has shape {variance.shape}; expected one variance, or one for each of the {f} "
+                "observed frames"
             )
-        variance = np.broadcast_to(variance, len(self.frames)).copy()
         require_positive(variance, "R")
-        correlation = self.correlation
-        if correlation is not None and len(correlation.points) != positions.shape[1]:
+        if self.correlation is not None and len(self.correlation.points) != positions.shape[1]:
             raise InputError(
-                f"R is correlated between {len(correlation.points)} vertices, but "
+                f"R is correlated between {len(self.correlation.points)} vertices, but "
                 f"{positions.shape[1]} are observed"
             )
-        for name, values in (("positions", positions), ("variance", variance)):
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
+        object.__setattr__(self, "positions", read_only(positions))
+        object.__setattr__(self, "variance", np.broadcast_to(variance, f))
         if self.scale is not None:
             scale = scales("scale of R", self.scale, positions.shape[1])
             object.__setattr__(self, "scale", scale)
@@ -96,50 +92,43 @@ class Observation:
 
     @property
     def y(self) -> FloatArray:
-        """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
+        """Stacked coordinates ``(3 k,)`` mm of the k seen vertices, frame by frame."""
         return self.positions[self.seen].ravel()
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many numbers of ``y`` are of each frame."""
+        """Length of each frame's part of ``y``."""
         return tuple((3 * self.seen.sum(axis=1)).tolist())
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
-        """What a model predicts of this observation; see :func:`observed_frames`."""
+        """The model's prediction of this observation; see :func:`observed_frames`."""
         return observed_frames(model, self.frames, self.seen, self.predicted)
 
     def distance(self, fitted: FloatArray) -> FloatArray:
         """Distance ``(n,)`` mm of each vertex of the last frame from fitted ``(f, n, 3)``.
 
-        NaN where a vertex is not seen.
+        NaN for vertices that are not seen.
         """
         return np.asarray(np.linalg.norm(fitted[-1] - self.positions[-1], axis=1))
 
     @property
     def R(self) -> NoiseCovariance:
         """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
-        correlation = self.correlation
-        if correlation is None:
-            variance = np.repeat(self.variance, self.sizes)
-            if self.scale is None:
-                return variance
-            return np.asarray(
-                variance
-                * np.concatenate([np.repeat(self.scale[seen], 3) for seen in self.seen]) ** 2
-            )
+        scale = np.ones(self.positions.shape[1]) if self.scale is None else self.scale
+        if self.correlation is None:
+            stds = np.concatenate([np.repeat(scale[seen], 3) for seen in self.seen])
+            return np.asarray(np.repeat(self.variance, self.sizes) * stds**2)
         blocks = []
         for seen, variance in zip(self.seen, self.variance, strict=True):
-            if not seen.any():
-                continue
-            noise = correlation.of(seen).noise(float(variance), 3)
-            if self.scale is not None:
-                noise = scaled_noise(noise, np.repeat(self.scale[seen], 3))
-            blocks.append(noise)
+            if seen.any():
+                noise = self.correlation.of(seen).noise(float(variance), 3)
+                own = np.repeat(scale[seen], 3)
+                blocks.append(noise if self.scale is None else scaled_noise(noise, own))
         return stacked_noise(blocks)
 
 
 def scales(what: str, values: FloatArray, size: int) -> FloatArray:
-    """A read-only copy of positive factors on standard deviations; InputError if they are none."""
+    """A read-only copy of ``size`` positive factors on standard deviations, or InputError."""
     scale = np.array(values, dtype=np.float64)
     if scale.shape != (size,):
         raise InputError(f"{what} has shape {scale.shape}, expected ({size},)")
@@ -148,7 +137,7 @@ def scales(what: str, values: FloatArray, size: int) -> FloatArray:
 
 
 def require_frames(frames: Sequence[str], predicted: Sequence[str] = FRAMES) -> None:
-    """Raise InputError unless ``frames`` are different frames of those that a model predicts."""
+    """Raise InputError unless ``frames`` are different frames out of those ``predicted``."""
     if not frames or not set(frames) <= set(predicted) or len(set(frames)) != len(frames):
         raise InputError(f"observed frames {list(frames)}, expected some of {list(predicted)}")
 
@@ -161,7 +150,7 @@ def observed_frames(
 ) -> Callable[[FloatArray], Prediction]:
     """The observed frames of a model that predicts all of ``predicted``, stacked.
 
-    What it hands on with a prediction are these frames with all vertices, ``(f, n, 3)`` mm.
+    ``aux`` of a prediction are these frames with all vertices, ``(f, n, 3)`` mm.
 
     Parameters
     ----------

@@ -144,6 +144,6 @@ def _alike(observation: Observed, standardised: FloatArray) -> float | None:
     neighbours = csr_array(one_way.maximum(one_way.T))
     # What is smaller than believed contradicts nothing, whatever its pattern.
     statistics = [
-        moran(column, neighbours).statistic * min(1.0, float(np.var(column))) for column in values.T
+        moran(column, neighbours) * min(1.0, float(np.var(column))) for column in values.T
     ]
     return float(max(statistics, key=abs))

@@ -83,7 +83,7 @@ def build_model(
     case : ValveCase
     settings : PersonaliseSettings
     store : Path, optional
-        Where an unstructured mesh and closed states are kept.
+        Folder in which an unstructured mesh is cached.
 
     Raises
     ------
@@ -96,9 +96,9 @@ def build_model(
     coarse = build_coarse(case, settings, store)
     shape = GivenValve(case.valve)
     if shape.band is None:
-        return replace(coarse, anchors=store)
+        return coarse
     solid = _solid(shape, settings.mesh, store)
-    return replace(coarse, mesh=solid, guide=coarse, anchors=store)
+    return replace(coarse, mesh=solid, guide=coarse)
 
 
 def build_coarse(

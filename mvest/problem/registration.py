@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvest.closure.anchors import ClosedState
+from mvest.closure.continuation import ClosedState
 from mvest.closure.frames import ERROR, OFFSET, FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError

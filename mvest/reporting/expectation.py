@@ -1,7 +1,7 @@
-"""What data will tell of parameters, found out before any are taken.
+"""Intervals to expect from an estimation before any data are taken.
 
-The Fisher information needs a model, where it is believed to be, and what is to be observed how
-well; it needs no observed value. So one run of the model says which intervals to expect.
+The Fisher information needs a model, a parameter set and the errors of the observations, but no
+observed value. One run of the model therefore says which intervals to expect.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from mvest.estimation.transform import to_filter
 from mvest.estimation.update import kalman_update
 from mvest.problem.estimate import Observed, Problem, expected_intervals
 from mvest.problem.registration import label_of, unit_of
-from mvest.reporting.markup import listed
 from mvest.reporting.tables import Column, Table, table
 
 
 def expectation_text(title: str, problem: Problem, observation: Observed, noise: str) -> str:
-    """The intervals to expect of an estimation that is not run, as text for a terminal.
+    """The expected 95 % intervals of an estimation, which is not run, as text for a terminal.
 
     Parameters
     ----------
@@ -31,10 +30,10 @@ def expectation_text(title: str, problem: Problem, observation: Observed, noise:
     problem : Problem
         The model is run once, at the mean of the prior.
     observation : Observed
-        Which points are seen, and how well; the values that were seen play no part where points
+        Which points are observed, and their errors. Observed values are not used where points
         correspond.
     noise : str
-        How well coordinates are seen.
+        The errors of the coordinates in words.
     """
     prior, assumed, R = problem.prior, problem.start, observation.R
     seen = predict(observation.of(problem.model), assumed, derivatives=True)
@@ -49,18 +48,18 @@ def expectation_text(title: str, problem: Problem, observation: Observed, noise:
     rows = expected_intervals(problem.parameters, transform, assumed, before.std, after.std)
     own = [row | {"alone": std} for row, std in zip(rows, data.std, strict=True)]
     lines = [
-        f"{title}: what the data will tell, intervals of 95 % to first order",
+        f"{title}: expected intervals of 95 %, to first order",
         f"Observed: {n} numbers of {', '.join(observation.frames)}; {noise}",
-        expected_table(own, alone=":.2g:± by the data alone").text(),
-        *map(alike_words, data.confounded()),
-        *(f"Known badly from the data alone: {words}" for words in data.flat()),
+        expected_table(own, alone=":.2g:± from the data alone").text(),
+        *map(trade_off_text, data.confounded()),
+        *(f"Poorly determined by the data alone: {words}" for words in data.flat()),
         "No estimation was run.",
     ]
     return "\n".join(lines)
 
 
 def expected_table(rows: Iterable[Mapping[str, Any]], **more: Column | str) -> Table:
-    """The table of `mvest.problem.estimate.expected_intervals`, and more columns."""
+    """The table of `mvest.problem.estimate.expected_intervals`, with further columns."""
     return table(
         ({**row, "name": label_of(row["name"])} for row in rows),
         name="::unknown",
@@ -74,21 +73,21 @@ def expected_table(rows: Iterable[Mapping[str, Any]], **more: Column | str) -> T
 
 
 def unknown_text(title: str, reason: str) -> str:
-    """The answer where the model has no prediction at the assumed parameters."""
+    """The text where the model has no prediction at the assumed parameters."""
     return (
-        f"{title}: what the data will tell is not known, the model has no prediction at the "
+        f"{title}: the intervals to expect are not known, since the model has no prediction at the "
         f"assumed parameters ({reason})"
     )
 
 
-def alike_words(group: TradeOff, labels: Mapping[str, str] | None = None) -> str:
-    """``The data hardly tell apart A and B: +10 % of A with −5 % of B looks almost the same``.
+def trade_off_text(group: TradeOff, labels: Mapping[str, str] | None = None) -> str:
+    """One sentence about parameters that the data hardly distinguish.
 
     Parameters
     ----------
     group : TradeOff
     labels : mapping, optional
-        What parameters are called.
+        Labels of the parameters.
     """
     labelled = [(labels or {}).get(name, name) for name in group.parameters]
     moved = []
@@ -99,7 +98,7 @@ def alike_words(group: TradeOff, labels: Mapping[str, str] | None = None) -> str
         own = f"{change:+.2g} {unit}" if unit in ("mm", "degrees") else f"{100 * relative:+.2g} %"
         moved.append(f"{own.replace('-', '−')} of {label}")
     return (
-        f"The data hardly tell apart {listed(labelled)} (correlations of at least "
+        f"The data hardly distinguish {' and '.join(labelled)} (correlation at least "
         f"{np.floor(1000 * group.correlation) / 1000:.3g}): {moved[0]} with "
-        f"{listed(moved[1:])} looks almost the same."
+        f"{' and '.join(moved[1:])} looks almost the same."
     )

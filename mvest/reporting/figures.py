@@ -1,9 +1,9 @@
-"""What all figures have in common: colours, sizes, axes, directions, and how they are written.
+"""Shared parts of all figures: colours, sizes, axes, viewing directions, and output files.
 
-Sizes are meant for a page about 800 pixels wide, where a figure of 8.3 inches shows 9-point text at
-about 12 pixels. Colours are those of Okabe and Ito, which people with colour-blindness can tell
-apart, and every line is also distinguished by its marker; colour maps run evenly in lightness.
-Nothing touches matplotlib's global state or needs a display.
+Sizes are meant for a page about 800 pixels wide, on which a figure of 8.3 inches shows 9-point text
+at about 12 pixels. The colours suit people with colour blindness, every line also has its own
+marker, and colour maps are perceptually uniform. Nothing here touches matplotlib's global state or
+needs a display.
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GOOD, BAD, GREY = COLOURS[0], COLOURS[1], "0.45"
 
 LEAFLET_COLOURS = np.array([[0.45, 0.70, 0.83], [0.91, 0.65, 0.45], [0.45, 0.79, 0.70]])
-"""Of leaflets in the order of their regions, ``(3, 3)``: tints of the first of `COLOURS`, in which
-curves show their moduli, light enough to be shaded."""
+"""Of the leaflets by region, ``(3, 3)``: tints of the first `COLOURS`, which can be shaded."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 SEQUENTIAL, DISTANCE_MAP = "cividis", "viridis"
@@ -50,16 +49,13 @@ SCALE_MM = 10.0
 TEXT, SMALL = 10, 8.5
 """Points, of titles and of everything else."""
 CHARACTERS_AN_INCH = 23
-"""Of the line at the foot."""
+"""Of the provenance line at the foot."""
 
-LONGEST_TEXT, LONGEST_LINE = 160, 400
-"""Characters of a line of a text in a figure, and of the line at its foot."""
-MAX_LINES = 6
-"""Of a text in a figure."""
-KEPT = 20
-"""Characters of a longer one that are shown, so that something is left of the figure."""
+LONGEST_LINE, LONGEST_TEXT, MAX_LINES, CUT_TO = 400, 160, 6, 20
+"""Most characters of the provenance line, and of a line of other texts; most lines of a text; and
+characters that are shown of a text beyond these limits, which would leave no room for the plot."""
 TICK = re.compile(r"\$\\mathdefault\{[−-]?[\d.]*(?:\\times)?[\d.]*(?:\^\{[−-]?[\d.]+\})?\}\$")
-"""What matplotlib writes at a logarithmic axis."""
+"""Tick labels of logarithmic axes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +68,7 @@ class View:
 
     @property
     def axes(self) -> FloatArray:
-        """``(3, 3)`` columns: to the right, up, and towards the eye."""
+        """``(3, 3)``, columns: to the right, up, and towards the eye."""
         e, a = np.deg2rad(self.elevation), np.deg2rad(self.azimuth)
         eye = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         right = np.array([-np.sin(a), np.cos(a), 0.0])
@@ -108,26 +104,26 @@ def plain_axes(axes: Any) -> None:
 
 def scale_bar(axes: Any, colour: str) -> None:
     """Draw a bar of `SCALE_MM` into the lower left corner of axes in millimetres."""
-    style = {"loc": "lower left", "color": colour, "frameon": False, "size_vertical": 0.25}
-    font = FontProperties(size=SMALL - 0.5)
     bar = AnchoredSizeBar(
-        axes.transData, SCALE_MM, f"{SCALE_MM:.0f} mm", label_top=True, fontproperties=font, **style
-    )
+        axes.transData, SCALE_MM, f"{SCALE_MM:.0f} mm", loc="lower left", color=colour,
+        frameon=False, size_vertical=0.25, label_top=True,
+        fontproperties=FontProperties(size=SMALL - 0.5),
+    )  # fmt: skip
     axes.add_artist(bar)
 
 
 def headline(figure: Figure, text: str, note: str) -> None:
-    """What the figure shows, left above everything, and below it how to read it."""
+    """Write a title above everything on the left, and below it a note on how to read the figure."""
     size = TEXT + 0.5
+    # Empty lines in the title reserve the space of the note.
     room = "\n" * (note.count("\n") + 1)
     figure.suptitle(text + room, fontsize=size, x=0.01, ha="left", fontweight="bold")
-    # The empty lines of the title keep this place free.
     below = 1.0 - (4.0 + 1.45 * size) / 72.0 / figure.get_figheight()
     figure.text(0.01, below, note, fontsize=SMALL, color="0.25", va="top")
 
 
 def plain_number(value: float) -> str:
-    """A number for an axis or a cell: two digits, powers of ten only where they are shorter."""
+    """A number for an axis or a cell: two digits, powers of ten only if they are shorter."""
     if value == 0:
         return "0"
     if abs(value) < 1e-3 or abs(value) >= 1e5:
@@ -142,15 +138,14 @@ def log_axis(axis: Any) -> None:
 
 
 def levels(n: int) -> Any:
-    """N colours in order from dark to light, light enough to part and dark enough to see."""
+    """N ordered colours from dark to light, all visible on white."""
     return colormaps["viridis"](np.linspace(0.0, 0.85, n))
 
 
 def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
-    """Each parameter against the iteration, a panel each; None if no estimate has iterates.
+    """Each parameter over the iterations, in a panel each; None if no estimate has iterates.
 
-    A band shows two standard deviations, which of several estimates are left out. The dashed line
-    is the truth.
+    A single estimate has a band of two standard deviations. The dashed line is the truth.
     """
     drawn = [one for one in estimates if one.iterates]
     if not drawn:
@@ -172,14 +167,13 @@ def iterates_figure(estimates: Sequence[EstimateRecord]) -> Figure | None:
         unit = f" ({unknown.unit})" if unknown.unit else ""
         axes.set(xlabel="iteration", ylabel=unknown.name + unit)
         axes.xaxis.get_major_locator().set_params(integer=True)
-    lines, names = grid[0].get_legend_handles_labels()
-    where: Any = "outside upper center"
-    figure.legend(lines, names, loc=where, ncols=2, frameon=False, fontsize=SMALL)
+    keys, where = grid[0].get_legend_handles_labels(), "outside upper center"
+    figure.legend(*keys, loc=where, ncols=3, frameon=False, fontsize=SMALL)
     return figure
 
 
 def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False) -> list[Path]:
-    """Write ``base.png``, and ``base.pdf`` for print, with one line in it and in its metadata.
+    """Write ``base.png``, and ``base.pdf`` for print, with a provenance line in foot and metadata.
 
     Raises
     ------
@@ -193,16 +187,14 @@ def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False
     layout = figure.get_layout_engine()
     png = Path(f"{base}.png")
     written = [write_atomically(png, lambda file: _save_png(figure, file, line))]
-    # What is laid out need not be once more, which takes as long as drawing it.
+    # The layout is computed once, since it takes as long as drawing.
     figure.set_layout_engine(None)
     if pdf:
-        # Without a date, so that the same result gives the same file.
+        # Without a date, so that equal results give equal files.
         about = {"Subject": line, "CreationDate": None}
+        path = Path(f"{base}.pdf")
         written.append(
-            write_atomically(
-                Path(f"{base}.pdf"),
-                lambda file: figure.savefig(file, dpi=DPI, metadata=about),
-            )
+            write_atomically(path, lambda file: figure.savefig(file, dpi=DPI, metadata=about))
         )
     note.remove()
     figure.set_layout_engine(layout)
@@ -210,34 +202,34 @@ def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False
 
 
 def _save_png(figure: Figure, path: Path, line: str) -> None:
-    """Write a palette of 256 colours: a third of the bytes, the same to the eye."""
+    """Write with a palette of 256 colours, which takes a third of the bytes and looks the same."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI, pil_kwargs={"compress_level": 0})
     about = PngInfo()
     about.add_text("Description", line)
     with Image.open(drawn) as image:
-        # Without the means, a palette of few pure colours loses the red ones.
+        # Without k-means, rare pure colours such as red are lost.
         light = image.convert("RGB").quantize(256, kmeans=2, dither=Image.Dither.NONE)
         light.save(path, "PNG", pnginfo=about, optimize=True, dpi=(DPI, DPI))
 
 
 def _show_texts(figure: Figure) -> None:
-    """Have texts of a record printed as they stand, whatever matplotlib would read in them."""
+    """Make all texts literal, so that matplotlib reads no mathematics in text of a record."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_text(_printed(text.get_text()))
     for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
         if any(label.get_text() != _printed(label.get_text()) for label in axis.get_ticklabels()):
             before = axis.get_major_formatter()
-            # Where names stand at the ticks.
+            # Names at the ticks.
             axis.set_major_formatter(lambda *at, before=before: _printed(before(*at)))
 
 
 def _printed(text: str) -> str:
-    """Text that matplotlib prints as it stands: what is between dollars is mathematics to it."""
+    """Text that matplotlib prints literally, also between dollars."""
     if TICK.fullmatch(text):
         return text
     lines = text.split("\n")
     fits = len(lines) <= MAX_LINES and max(map(len, lines)) <= LONGEST_TEXT
-    cut = text if fits else f"{text[:KEPT]}…"
+    cut = text if fits else f"{text[:CUT_TO]}…"
     return re.sub(r"\\?\$", r"\\$", shown_text(cut).replace("\t", " "))

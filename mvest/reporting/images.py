@@ -1,7 +1,7 @@
-"""Pictures of a valve found in images: its outlines on slices of the volume, and its measures.
+"""Pictures of a valve detected in images: its outlines on slices of the volume, and its measures.
 
-The slices lie in the planes in which a mitral valve is looked at. All positions are LPS mm. A plane
-has its own coordinates: mm to the right and up from its origin.
+The slices lie in the usual planes of a mitral valve. All positions are LPS mm; a plane has its own
+coordinates, mm to the right and up from its origin.
 """
 
 from __future__ import annotations
@@ -45,17 +45,16 @@ COLUMNS = {
     "at the annulus": "from the atrium, anterior up",
     "at the free edge": "1 mm above the higher one, anterior up",
 }
-"""Planes of `valve_planes` in their order, two along the valve's axis and two across, and how they
-are seen."""
+"""Planes of `valve_planes`, two along the valve's axis and two across, with their orientation."""
 
 ALONG = ("commissural", "anteroposterior")
-"""Planes in which the papillary tips are in sight."""
+"""Planes that show the papillary tips."""
 ABOVE_EDGE_MM = 1.0
 STEP_MM = 0.4
 """Between pixels."""
 MOST_ROWS = 6
 REACH_MM = 3.0
-"""Up to which distance from a plane annulus points and papillary tips are drawn in it."""
+"""Annulus points and papillary tips are drawn in a plane up to this distance from it."""
 MARGIN_MM = 7.0
 ROW_INCHES = 2.35
 DOTS: Mapping[str, Mapping[str, Any]] = {
@@ -79,13 +78,13 @@ OVER_TIME = {
     "Leaflet areas": {"anterior_area_mm2": "anterior", "posterior_area_mm2": "posterior"},
     "Papillary tips": {"tip_separation_mm": "between the tips", "tip_depth_mm": "mean depth"},
 }
-"""Title of a panel -> the measures in it, and what readers call them."""
+"""Title of a panel -> its measures and their labels."""
 
 CAPTIONS = {
     "montage": "The valve as it was detected, drawn on the volume.",
     "measures_over_time": (
-        "Measures of the valve over time. Hollow: frames of low confidence. Bands: where 95 % of "
-        "true values are expected, from the detectors' errors on simulated valves."
+        "Measures of the valve over time. Hollow: frames of low confidence. Bands: 95 % intervals, "
+        "from the detectors' errors on simulated valves."
     ),
 }
 
@@ -93,23 +92,11 @@ Extent = tuple[float, float, float, float]
 """Left, right, bottom and top in a plane, mm."""
 
 
-# -- what the image step leaves in a folder -------------------------------------------------------
+# -- files of the image step ----------------------------------------------------------------------
 def write_image_step(
     detected: DetectedValve, folder: Path
 ) -> dict[str, tuple[Mapping[str, Any], ...]]:
-    """Draw and write a detected valve; returns what its record says of the images.
-
-    Parameters
-    ----------
-    detected : DetectedValve
-    folder : Path
-        Existing folder.
-
-    Returns
-    -------
-    dict
-        As `DetectedValve.details` has it.
-    """
+    """Draw and write a detected valve into an existing folder; returns `DetectedValve.details`."""
     files = write_detected(detected, folder)
     volume, valve, closed = detected.volume, detected.valve, detected.frames.closed
     name, low = detected.case.name, detected.settings.min_confidence
@@ -126,7 +113,7 @@ def write_image_step(
 def draw_candidate(
     volume: VolumeSequence, candidate: ValveSequence, low_confidence: float, folder: Path
 ) -> Path:
-    """Draw a candidate that was not accepted, marked as such; returns the picture."""
+    """Draw a candidate that was not accepted, with a title that says so; returns the picture."""
     folder.mkdir(parents=True, exist_ok=True)
     title = f"NO VALVE FOUND; best candidate, not accepted: {called(volume)}"
     figure = montage_figure(volume, candidate, title=title, low_confidence=low_confidence)
@@ -162,20 +149,20 @@ class SlicePlane:
 def valve_planes(valve: ValveSequence, frame: int) -> dict[str, SlicePlane]:
     """The planes of one frame by their names in `COLUMNS`.
 
-    The commissural one holds both commissures and the middle between the papillary tips, the
-    anteroposterior (three-chamber) one the middles of both sides of the annulus and the valve's
-    axis; both have the atrium up. Those across are seen from the atrium with the anterior side up:
-    through the centre of the annulus, and 1 mm above the middle of the free edge that is higher, so
-    that both leaflets are cut.
+    The commissural plane contains both commissures and the middle between the papillary tips. The
+    anteroposterior (three-chamber) plane contains the middles of both sides of the annulus and the
+    valve's axis. Both have the atrium up. The planes across are seen from the atrium with the
+    anterior side up: one through the centre of the annulus, and one 1 mm above the middle of the
+    higher free edge, which cuts both leaflets.
 
     Raises
     ------
     GeometryError
-        Positions that are not finite, or on one line.
+        Positions are not finite, or are on one line.
     """
     named, tips = landmarks(valve, frame), valve.tips[frame]
     if not (np.isfinite(valve.vertices[frame]).all() and np.isfinite(tips).all()):
-        raise GeometryError(f"frame {frame}: positions that are not finite numbers have no planes")
+        raise GeometryError(f"frame {frame}: positions are not finite, so there are no planes")
     front, back = named["annulus_anterior"], named["annulus_posterior"]
     first, second = named["commissure_0"], named["commissure_180"]
     plane = annulus_plane(valve.annulus[frame], tips.mean(axis=0), front)
@@ -201,12 +188,12 @@ def _across(direction: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def resample(volume: VolumeSequence, frame: int, plane: SlicePlane, extent: Extent) -> FloatArray:
-    """A slice of one frame, between voxels by trilinear interpolation.
+    """A trilinearly interpolated slice of one frame.
 
     Returns
     -------
     (rows, columns)
-        `STEP_MM` apart from the bottom up; NaN outside the volume.
+        Pixels of `STEP_MM` from the bottom up; NaN outside the volume.
     """
     across, up = (
         low + (np.arange(round((high - low) / STEP_MM)) + 0.5) * STEP_MM
@@ -219,7 +206,7 @@ def resample(volume: VolumeSequence, frame: int, plane: SlicePlane, extent: Exte
 
 
 def leaflet_contours(valve: ValveSequence, frame: int, plane: SlicePlane) -> list[FloatArray]:
-    """Segments ``(k, 2, 2)`` mm in which a plane cuts each leaflet, in the order of the regions."""
+    """Segments ``(k, 2, 2)`` mm in which a plane cuts each leaflet, by region."""
     layout, contours = valve.layout, []
     for number in range(len(layout.region_names)):
         triangles = layout.triangles[layout.region == number]
@@ -232,7 +219,7 @@ def leaflet_contours(valve: ValveSequence, frame: int, plane: SlicePlane) -> lis
 def chosen_frames(count: int, closed: int | None = None) -> list[int]:
     """At most `MOST_ROWS` of ``count`` frames, evenly spaced from the first to the last.
 
-    The closed one, if given, takes the place of the nearest that is not the first.
+    A given closed frame replaces the nearest of them, except the first.
     """
     frames = np.unique(np.linspace(0, count - 1, min(MOST_ROWS, count)).round().astype(int))
     if closed is not None and closed not in frames:
@@ -249,26 +236,25 @@ def montage_figure(
     closed: int | None = None,
     low_confidence: float = MIN_CONFIDENCE,
 ) -> Figure:
-    """Frames in rows, the planes of `valve_planes` in columns, with what the valve cuts drawn on.
+    """Frames in rows and the planes of `valve_planes` in columns, with outlines of the valve.
 
-    Every row has the planes of its own frame; all panels have one scale. Leaflets are drawn where
-    the plane cuts them, annulus points and papillary tips where they lie within 3 mm of it.
+    Every row has the planes of its own frame, and all panels have one scale. Leaflets are drawn
+    where the plane cuts them, annulus points and papillary tips if they are within 3 mm of it.
 
     Parameters
     ----------
     volume, valve
-        Frame k of one is frame k of the other.
+        With the same frames.
     title : str
-        What is shown, such as the name of the sequence.
     closed : int, optional
-        A frame that must be among those shown.
+        A frame to be shown.
     low_confidence : float
         Frames below this are marked in words and by a dashed frame.
 
     Raises
     ------
     InputError
-        The two have other numbers of frames or other times.
+        Numbers or times of the frames differ.
     """
     count, low = len(valve.times), ~(valve.frame_confidence >= low_confidence)
     if len(volume.times) != count or not np.allclose(
@@ -288,7 +274,7 @@ def montage_figure(
         for frame, named in planes.items()
         for name, plane in named.items()
     }
-    # Grey values drawn black and white: all but the darkest and brightest 0.5 %.
+    # The darkest and brightest 0.5 % of the pixels are black and white.
     values = np.concatenate([[], *(image[np.isfinite(image)] for image in slices.values())])
     window = np.quantile(values, [0.005, 0.995]) if len(values) else (0.0, 1.0)
     widths = [right - left for left, right, _, _ in extents.values()]
@@ -333,7 +319,7 @@ def montage_figure(
 def _extent(
     valve: ValveSequence, planes: Mapping[int, Mapping[str, SlicePlane]], name: str
 ) -> Extent:
-    """For one column the smallest box around the valve in all rows, and a margin."""
+    """The smallest box around the valve in all rows of a column, with a margin."""
     places = [np.array([[-20.0, -20.0], [20.0, 20.0]])] if not planes else []
     for frame, named in planes.items():
         points = [valve.vertices[frame], *([valve.tips[frame]] if name in ALONG else [])]
@@ -369,12 +355,12 @@ def measures_figure(
     Parameters
     ----------
     rows : sequence of mapping
-        From `mvest.cases.from_images.measures.measure_sequence`: for each frame ``time_s``,
-        ``confidence`` and the measures; None leaves a gap. Of those that have bounds
-        (`mvest.cases.from_images.detector_errors.with_bands`) the band is drawn, too.
+        From `mvest.cases.from_images.measures.measure_sequence`: ``time_s``, ``confidence`` and the
+        measures of each frame; None leaves a gap. Measures with bounds
+        (`mvest.cases.from_images.detector_errors.with_bands`) have a band.
     title : str
     low_confidence : float
-        Frames below this are drawn hollow.
+        Frames below this are hollow.
     """
     table = pd.DataFrame(list(rows))
     time, sure = 1e3 * table["time_s"], table["confidence"] >= low_confidence
@@ -384,31 +370,27 @@ def measures_figure(
         axes.set_ylabel(unit_of_measure(next(iter(curves))))
         bounds = [f"{name}_{end}" for name in curves for end in ("low", "high")]
         shown = table.reindex(columns=[*curves, *bounds]).astype(float)
-        for k, (name, words) in enumerate(curves.items()):
-            colour = COLOURS[k]
+        for (name, words), colour, marker in zip(curves.items(), COLOURS, MARKERS, strict=False):
             axes.plot(time, shown[name], color=colour, lw=1.2, label=words)
             if f"{name}_low" in table:
                 band = shown[f"{name}_low"], shown[f"{name}_high"]
                 axes.fill_between(time, *band, color=colour, alpha=0.16, lw=0)
-            for which, face in ((sure, colour), (~sure, "white")):
-                style = {"marker": MARKERS[k], "ms": 4.2, "mec": colour, "mfc": face}
-                axes.plot(time[which], shown[name][which], ls="none", **style)
+            style = {"marker": marker, "ms": 4.2, "mec": colour, "ls": "none"}
+            axes.plot(time[sure], shown[name][sure], mfc=colour, **style)
+            axes.plot(time[~sure], shown[name][~sure], mfc="white", **style)
         if len(curves) > 1:
             axes.legend(fontsize=SMALL - 0.5, frameon=False, handlelength=1.4)
         if shown.isna().all(axis=None):
-            axes.text(
-                0.5, 0.5, "not measured in any frame", transform=axes.transAxes, ha="center",
-                fontsize=SMALL, color=GREY,
-            )  # fmt: skip
+            style = {"ha": "center", "fontsize": SMALL, "color": GREY}
+            axes.text(0.5, 0.5, "not measured in any frame", transform=axes.transAxes, **style)
             continue
-        # Limits that neither magnify noise nor let the legend cover a curve.
+        # These limits do not magnify noise, and leave space for the legend above the curves.
         low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
         span, middle = max(high - low, 0.1 * max(abs(high), abs(low)), 0.5), 0.5 * (high + low)
         axes.set_ylim(middle - 0.6 * span, middle + 0.95 * span)
     for axes in grid[-1]:
         axes.set_xlabel("time [ms]")
+    bands = " Bands: 95 %." if table.columns.str.endswith("_low").any() else ""
     note = f"Hollow: confidence below {low_confidence:g} ({(~sure).sum()} of {len(sure)} frames). "
-    banded = table.columns.str.endswith("_low").any()
-    note += "Gaps: the shape defies the measure" + (". Bands: 95 %." if banded else ".")
-    headline(figure, title, note)
+    headline(figure, title, f"{note}Gaps: not measurable.{bands}")
     return figure

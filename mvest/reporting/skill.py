@@ -1,7 +1,6 @@
-"""How good estimates are beside what anyone could say without one: numbers, tables and a figure.
+"""The skill of estimates compared with guesses: numbers, tables and a figure.
 
-That is the generic guess, a value of the literature, and the prior alone, which is that value with
-the interval that is believed before anything was seen.
+The generic guess is the literature's value; the prior is this value with its interval.
 """
 
 from __future__ import annotations
@@ -21,20 +20,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 GENERIC = "generic guess"
-"""What tables call it."""
-
 HALF = float(norm.ppf(0.975))
 """Standard deviations from the middle of a 95 % interval to its end."""
 
 
 def generic_guess(unknown: Unknown) -> Unknown:
-    """An unknown as the literature has it: the mean of the prior, without an interval."""
+    """The unknown with the mean of its prior as the estimate, without an interval."""
     nothing: dict[str, None] = dict.fromkeys(("std", "low", "high"))
     return unknown.model_copy(update={"estimate": unknown.prior_mean, **nothing})
 
 
 def prior_alone(unknown: Unknown) -> Unknown:
-    """An unknown as it is believed before anything was seen; see `mvest.estimation.transform`."""
+    """The unknown with the 95 % interval of its prior, which is log-normal if it is positive."""
     guess, mean, std = generic_guess(unknown), unknown.prior_mean, unknown.prior_std
     if mean is None or std is None:
         return guess
@@ -44,7 +41,7 @@ def prior_alone(unknown: Unknown) -> Unknown:
 
 
 def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
-    """Coverage and errors of estimates beside those of the generic guess and of the prior alone.
+    """Coverage and errors of estimates, compared with the generic guess and the prior.
 
     Parameters
     ----------
@@ -54,14 +51,13 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``n`` unknowns, ``estimated`` of them, ``inside`` their 95 % intervals; ``coverage`` (%),
-        the share of the intervals that hold the truth, with exact 95 % bounds; ``mean square`` of
-        errors in posterior standard deviations, 1 where intervals are as wide as they should be.
-        Errors (``mean
-        error``, ``median error`` of their sizes, of the generic guess for the same and for all) and
-        the ``mean width`` of intervals are in ``unit``: relative to the truth (%) for moduli and
-        factors, otherwise as the unknown is. ``relative width`` is the median over the estimate,
-        ``width over prior`` that of the logarithm's interval over the prior's. None: not known.
+        ``n`` unknowns, how many were ``estimated`` and how many have the truth ``inside`` their
+        95 % interval; ``coverage`` (%) with exact 95 % bounds; ``mean square`` of errors in
+        posterior standard deviations, which is 1 for intervals of the right width. Errors and the
+        ``mean width`` of intervals are in ``unit``: in % of the truth for moduli and factors, else
+        in the unknown's unit. The generic guess has its median error for the same unknowns and for
+        all. ``relative width`` is the median over the estimate, and ``width over prior`` the median
+        ratio of logarithmic widths. None: not known.
     """
     unit = "" if unknowns[0].is_modulus else unknowns[0].unit
     prior = [prior_alone(own) for own in unknowns]
@@ -81,6 +77,12 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
     inside, n = sum(judged), len(judged)
     bounds = share_bounds(inside, n)
     scores = [z**2 for own in unknowns if (z := score(own)) is not None]
+
+    def known_only(function: Callable[[FloatArray], Any], values: FloatArray) -> float | None:
+        """A mean or median of the finite values; None if there are none."""
+        finite = values[np.isfinite(values)]
+        return float(function(finite)) if finite.size else None
+
     return {
         "n": len(unknowns),
         "estimated": int(known.sum()),
@@ -88,27 +90,21 @@ def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
         "coverage": 100 * inside / n if n else None,
         "coverage low": 100 * bounds[0] if n else None,
         "coverage high": 100 * bounds[1] if n else None,
-        "mean square": _of_known(np.mean, np.array(scores)),
+        "mean square": known_only(np.mean, np.array(scores)),
         "unit": unit or "%",
-        "mean error": _of_known(np.mean, error),
-        "median error": _of_known(np.median, np.abs(error)),
-        GENERIC: _of_known(np.median, guess_error[known]),
-        f"{GENERIC}, all": _of_known(np.median, guess_error),
+        "mean error": known_only(np.mean, error),
+        "median error": known_only(np.median, np.abs(error)),
+        GENERIC: known_only(np.median, guess_error[known]),
+        f"{GENERIC}, all": known_only(np.median, guess_error),
         "inside prior": sum(own.inside is True for own in prior),
-        "mean width": _of_known(np.mean, width * scale),
-        "relative width": None if unit else _of_known(np.median, width / estimate),
-        "width over prior": _of_known(np.median, ratio),
+        "mean width": known_only(np.mean, width * scale),
+        "relative width": None if unit else known_only(np.median, width / estimate),
+        "width over prior": known_only(np.median, ratio),
     }
 
 
-def _of_known(function: Callable[[FloatArray], Any], values: FloatArray) -> float | None:
-    """A mean or median of the finite values; None if there are none."""
-    finite = values[np.isfinite(values)]
-    return float(function(finite)) if finite.size else None
-
-
 def score(unknown: Unknown) -> float | None:
-    """Truth minus estimate in posterior standard deviations, where the posterior is normal."""
+    """Truth minus estimate in posterior standard deviations, of the logarithm if positive."""
     values = (unknown.truth, unknown.estimate, unknown.low, unknown.high)
     if any(value is None for value in values):
         return None
@@ -118,7 +114,7 @@ def score(unknown: Unknown) -> float | None:
 
 
 def log_width(unknown: Unknown) -> float:
-    """Width of the interval of a modulus' logarithm; NaN without an interval."""
+    """Width of the interval of a modulus's logarithm; NaN without an interval."""
     if unknown.low is None or unknown.high is None:
         return np.nan
     return float(np.log(unknown.high / unknown.low))
@@ -155,18 +151,18 @@ COLUMNS = {
 
 
 def trust_of(estimate: EstimateRecord) -> str:
-    """The verdict in a word: ``none`` without an estimate, empty where it was not judged."""
+    """The verdict in a word: ``none`` without an estimate, empty if it was not judged."""
     if not estimate.is_stated:
         return NONE
     return "" if estimate.verdict is None else estimate.verdict.trust
 
 
 def stated(estimate: EstimateRecord) -> list[Unknown]:
-    """The unknowns of the filter, without numbers where none may be stated."""
+    """The unknowns of the filter, without numbers if none may be stated."""
+    if estimate.is_stated:
+        return list(estimate.parameters)
     nothing: Mapping[str, None] = dict.fromkeys(("estimate", "std", "low", "high"))
-    return [
-        own if estimate.is_stated else own.model_copy(update=nothing) for own in estimate.parameters
-    ]
+    return [own.model_copy(update=nothing) for own in estimate.parameters]
 
 
 def interval(label: str, unknown: Unknown | None) -> dict[str, Any]:
@@ -176,7 +172,7 @@ def interval(label: str, unknown: Unknown | None) -> dict[str, Any]:
 
 
 def interval_columns(label: str, *, hidden: bool = False) -> dict[str, Column]:
-    """Columns of such cells in MPa; the truth has a column of its own."""
+    """Columns of `interval` in MPa; the column ``truth`` has the truth."""
     low, high, inside = (f"{label} {part}" for part in ("low", "high", "inside"))
     return {
         label: Column("MPa", low=low, high=high, truth="truth", hidden=hidden),
@@ -186,13 +182,9 @@ def interval_columns(label: str, *, hidden: bool = False) -> dict[str, Column]:
 
 
 def estimates_table(by: str, estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each unknown of each estimate, beside its truth.
+    """A row for each unknown of each estimate, with its truth.
 
-    Parameters
-    ----------
-    by : str
-        Name of the first column: the case of an estimate, or its seed where it has none.
-    estimates : sequence of EstimateRecord
+    The first column is named ``by`` and has the case of an estimate, or its seed if it has none.
     """
     keys = ("parameter", "truth", "prior_mean", "estimate", "std", "bound", "relative_error")
     rows = [
@@ -218,21 +210,13 @@ def estimates_table(by: str, estimates: Sequence[EstimateRecord]) -> Table:
 
 
 def skill_table(by: str, groups: Mapping[str, Sequence[Unknown]]) -> Table:
-    """A row for each group of unknowns, see `skill`; none for empty ones.
-
-    Parameters
-    ----------
-    by : str
-        Name of the first column.
-    groups : mapping
-        Value of the first column -> unknowns.
-    """
+    """The `skill` of each group that is not empty; the first column ``by`` names the group."""
     rows = [{by: name, **skill(unknowns)} for name, unknowns in groups.items() if unknowns]
     return table(rows, **{by: Column(), **COLUMNS})
 
 
 def verdict_table(estimates: Sequence[EstimateRecord]) -> Table:
-    """What a verdict is worth: the skill of all moduli, stated or not, by verdict."""
+    """The skill of all moduli, stated or not, by verdict."""
     groups = {
         str(trust): [own for one in estimates if trust_of(one) == trust for own in one.moduli]
         for trust in VERDICTS
@@ -243,12 +227,12 @@ def verdict_table(estimates: Sequence[EstimateRecord]) -> Table:
 def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure:
     """Estimates over their truths with 95 % intervals, in the colour of their verdicts.
 
-    There is a panel for each modulus and a band for each group, in which truths rise downwards.
+    Each modulus has a panel, and each group a band in which truths rise downwards.
 
     Parameters
     ----------
     groups : mapping
-        Name -> moduli whose truths are known, each with the verdict in a word.
+        Name -> moduli with known truths, each with its verdict in a word.
     """
     from mvest.reporting.figures import panels
 
@@ -261,7 +245,15 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure
             rows = [(own, trust) for own, trust in each if own.name == name]
             rows.sort(key=lambda row: row[0].truth or 0.0)
             for j, (own, trust) in enumerate(rows):
-                _draw_modulus(axes, k + 0.8 * ((j + 0.5) / len(rows) - 0.5), own, trust)
+                at, colour = k + 0.8 * ((j + 0.5) / len(rows) - 0.5), COLOURS[trust]
+                numbers = np.array([own.low, own.estimate, own.high, own.prior_mean], dtype=float)
+                low, middle, high, guess = numbers / float(own.truth or np.nan)
+                face = "white" if trust == NONE else colour
+                axes.plot(guess, at, "|", color="0.6", ms=5, zorder=1)
+                axes.plot([low, high], [at, at], color=colour, lw=1.3)
+                axes.plot(middle, at, "o", color=colour, mfc=face, ms=3.5)
+                if own.estimate is None:
+                    axes.text(1.0, at, "no estimate", fontsize=7, ha="center", va="center")
         axes.axvline(1.0, color="0.3", lw=0.8, zorder=0)
         axes.set_xscale("log")
         axes.set_xticks([0.5, 0.7, 1.0, 1.5, 2.0], labels=["0.5", "0.7", "1", "1.5", "2"])
@@ -274,15 +266,3 @@ def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure
     grid[-1].plot([], [], "|", color="0.5", ms=8, label=GENERIC)
     grid[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     return drawn
-
-
-def _draw_modulus(axes: Any, at: float, own: Unknown, trust: str) -> None:
-    """One estimate over its truth, and the generic guess."""
-    numbers = np.array([own.low, own.estimate, own.high, own.prior_mean], dtype=float)
-    low, middle, high, guess = numbers / float(own.truth or np.nan)
-    colour = COLOURS[trust]
-    axes.plot(guess, at, "|", color="0.6", ms=5, zorder=1)
-    axes.plot([low, high], [at, at], color=colour, lw=1.3)
-    axes.plot(middle, at, "o", color=colour, mfc="white" if trust == NONE else colour, ms=3.5)
-    if own.estimate is None:
-        axes.text(1.0, at, "no estimate", fontsize=7, ha="center", va="center")

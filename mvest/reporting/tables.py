@@ -1,9 +1,9 @@
 """Tidy tables with the meaning of their columns: CSV, Markdown, LaTeX and JSON from one writer.
 
-A table is a data frame (one row an observation, one column a quantity) and, for each column, its
-unit, its digits and the columns that belong to it: a standard deviation, the ends of an interval,
-the truth. Files for programs (CSV, JSON) hold every column as it is; texts for readers (Markdown,
-LaTeX) round, and join what belongs together.
+A table has one row per observation and one column per quantity. For each column it knows the unit,
+the digits and the columns that belong to it: a standard deviation, the ends of an interval, the
+truth. Files for programs (CSV, JSON) hold every column unrounded. Texts for readers (Markdown,
+LaTeX) are rounded and show a value and its uncertainty in one cell.
 """
 
 from __future__ import annotations
@@ -21,30 +21,29 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 WIDTH, MOST_BESIDE = 100, 5
-"""Characters of a line of a terminal, and rows that a terminal shows beside each other."""
+"""Characters of a line of a terminal, and the most rows that are transposed to fit into it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """What the numbers of a column mean, and how a reader sees them.
+    """Meaning of a column, and how readers see it.
 
     Attributes
     ----------
     unit : str
-        Empty for what has none.
+        Empty if it has none.
     digits : str
-        Format specification, ``.2f`` say; empty: three significant digits.
+        Format specification such as ``.2f``; empty: three significant digits.
     std : str
-        Column with the standard deviation of this one: shown as ``value ± std``.
+        Column of standard deviations, shown as ``value ± std``.
     low, high : str
-        Columns with the ends of its interval: shown as ``value (low to high)``.
+        Columns of the ends of an interval, shown as ``value (low to high)``.
     truth : str
-        Column with its true value, which has a place of its own: an interval that misses it is
-        marked with a cross.
+        Column of true values; an interval that misses it is marked with a cross.
     label : str
         Heading for readers; empty: the name with spaces for underscores.
     hidden : bool
-        Whether readers do not see it; files for programs always have it.
+        Whether only files for programs have the column.
     """
 
     unit: str = ""
@@ -74,9 +73,9 @@ class Table:
     Attributes
     ----------
     values : mapping of str to list
-        Column -> its values; None where a value is missing.
+        Column -> its values; None if a value is missing.
     columns : mapping of str to Column
-        What columns mean; one that is not named here has no unit.
+        Meaning of columns; one that is not named here has no unit.
     """
 
     values: Mapping[str, Sequence[Any]]
@@ -87,7 +86,7 @@ class Table:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """The same, a mapping for each row."""
+        """A mapping for each row."""
         return [
             dict(zip(self.values, row, strict=True))
             for row in zip(*self.values.values(), strict=True)
@@ -95,22 +94,22 @@ class Table:
 
     @property
     def frame(self) -> DataFrame:
-        """The same as a data frame; numbers that are missing are NaN."""
+        """The table as a data frame; missing numbers are NaN."""
         import pandas as pd
 
-        # Not with another type for whole numbers where one is missing: 3 stays 3 in a file.
+        # Counts stay whole numbers in a file if some are missing.
         kinds = {name: {*map(type, values)} for name, values in self.values.items()}
         whole = {name: "Int64" for name, kind in kinds.items() if kind == {int, type(None)}}
         return pd.DataFrame(dict(self.values)).astype(whole)
 
     def csv(self) -> str:
-        """The table for programs: a heading says its unit as ``name [unit]``."""
+        """The table for programs, with headings ``name [unit]``."""
         units = {name: self._column(name).unit for name in self.values}
         headings = [f"{name} [{unit}]" if unit else name for name, unit in units.items()]
         return str(self.frame.to_csv(index=False, header=headings))
 
     def readable(self) -> list[dict[str, str]]:
-        """Rows as readers see them: rounded, and joined with what belongs to a column."""
+        """Rounded rows, a value and its uncertainty in one cell."""
         joined = {
             other
             for name, column in self.columns.items()
@@ -121,7 +120,7 @@ class Table:
         return [{self._heading(name): self._cell(name, row) for name in shown} for row in self.rows]
 
     def markdown(self) -> str:
-        """The readable table in Markdown; a sentence where there is no row."""
+        """The readable table in Markdown, or a sentence if it is empty."""
         rows = self.readable()
         return markdown_rows(rows) if rows else "No rows."
 
@@ -129,20 +128,15 @@ class Table:
         r"""The readable table in LaTeX, with ``\usepackage{booktabs}``; first column left."""
         import pandas as pd
 
-        plain = [
-            {
-                shown_text(" ".join(k.split())): shown_text(" ".join(v.split()))
-                for k, v in row.items()
-            }
-            for row in self.readable()
-        ]
-        if not plain:
+        shown = pd.DataFrame(self.readable())
+        if shown.empty:
             return "% no rows\n"
-        sides = "l" + "r" * (len(plain[0]) - 1)
-        return str(pd.DataFrame(plain).to_latex(index=False, escape=True, column_format=sides))
+        plain = shown.rename(columns=_one_line).map(_one_line)
+        sides = "l" + "r" * (plain.shape[1] - 1)
+        return str(plain.to_latex(index=False, escape=True, column_format=sides))
 
     def text(self) -> str:
-        """The readable table for a terminal; few wide rows stand beside each other."""
+        """The readable table for a terminal; a few wide rows are transposed."""
         import pandas as pd
 
         shown = pd.DataFrame(self.readable())
@@ -163,13 +157,7 @@ class Table:
 
     @classmethod
     def of_plain(cls, data: Mapping[str, Any], where: str) -> Table:
-        """A table from plain data; ``where`` names it in an error.
-
-        Raises
-        ------
-        InputError
-            If the data are no table.
-        """
+        """A table from plain data; an InputError names ``where`` if they are no table."""
         try:
             columns = {name: Column(**about) for name, about in data["columns"].items()}
             values = {str(name): list(column) for name, column in data["values"].items()}
@@ -210,19 +198,21 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
     Parameters
     ----------
     rows : iterable or DataFrame
-        NumPy scalars become plain numbers, numbers that are not finite None.
+        NumPy scalars become plain numbers, and numbers that are not finite become None.
     **columns : Column or str
-        What columns mean; a text is ``unit:digits:label``, for example ``"mm:.2f"``, of which what
-        follows may be missing. Named columns come first, in this order.
+        Meaning of columns, in the order in which they come first; a text is
+        ``unit:digits:label``, such as ``"mm:.2f"``, whose last parts may be missing.
 
     Raises
     ------
     InputError
-        If a named column, or one that belongs to it, does not exist although there are rows.
+        If there are rows without a named column, or without one that belongs to it.
     """
     plain = _plain_rows(rows)
     names = list(dict.fromkeys(name for row in plain for name in row))
-    about = {name: _column(spec) for name, spec in columns.items()}
+    about = {
+        name: spec if isinstance(spec, Column) else _column(spec) for name, spec in columns.items()
+    }
     needed = [
         name
         for key, column in about.items()
@@ -237,35 +227,26 @@ def table(rows: Iterable[Any] | DataFrame, **columns: Column | str) -> Table:
 
 
 def joined(tables: Mapping[str, Table], key: str = "run") -> Table:
-    """Tables below each other; a first column says where each row comes from.
-
-    Parameters
-    ----------
-    tables : mapping
-        Value of the first column -> table.
-    key : str
-        Its name.
-    """
+    """Concatenated tables; the first column ``key`` has the name of each row's table."""
     names = list(dict.fromkeys(name for part in tables.values() for name in part.values))
     columns = dict(ChainMap(*(dict(part.columns) for part in tables.values())))
     rows = [{key: label, **row} for label, part in tables.items() for row in part.rows]
     return Table({name: [row.get(name) for row in rows] for name in [key, *names]}, columns)
 
 
-def _column(spec: Column | str) -> Column:
-    if isinstance(spec, Column):
-        return spec
+def _column(spec: str) -> Column:
     unit, digits, label = [*spec.split(":", 2), "", ""][:3]
     return Column(unit, digits, label=label)
 
 
+def _one_line(text: str) -> str:
+    return shown_text(" ".join(text.split()))
+
+
 def _plain_rows(rows: Iterable[Any] | DataFrame) -> list[dict[str, Any]]:
     given: Iterable[Any] = rows.to_dict("records") if hasattr(rows, "to_dict") else rows
-    found = []
-    for row in given:
-        values = asdict(row) if is_dataclass(row) and not isinstance(row, type) else row
-        found.append({str(name): _plain(value) for name, value in values.items()})
-    return found
+    plain = (asdict(row) if is_dataclass(row) else row for row in given)  # type: ignore[arg-type]
+    return [{str(name): _plain(value) for name, value in row.items()} for row in plain]
 
 
 def _plain(value: Any) -> Any:

@@ -1,8 +1,5 @@
 r"""Measures of a closing valve, step by step, and of a closed one.
 
-Steps: opening, leaks, coaptation, chordae, element quality. Closed: gap, coaptation, tenting,
-annulus and peak stress.
-
 With the right stretch :math:`U = \sqrt{I + 2E}` and the second Piola-Kirchhoff stress :math:`S` the
 Cauchy stress is :math:`\sigma = F S F^T / \det F = R \, (U S U / \det U) \, R^T` (Holzapfel 2000,
 Nonlinear Solid Mechanics, equation 3.65, with :math:`F = R U`), so that its principal values are
@@ -55,27 +52,33 @@ def measure_steps(
     Returns
     -------
     list of dict
-        Of each step ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening seen along
-        the best annulus normal between the thick leaflets; ``coaptation`` (mm), the height in the
-        middle of the valve over which the midsurfaces of opposing leaflets are within the contact
-        distance;
-        ``intersections``, pairs of intersecting triangles of the leaflets' faces (both sides and
-        rims); the largest ``chord strain`` and ``chord force`` (N); ``smallest det F``, the
-        determinant of the deformation gradient at the quadrature points; ``Newton iterations``.
+        For each step ``time`` (s); ``pressure`` (mmHg); ``orifice`` (mm²), the opening between the
+        thick leaflets along the best annulus normal; ``coaptation`` (mm), the height in the middle
+        of the valve over which the leaflets are within the contact distance; ``intersections``,
+        pairs of intersecting triangles of the leaflets' faces; the largest ``chord strain`` and
+        ``chord force`` (N); ``smallest det F`` of the quadrature points; ``Newton iterations``.
     """
     valve, system, simulation = model.valve, result.system, result.simulation
-    surface = valve.surface
+    surface, mesh = valve.surface, model.mesh
     closed_surface = thicken(surface, normals)
-    faces = embed(model.mesh, closed_surface.vertices)
+    faces = embed(mesh, closed_surface.vertices)
     loading = boundary_loading(system, valve, model.contact_valve, model.settings)
     one, other = (surface.triangles[surface.region == k] for k in (0, 1))
     measures = []
     for time, x in zip(simulation.times, simulation.frames, strict=True):
-        middle, outer = model.observed(x), faces(x)
+        middle, outer, loads = model.observed(x), faces(x), loading(time)
         annulus = middle[valve.annulus]
         plane = plane_of(valve, annulus)
-        loads = loading(time)
-        strain, force = _chordae(system, x, loads.tips)
+        strain = force = 0.0
+        if (cables := system.cables) is not None:
+            factors, at = system.factors, (x, loads.tips)
+            strain = float(cables.strain(*at, factors.chord_rest_length).max())
+            forces = cables.forces(*at, factors.chord_stiffness, factors.chord_rest_length)[0]
+            force = float(np.linalg.norm(forces, axis=1).max())
+        now, rest = (
+            jacobian_determinants(y, mesh.elements, mesh.reference, mesh.reference.points)
+            for y in (x, mesh.nodes)
+        )
         iterations = sum(len(r.residuals) - 1 for r in simulation.records if r.time <= time + 1e-12)
         length = coaptation_length(middle, one, other, plane, contact_distance)
         measures.append(
@@ -87,33 +90,15 @@ def measure_steps(
                 "intersections": len(intersecting_triangles(outer, closed_surface.triangles)),
                 "chord strain": strain,
                 "chord force": force,
-                "smallest det F": _smallest_jacobian(model, x),
+                "smallest det F": float((now / rest).min()),
                 "Newton iterations": iterations,
             }
         )
     return measures
 
 
-def _chordae(system: System, x: FloatArray, tips: FloatArray) -> tuple[float, float]:
-    cables = system.cables
-    if cables is None:
-        return 0.0, 0.0
-    factors = system.factors
-    strain = cables.strain(x, tips, factors.chord_rest_length)
-    force = cables.forces(x, tips, factors.chord_stiffness, factors.chord_rest_length)[0]
-    return float(strain.max()), float(np.linalg.norm(force, axis=1).max())
-
-
-def _smallest_jacobian(model: ClosureModel, x: FloatArray) -> float:
-    mesh = model.mesh
-    points = mesh.reference.points
-    now = jacobian_determinants(x, mesh.elements, mesh.reference, points)
-    rest = jacobian_determinants(mesh.nodes, mesh.elements, mesh.reference, points)
-    return float((now / rest).min())
-
-
 _PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
-"""Of tensor components in a six-vector 11, 22, 33, 23, 13, 12."""
+"""Places of tensor components in a six-vector 11, 22, 33, 23, 13, 12."""
 
 
 def principal_cauchy(green: FloatArray, stress: FloatArray) -> FloatArray:
@@ -144,8 +129,8 @@ def _stress(system: System, x: FloatArray) -> FloatArray:
 def peak_stress(system: System, x: FloatArray) -> Measured:
     """Peak stress of each region in equilibrium, as `Measured` names it; volumes are at rest.
 
-    The largest belongs to the insertion of a chord or to the hinge, where the stress grows as the
-    mesh is refined; the percentiles do so much less.
+    The largest occurs at the insertion of a chord or at the hinge, and grows as the mesh is
+    refined; the percentiles much less so.
 
     Parameters
     ----------
@@ -164,14 +149,17 @@ def peak_stress(system: System, x: FloatArray) -> Measured:
         raise InputError("the stress is not finite: an element is turned inside out")
     peaks: Measured = {}
     for number, name in enumerate(mesh.region_names):
-        own = mesh.region == number
-        for kind, peak in _peaks(values[own].ravel(), system.solid.volumes[own].ravel()).items():
-            peaks[f"stress_{kind}_{name}_mpa"] = peak
+        own = values[mesh.region == number].ravel()
+        order, volumes = np.argsort(own), system.solid.volumes[mesh.region == number].ravel()
+        below = np.cumsum(volumes[order]) / volumes.sum()
+        for kind, share in (("p95", 0.95), ("p99", 0.99)):
+            peaks[f"stress_{kind}_{name}_mpa"] = float(own[order][np.searchsorted(below, share)])
+        peaks[f"stress_max_{name}_mpa"] = float(own.max())
     return peaks
 
 
 def nodal_stress(system: System, x: FloatArray) -> FloatArray:
-    """First principal Cauchy stress ``(n,)`` (MPa) at the nodes, means of their elements by volume.
+    """First principal Cauchy stress ``(n,)`` (MPa) at the nodes, averaged over their elements.
 
     Parameters are those of `peak_stress`.
     """
@@ -185,9 +173,9 @@ def nodal_stress(system: System, x: FloatArray) -> FloatArray:
 
 
 def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the midsurface is sampled for contact ``(k, 3)`` (mm, at rest), and the pressure there.
+    """Contact samples ``(k, 3)`` (mm, at rest), and the pressure ``(k,)`` (MPa) there.
 
-    The pressure ``(k,)`` (MPa) is the force on a point over its area; empty without contact.
+    The pressure is the force on a sample over its area; empty without contact.
     """
     contact = system.contact
     if contact is None:
@@ -197,18 +185,11 @@ def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatAr
     return contact.sheet.rest, force / contact.sheet.areas
 
 
-def _peaks(values: FloatArray, volumes: FloatArray) -> Measured:
-    order = np.argsort(values)
-    below = np.cumsum(volumes[order]) / volumes.sum()
-    p95, p99 = (float(values[order][np.searchsorted(below, q)]) for q in (0.95, 0.99))
-    return {"p95": p95, "p99": p99, "max": float(values.max())}
-
-
 Measured = dict[str, float]
-"""Name with its unit -> number; each leaflet has stresses of its own.
+"""Name with its unit -> number.
 
-* ``gap_mm2``: regurgitant gap, the area within the annulus, seen along its normal, of the lines of
-  sight that stay farther than half the contact reach from every leaflet's midsurface;
+* ``gap_mm2``: regurgitant gap, the area within the annulus of the lines of sight along its normal
+  that stay farther than half the contact reach from every leaflet's midsurface;
 * ``coaptation_length_mm``: length over which the leaflets touch (midsurfaces within the contact
   reach) in the middle anteroposterior section, the smaller of both;
 * ``coaptation_area_mm2``: area over which the leaflets touch, mean of both;
@@ -219,27 +200,19 @@ Measured = dict[str, float]
 * ``tenting_volume_mm3``: volume between annulus plane and leaflets;
 * ``ap_diameter_mm``: anteroposterior diameter of the annulus;
 * ``annulus_circumference_mm``: length of the annulus in space;
-* ``stress_p95_LEAFLET_mpa``: first principal Cauchy stress that 95 % of the leaflet's volume stays
-  below; ``stress_p99_``: the same for 99 %; ``stress_max_``: the largest, which depends on the
-  mesh.
+* ``stress_p95_LEAFLET_mpa``: 95th percentile, by volume, of the leaflet's first principal Cauchy
+  stress; also ``stress_p99_`` and ``stress_max_``, which depends on the mesh.
 """
 
 NEVER_NEGATIVE = ("gap_", "coaptation_", "ap_diameter_", "annulus_", "stress_")
-"""Beginnings of names of measures that have no negative values: areas, lengths, and the highest
-tension of a leaflet that is under pressure."""
+"""Beginnings of names of measures that are never negative: areas, lengths, and the highest tension
+of a leaflet under pressure."""
 
 
 def measure_closed(model: ClosureModel, system: System, x: FloatArray) -> Measured:
     """Measure one closed valve of two leaflets.
 
-    Parameters
-    ----------
-    model : ClosureModel
-        Whose valve it is.
-    system : System
-        The model's, set to the parameters at which ``x`` is in equilibrium.
-    x : ndarray
-        ``(n, 3)`` mm nodal positions.
+    ``system`` is the model's, set to the parameters at which ``x (n, 3)`` mm is in equilibrium.
     """
     valve, surface = model.valve, model.valve.surface
     vertices = model.observed(x)

@@ -1,4 +1,4 @@
-"""One scenario at the estimate and at samples of its posterior, and summaries of both."""
+"""Prediction of one scenario at the estimate and at samples of its posterior."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from mvest.typing import FloatArray
 
 
 def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
-    """Parameter vectors ``(count, p)`` that are spread as the posterior is.
+    """Samples ``(count, p)`` of the parameters' posterior.
 
-    A scrambled Sobol sequence (Owen 1998, J. Complexity 14:466) taken through the normal
-    distribution in filter coordinates, so that parameters estimated by their logarithm stay
-    positive.
+    A scrambled Sobol sequence (Owen 1998, J. Complexity 14:466), transformed to the normal
+    distribution in filter coordinates.
 
     Parameters
     ----------
@@ -36,7 +35,7 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
         If the estimate has not converged or the count is not a power of two.
     """
     if not estimate.converged:
-        raise InputError(f"no samples of an estimate that is none: {estimate.reason.value}")
+        raise InputError(f"no samples: the estimate has not converged: {estimate.reason.value}")
     if count < 2 or count & (count - 1):
         raise InputError(f"samples = {count}, expected a power of two > 1")
     posterior = estimate.transformed
@@ -51,20 +50,13 @@ NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """One closed valve, or the reason why there is none.
-
-    Attributes
-    ----------
-    measures : dict
-        Empty if the valve does not close.
-    reason : str
-    """
+    """Measures of one closed valve; empty if the valve does not close, with the reason."""
 
     measures: Measured
     reason: str = ""
 
     def get(self, name: str) -> float:
-        """A measure; NaN if it is not known."""
+        """A measure; NaN if unknown."""
         return self.measures.get(name, float("nan"))
 
 
@@ -78,7 +70,7 @@ class PredictedScenario:
     shape : ndarray or None
         ``(n, 3)`` mm, observed vertices at the estimate.
     samples : tuple of Sample
-        Of the posterior, failed ones among them.
+        Of the posterior, including failed ones.
     finer : Sample or None
         The same valve at the estimate on a finer mesh, if there is one.
     """
@@ -90,7 +82,7 @@ class PredictedScenario:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Reasons of the samples that gave no closed valve."""
+        """Reasons of the failed samples."""
         return tuple(sample.reason for sample in self.samples if not sample.measures)
 
     def spread(self, name: str) -> dict[str, float]:
@@ -99,10 +91,9 @@ class PredictedScenario:
         Returns
         -------
         dict
-            ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles, unbiased for
-            the median (Hyndman and Fan 1996, Am. Stat. 50:361, type 8), which lie close to the
-            extremes with fewer than 40 samples; and how many ``samples`` gave a number. NaN where
-            these are too few.
+            ``mean`` and ``std``; ``low`` and ``high``, the 2.5 and 97.5 % quantiles (Hyndman and
+            Fan 1996, Am. Stat. 50:361, type 8), close to the extremes with fewer than 40 samples;
+            and the number of finite ``samples``. NaN if these are too few.
         """
         known = np.array([v for v in (one.get(name) for one in self.samples) if np.isfinite(v)])
         mean = float(known.mean()) if len(known) else float("nan")
@@ -113,24 +104,21 @@ class PredictedScenario:
         return {"mean": mean, "std": std, "low": low, "high": high, "samples": len(known)}
 
     def mesh_error(self, name: str) -> float:
-        """Difference of a measure from that of the finer mesh; NaN where there is none.
+        """Difference of a measure from that of the finer mesh; NaN without one.
 
-        Taken as a standard deviation of the mesh's error [choice]. Of two meshes, Roache's grid
-        convergence index (1994, J. Fluids Eng. 116:405) is stricter: with its safety factor of 3, a
-        refinement ratio of 1.65 and second order, 4.7 differences in place of the 1.96 of
+        It is used as the standard deviation of the mesh's error [choice]. Roache's grid convergence
+        index for two meshes (1994, J. Fluids Eng. 116:405) is stricter: with its safety factor of
+        3, a refinement ratio of 1.65 and second order, 4.7 differences instead of the 1.96 of
         `interval`.
         """
-        return (
-            float("nan")
-            if self.finer is None
-            else abs(self.finer.get(name) - self.at_estimate.get(name))
-        )
+        finer = float("nan") if self.finer is None else self.finer.get(name)
+        return abs(finer - self.at_estimate.get(name))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a measure with the error of the mesh; NaN where that is not known.
+        """95 % interval of a measure with the error of the mesh; NaN if that is unknown.
 
-        To either side of the estimate the reach of the samples and 1.96 mesh errors, as independent
-        errors add up. A measure that cannot be negative (see `NEVER_NEGATIVE`) stays so.
+        To either side of the estimate, the distance to the samples' quantile and 1.96 mesh errors
+        are combined as independent errors. Measures in `NEVER_NEGATIVE` stay non-negative.
         """
         spread, error = self.spread(name), NORMAL_95 * self.mesh_error(name)
         centre = self.at_estimate.get(name)
@@ -141,21 +129,27 @@ class PredictedScenario:
         return float(low), float(high)
 
     def against(self, own: Sample, same: Sample) -> dict[str, dict[str, float | bool | None]]:
-        """Every measure beside that of the true valve, which no estimate knows.
+        """Every measure compared with that of the true valve.
 
         Parameters
         ----------
         own, same : Sample
             With the true parameters on a mesh of its own, and on the mesh of the estimate, where
-            only the uncertainty of the parameters is left.
+            only the parameters are uncertain.
 
         Returns
         -------
         dict
-            Measure -> its ``estimate``, the ``mean``, ``std`` and 95 % interval (``low``, ``high``)
-            of the ``samples``, the ``mesh_error`` and the ``wide_`` interval with it, both truths,
-            and whether the intervals hold them; None where one of these is not known.
+            Measure -> its ``estimate``, `spread`, ``mesh_error``, the ``wide_`` `interval` with it,
+            both truths, and whether the intervals contain them; None if unknown.
         """
+
+        def inside(interval: tuple[float, float], true: float | None) -> bool | None:
+            low, high = interval
+            return (
+                None if true is None or not np.isfinite(high - low) else bool(low <= true <= high)
+            )
+
         rows: dict[str, dict[str, float | bool | None]] = {}
         for name, value in self.at_estimate.measures.items():
             spread, wide = self.spread(name), self.interval(name)
@@ -168,27 +162,18 @@ class PredictedScenario:
                 "wide_low": wide[0],
                 "wide_high": wide[1],
                 "truth_own_mesh": on_own,
-                "inside_own_mesh": _inside(narrow, on_own),
+                "inside_own_mesh": inside(narrow, on_own),
                 "truth_same_mesh": on_same,
-                "inside_same_mesh": _inside(narrow, on_same),
-                "inside_wide": _inside(wide, on_own),
+                "inside_same_mesh": inside(narrow, on_same),
+                "inside_wide": inside(wide, on_own),
             }
         return rows
-
-
-def _inside(interval: tuple[float, float], true: float | None) -> bool | None:
-    """Whether an interval holds the truth; None where one of them is not known."""
-    low, high = interval
-    return None if true is None or not np.isfinite(high - low) else bool(low <= true <= high)
 
 
 def closed_valve(
     model: ClosureModel, m: FloatArray, *, sensitivities: bool = False
 ) -> tuple[Sample, FloatArray | None]:
-    """A closed valve measured, and the observed vertices ``(n, 3)`` mm.
-
-    A closure that fails is a failed sample without vertices.
-    """
+    """Measures of a closed valve, and its observed vertices ``(n, 3)`` mm; None if it fails."""
     try:
         result = model.close(m, sensitivities=sensitivities)
     except MaterialError as error:
@@ -212,15 +197,15 @@ def predict_scenario(
     Parameters
     ----------
     model : ClosureModel
-        Under the scenario; with ``continuation`` every sample is an equilibrium that is sought
-        from the one at the estimate.
+        Under the scenario. With ``continuation`` every sample is reached from the closed valve at
+        the estimate.
     estimate : Estimate
     samples : ndarray
         ``(k, p)`` of its posterior.
     on_sample : callable, optional
-        Called with the number of each sample that is done, for progress.
+        Called with the number of each finished sample, for progress.
     finer : ClosureModel, optional
-        The same on a finer mesh, closed once, at the estimate, to tell the error of the mesh.
+        The same on a finer mesh, closed once at the estimate, for the error of the mesh.
 
     Raises
     ------
@@ -232,7 +217,7 @@ def predict_scenario(
             f"the estimate is of {', '.join(estimate.names)}, the model has "
             f"{', '.join(model.names)}"
         )
-    # With derivatives, from which the equilibria of the samples are expected.
+    # Its derivatives predict the equilibria of the samples.
     first, shape = closed_valve(model, estimate.mean, sensitivities=True)
     start = model.closed
     predicted = []

@@ -1,6 +1,6 @@
-"""What a prediction changes of the closed valve: pressure, annulus, and a clip between the edges.
+"""Hypothetical changes of the closed valve: pressure, annulus, and a clip between the edges.
 
-Scenarios are hypothetical and simulated; none of them is a recommendation.
+Scenarios are simulated; none of them is a recommendation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 
 NARROWEST = 0.3
-"""Share of the anteroposterior diameter that any ring leaves."""
+"""Smallest share of the anteroposterior diameter that a ring may leave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +29,12 @@ class Annuloplasty:
 
     Every annulus point is moved along the anterior direction towards the commissural line (through
     the centre of the annulus, along the commissures), in proportion to its distance from it:
-    ``y -> s y``. Points on that line stay where they are; the commissural diameter and the heights
-    along the normal stay, and the circumference and area become smaller with the diameter.
+    ``y -> s y``. The commissural diameter and the heights along the normal do not change.
 
     Attributes
     ----------
     percent : float
-        By how much the anteroposterior diameter becomes smaller.
+        Reduction of the anteroposterior diameter.
     """
 
     percent: Percent
@@ -57,12 +56,11 @@ class Clip:
     Attributes
     ----------
     position_mm : float
-        Of its middle along the commissures from the middle of the annulus (0: A2 to P2), in the
-        reference frame.
+        Position of its middle along the commissures (0: A2 to P2), in the reference frame.
     width_mm : float
         Along the free edges.
     grasp_mm : float
-        How far from the free edges the leaflets are held.
+        Distance from the free edges to which the leaflets are held.
     stiffness : float
         N/mm of each pair.
     """
@@ -80,7 +78,7 @@ class Clip:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Changes of a valve, in any combination; without any it is the valve as observed.
+    """Changes of a valve; without any it is the valve as observed.
 
     Attributes
     ----------
@@ -105,7 +103,7 @@ class Scenario:
 
 
 def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
-    """A fresh model of the same valve under a scenario; its guides are changed alike.
+    """A fresh model of the same valve under a scenario, and so are its guides.
 
     Raises
     ------
@@ -125,11 +123,14 @@ def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
         changed.contact_valve = _with_ring(model.contact_valve, plane, share)
         changed.valve = _with_ring(model.valve, plane, share)
     if scenario.clip is not None:
-        changed.ties = _tied(model, scenario.clip)
+        valve = model.contact_valve
+        edge = float(valve.surface.thickness[valve.free_edge].mean())
+        distance = model.settings.contact.reference_distance * edge
+        ends = clip_points(valve, scenario.clip)
+        changed.ties = TiedPoints(*ends, distance, scenario.clip.stiffness)
     return changed
 
 
-# -- annulus --------------------------------------------------------------------------------------
 def plane_of(valve: Valve, annulus: FloatArray) -> AnnulusPlane:
     """Plane of a valve's annulus ``(k, 3)`` mm; the first region is the anterior leaflet."""
     own = valve.surface.vertex_region[valve.annulus] == 0
@@ -137,15 +138,15 @@ def plane_of(valve: Valve, annulus: FloatArray) -> AnnulusPlane:
 
 
 def narrowed(annulus: FloatArray, plane: AnnulusPlane, share: float) -> FloatArray:
-    """Annulus ``(k, 3)`` mm whose distances from the commissural line are ``share`` of before."""
+    """Annulus ``(k, 3)`` mm with its distances from the commissural line scaled by ``share``."""
     along = (annulus - plane.origin) @ plane.anterior
     return np.asarray(annulus + ((share - 1) * along)[:, None] * plane.anterior)
 
 
 def _share(valve: Valve, plane: AnnulusPlane, ring: Annuloplasty) -> float:
-    """Share that gives the annulus, measured in its own new plane, the wanted diameter.
+    """Factor `narrowed` that gives the annulus the wanted diameter in its new plane.
 
-    Nearly the ratio of the diameters; the centre of the curve moves a little as it is narrowed.
+    It is nearly the ratio of the diameters; the centre of the curve moves a little.
     """
     annulus = valve.motion.annulus[-1]
     before = measure_annulus(annulus, plane).anteroposterior_diameter
@@ -160,22 +161,10 @@ def _share(valve: Valve, plane: AnnulusPlane, ring: Annuloplasty) -> float:
 
 def _with_ring(valve: Valve, plane: AnnulusPlane, share: float) -> Valve:
     """The valve with the ring: its displacement grows with the phase of the closure."""
-    motion = valve.motion
-    ringed = np.stack(
-        [
-            annulus + phase * (narrowed(annulus, plane, share) - annulus)
-            for phase, annulus in zip(motion.phase, motion.annulus, strict=True)
-        ]
-    )
+    motion, phase = valve.motion, valve.motion.phase[:, None, None]
+    narrow = np.stack([narrowed(annulus, plane, share) for annulus in motion.annulus])
+    ringed = motion.annulus + phase * (narrow - motion.annulus)
     return replace(valve, motion=Motion(motion.phase, ringed, motion.papillary_tips))
-
-
-# -- clip -----------------------------------------------------------------------------------------
-def _tied(model: ClosureModel, clip: Clip) -> TiedPoints:
-    valve = model.contact_valve
-    edge = float(valve.surface.thickness[valve.free_edge].mean())
-    distance = model.settings.contact.reference_distance * edge
-    return TiedPoints(*clip_points(model.contact_valve, clip), distance, clip.stiffness)
 
 
 SPACING_MM = 2.5
@@ -186,7 +175,7 @@ def clip_points(valve: Valve, clip: Clip) -> tuple[FloatArray, FloatArray]:
     """Tied points of the first and the second leaflet, ``(k, 3)`` mm in the reference frame.
 
     Two rows on each leaflet, at half and at the whole grasp from its free edge, in planes across
-    the commissural direction over the width of the clip.
+    the commissural direction.
 
     Raises
     ------

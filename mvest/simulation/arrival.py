@@ -1,4 +1,4 @@
-"""The geometry of a virtual patient as another program or a segmentation brings it.
+"""The geometry of a virtual patient after export and import.
 
 The valve is exported (as surfaces, as a folder of SlicerHeart, as label maps) and imported again.
 No reader or writer of this project takes part in the exports: VTK (through PyVista) cuts and writes
@@ -32,11 +32,11 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 
 KINDS = ("vertices", "surfaces", "slicerheart", "labels")
-"""Ways in which a geometry arrives, in the order of tables."""
+"""Ways of exporting a geometry, in the order of tables."""
 
 POSE = Rotation.from_euler("xz", [1.0, 0.4]).as_matrix()
 SHIFT = np.array([31.0, -12.0, 140.0])
-"""From the axes of a simulated valve to LPS mm: so that nothing lies along an axis."""
+"""From the axes of a simulated valve to LPS mm, so that nothing lies along an axis."""
 
 SCENE = "simulated"
 LANDMARKS = {
@@ -46,24 +46,24 @@ LANDMARKS = {
 """Direction (x, y) of SlicerHeart's landmarks from the middle of the template's annulus."""
 
 FINE_MM, MARGIN_MM = 0.2, 6.0
-"""Of the grid on which leaflets are drawn before they are sampled at voxels."""
+"""Spacing and margin of the grid on which leaflets are drawn before they are sampled at voxels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArrivalSettings:
-    """How the geometry of a virtual patient arrives."""
+    """How the geometry of a virtual patient is exported."""
 
-    kind: str  # vertices, surfaces, slicerheart or labels
-    label: str  # what tables call it
-    seen_with_errors: bool = False  # the closed surface has the errors of the patient's case
-    voxel_mm: Length | None = None  # of a label map
-    closed: bool = False  # the closed frame is a label map as well
-    std_mm: Length = 0.6  # of the closed surface, where the case itself does not state it
+    kind: str  #: vertices, surfaces, slicerheart or labels
+    label: str  #: name in tables
+    seen_with_errors: bool = False  #: the closed surface has the errors of the patient's case
+    voxel_mm: Length | None = None  #: of a label map
+    closed: bool = False  #: the closed frame is a label map as well
+    std_mm: Length = 0.6  #: of the closed surface, where the case itself does not state it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrived:
-    """A case, and where its open and closed midsurfaces truly were, in the axes of the case."""
+    """A case, and its true open and closed midsurfaces in the axes of the case."""
 
     case: ValveCase
     opened: Frame
@@ -77,24 +77,12 @@ def arrive(
     arrival: ArrivalSettings,
     folder: Path,
 ) -> Arrived:
-    """What becomes of a virtual patient's geometry on its way.
+    """Export the geometry of a virtual patient's case and import it again.
 
-    Parameters
-    ----------
-    case : ValveCase
-        Of the patient, whose vertices correspond.
-    positions : ndarray
-        ``(n, 3)`` mm, where these truly were in the closed frame.
-    registration : ndarray
-        ``(6,)`` by which they are displaced against the annulus and the tips that the case states.
-    arrival : ArrivalSettings
-    folder : Path
-        Empty; what is exported and imported is left there.
-
-    Raises
-    ------
-    MvestError
-        If the kind is unknown, or the importer refuses what was exported.
+    ``positions (n, 3)`` mm are the true ones of its vertices in the closed frame, ``registration
+    (6,)`` their displacement against the annulus and the tips that the case states. Exported and
+    imported files are left in the folder, which must be empty. MvestError if the kind is unknown,
+    or the importer refuses the export.
     """
     opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
     patient = Arrived(case, opened, replace(closed, vertices=positions))
@@ -120,10 +108,10 @@ def arrive(
 def _through_slicerheart(
     patient: Arrived, frames: tuple[Frame, Frame], arrival: ArrivalSettings, folder: Path
 ) -> ValveCase:
-    """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
+    """Write the files of ValveBatchExport with -vls, -acc and -lc, and the papillary muscles.
 
-    Frames are midsurfaces (LPS mm; tips antero-lateral first); the atrial side of a leaflet lies
-    half its mean thickness from them.
+    Frames are midsurfaces (LPS mm; antero-lateral tip first). The atrial side of a leaflet is half
+    its mean thickness away.
     """
     import pandas as pd
 
@@ -176,10 +164,7 @@ def _through_labels(
 
 
 def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:
-    """A case of an open frame with a closed one added by hand, as midsurface.
-
-    Its chordae are laid out again, by both frames.
-    """
+    """Add a closed midsurface to a case of an open frame; chordae are laid out by both frames."""
     write_case(folder, case)
     document = yaml.safe_load((folder / CASE_FILE).read_text(encoding="utf-8"))
     region = {"region": np.asarray(closed.region)}
@@ -203,7 +188,7 @@ def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) ->
 
 
 def _in_lps(frame: Frame) -> Frame:
-    """A frame in the axes of an image, LPS, the left tip first."""
+    """A frame in LPS, the left tip first."""
     tips = frame.papillary_tips[np.argsort(frame.papillary_tips[:, 0])]
     shapes = {"vertices": frame.vertices, "annulus": frame.annulus, "free_edge": frame.free_edge}
     moved = {name: points @ POSE.T + SHIFT for name, points in shapes.items()}
@@ -212,22 +197,20 @@ def _in_lps(frame: Frame) -> Frame:
 
 # -- exports --------------------------------------------------------------------------------------
 def _in_ras(name: str, axes: str, point: FloatArray) -> dict[str, str]:
-    """R, A, S of a point, as exported tables have them."""
+    """R, A and S of a point, as in exported tables."""
     values = point * (-1, -1, 1)
     return {f"{name}{axis}": f"{value:.2f}" for axis, value in zip(axes, values, strict=True)}
 
 
 def _write_atrial_side(file: Path, frame: Frame, label: int, thickness_mm: float) -> None:
-    """Write one leaflet with triangles of its own, half its thickness nearer to the atrium.
+    """Write one remeshed leaflet, half its thickness nearer to the atrium.
 
-    It is a binary legacy model with the header of 3D Slicer, which names its axes.
+    It is a binary legacy file with the header of 3D Slicer, which names its axes.
     """
     try:
         import pyvista
     except ImportError as error:
-        raise ConfigurationError(
-            "folders of SlicerHeart are written by VTK: pip install mvest[viz]"
-        ) from error
+        raise ConfigurationError("SlicerHeart folders need pip install mvest[viz]") from error
 
     surface = pyvista.PolyData.from_regular_faces
     normals = surface(frame.vertices, frame.triangles).compute_normals(
@@ -255,18 +238,18 @@ def _write_points(file: Path, points: Sequence[FloatArray]) -> None:
 def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_mm: float) -> None:
     """Write thick leaflets (LPS mm) as a NIfTI of labels: 1 anterior, 2 posterior, 0 elsewhere.
 
-    A voxel belongs to the leaflets if more than half of it does, to the larger part of the two.
+    A voxel belongs to the leaflets if more than half of it does, and to the one with more of it.
     """
     import nibabel
 
     drawn, low = drawn_leaflets(frame, thickness_mm)
     shape = [int(np.ceil(n * FINE_MM / voxel_mm)) for n in drawn.shape]
-    # Voxels lie anywhere against the leaflets.
+    # The grid is not aligned with the leaflets.
     start = 0.37 * voxel_mm
     at = np.indices(shape).reshape(3, -1) * voxel_mm / FINE_MM + start / FINE_MM
     share = []
     for label in (1, 2):
-        # The mean over a voxel, as far as a normal distribution of its variance is one.
+        # Approximate mean over a voxel: a normal distribution with the variance of its side.
         blurred = gaussian_filter((drawn == label).astype(np.float32), voxel_mm / FINE_MM / 12**0.5)
         share.append(map_coordinates(blurred, at, order=1).reshape(shape))
     anterior, posterior = share
@@ -282,7 +265,7 @@ def _write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_m
 def drawn_leaflets(
     frame: Frame | LeafletSurface, thickness_mm: FloatArray
 ) -> tuple[NDArray[np.uint8], FloatArray]:
-    """Labels on a fine grid, and where its first point is (LPS mm)."""
+    """Labels on a fine grid, and the position of its first point (LPS mm)."""
     vertices, triangles = frame.vertices, frame.triangles
     corner, normals = vertices[triangles], smooth_vertex_normals(vertices, triangles)
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
@@ -293,7 +276,7 @@ def drawn_leaflets(
     points = np.einsum("ka,tai->tki", weights, corner).reshape(-1, 3)
     along = np.einsum("ka,tai->tki", weights, normals[triangles]).reshape(-1, 3)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    # Points are drawn as cells of the fine grid, half of one beyond where they are.
+    # Points are drawn as cells of the fine grid, which reach half a cell beyond them.
     reach = np.einsum("ka,ta->tk", weights, thickness_mm[triangles]).ravel() - FINE_MM
     leaflet = np.repeat(frame.region + 1, len(weights)).astype(np.uint8)
     low = vertices.min(axis=0) - MARGIN_MM

@@ -1,4 +1,4 @@
-"""A virtual patient who is to be imaged: a valve in motion, and what its images do not state.
+"""A virtual patient for imaging: a valve in motion, and the truth that its images do not state.
 
 Open, closed and held frames are those of a virtual patient
 (:mod:`mvest.simulation.virtual_patient`): closed on a fine mesh, in exact equilibrium under the
@@ -31,45 +31,31 @@ IMAGED = PatientSimulation(
     held_relaxation=(0.15, 0.3),
     held_tips=(0.0, 0.0, 0.0),
 )
-"""How these patients are closed. Its settings of what is seen are not used."""
+"""How these patients are closed. The settings of the observation are not used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoSettings:
-    """How a virtual patient who is to be imaged moves, and how the volume is simulated."""
+    """How a virtual patient for imaging moves, and how the volume is simulated."""
 
-    spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
-    tip_motion_mm: tuple[Length, Length] = (1.0, 3.0)  # of papillary tips
+    spread: str = "training"  #: of acquisitions; shifted: outside the training of the detectors
+    tip_motion_mm: tuple[Length, Length] = (1.0, 3.0)  #: of papillary tips
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagedPatient:
-    """A virtual patient in motion.
+    """A virtual patient in motion."""
 
-    Attributes
-    ----------
-    valve : MovingValve
-        Its positions are true: the open frame, those of closing, the closed one, those held.
-    closed : int
-        Number of the closed frame.
-    pressure_mmHg : float
-        Stated of the closed frame.
-    stated : Valve
-        In the layout, with the chordae as they would be stated.
-    values : mapping
-        Parameter -> true value, as in `VirtualPatient`.
-    """
-
-    valve: MovingValve
-    closed: int
-    pressure_mmHg: float
-    stated: Valve
-    values: Mapping[str, float]
+    valve: MovingValve  #: true, in the open frame, those of closing, the closed one, and those held
+    closed: int  #: number of the closed frame
+    pressure_mmHg: float  #: stated of the closed frame
+    stated: Valve  #: in the layout, with the chordae as they would be stated
+    values: Mapping[str, float]  #: parameter -> true value, as in `VirtualPatient`
 
     def chord_ratios(self) -> dict[str, FloatArray]:
         """Family -> true rest lengths of its chordae over the distance of their ends, closed.
 
-        A layout by a closed frame that was seen needs it (`mvest.cases.tissue`).
+        `mvest.cases.tissue` lays chordae out by these ratios.
         """
         surface, chordae = self.stated.surface, self.stated.chordae
         place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
@@ -87,22 +73,10 @@ def simulate_imaged_patient(
 ) -> ImagedPatient:
     """Close a valve as a patient's.
 
-    Parameters
-    ----------
-    drawn : DrawnValve
-        With the values of :func:`mvest.simulation.virtual_patient.draw_patient_values`; their
-        displacement is not used.
-    simulation : PatientSimulation
-        Of the open, closed and held frames.
-    settings : MotionSettings
-        Layout, duration and limits; mesh and number of the frames of closing.
-
-    Raises
-    ------
-    GeometryError
-        If the valve does not close, or not as a valve does.
-    InputError
-        If its mechanics do not end in an equilibrium.
+    The displacement in its values (`draw_patient_values`) is not used. ``simulation`` applies to
+    the open, closed and held frames; ``settings`` give layout, duration, limits, and mesh and
+    number of the frames of closing. GeometryError if the valve does not close, or not as a valve
+    does; InputError if its mechanics do not end in an equilibrium.
     """
     values = {name: value for name, value in drawn.values.items() if name not in REGISTRATION}
     drawn, protocol = replace(drawn, values=values), drawn.mechanics.protocol
@@ -110,7 +84,7 @@ def simulate_imaged_patient(
         raise InputError(
             "mechanics protocol equilibrium = False, expected True for a patient who is imaged"
         )
-    # The coarse closure first: it is soon refused.
+    # The coarse closure comes first: it is refused soonest.
     closing, tips, _ = closing_frames(drawn, settings)
     seen = drawn.sampled(settings.columns, settings.rows)
     later = close_patient(drawn, seen, simulation)

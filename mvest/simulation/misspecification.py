@@ -1,9 +1,9 @@
-"""Misspecifications: how a simulated valve, and how it is seen, differ from what its case states.
+"""Misspecifications: how a simulated valve, and its observation, differ from what its case states.
 
 An estimator believes its case, and models the rest. A misspecification breaks one of these beliefs,
 so that estimates are judged where the estimator's assumptions do not hold. Its draws come from a
-random stream beside that of the patient. So a seed stands for the same valve with the same errors
-under all of them, apart from what the misspecification adds.
+random stream separate from the patient's. So a seed gives the same valve with the same errors under
+all of them, apart from what the misspecification adds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KERNELS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "exponential": lambda ratio: np.exp(-ratio),
     "gaussian": lambda ratio: np.exp(-0.5 * ratio**2),
 }
-"""Correlation by distance over length, beside that of `SpatialCorrelation`."""
+"""Correlation as a function of distance over length, in addition to `SpatialCorrelation`."""
 
 ANNULUS_LENGTH_MM = 20.0
 """Correlation length of errors of the annulus."""
@@ -39,52 +39,36 @@ ANNULUS_LENGTH_MM = 20.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misspecification:
-    """What differs from what a case states and an estimator assumes; by default nothing.
+    """Differences from what a case states and an estimator assumes; by default none.
 
     Attributes
     ----------
     kernel : str
-        Of the smooth errors: ``matern`` (of smoothness 3/2, as assumed), ``exponential`` (which is
-        rougher) or ``gaussian`` (which is smoother).
-    length_factor : float
-        On their stated correlation length.
-    annulus_mm, tips_mm : float
-        Standard deviation of each coordinate of two errors: a smooth one of the closed annulus, and
-        one of the papillary tips that is the same in all frames.
-    pressure_off, thickness_off : float
-        Relative error, up or down at random.
-    missing : float
-        Share of the closed leaflets that was not seen, a patch about a random vertex. It is filled
-        in as smoothly as can be.
-    outliers : float
-        Share of the vertices of the closed leaflets that are seen somewhere else.
-    outlier_mm : float
-        Standard deviation of each coordinate of these errors.
+        Of the smooth errors: ``matern`` (of smoothness 3/2, as assumed), ``exponential`` (rougher)
+        or ``gaussian`` (smoother).
     exponential : mapping
-        Region -> tissue of the exponential law that takes the place of the linear one, its stresses
-        scaled to that one's (see `MechanicsSettings`); empty: the linear law.
-    prestretch : float
-        How many times as long in their plane open leaflets are as they would be free of stress.
+        Region -> tissue of the exponential law that replaces the linear one, its stresses scaled to
+        that one's (see `mechanics`); empty: the linear law.
     leaflet_scale : float
-        Share by which one leaflet, drawn at random, is seen too long in the open frame, from its
-        annulus on.
-    frame_scale : float
-        Share by which the annulus and both leaflets are seen too large in the open frame.
+        Relative error of one leaflet's length from the annulus in the open frame, too long. The
+        leaflet is drawn at random.
     """
 
     kernel: str = "matern"
-    length_factor: Factor = 1.0
-    annulus_mm: Length = 0.0
-    tips_mm: Length = 0.0
-    pressure_off: Share = 0.0
-    thickness_off: Share = 0.0
-    missing: Share = 0.0
-    outliers: Share = 0.0
-    outlier_mm: Length = 4.0
+    length_factor: Factor = 1.0  #: on the stated correlation length of the smooth errors
+    annulus_mm: Length = 0.0  #: SD of each coordinate of a smooth error of the closed annulus
+    tips_mm: Length = 0.0  #: SD of each coordinate of the tips' error, the same in all frames
+    pressure_off: Share = 0.0  #: relative error, up or down at random
+    thickness_off: Share = 0.0  #: the same of the thickness
+    missing: Share = (
+        0.0  # share of the closed leaflets not seen, a patch that is filled in smoothly
+    )
+    outliers: Share = 0.0  #: share of the vertices of the closed leaflets that are outliers
+    outlier_mm: Length = 4.0  #: SD of each coordinate of their errors
     exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
-    prestretch: Stretch = 1.0
+    prestretch: Stretch = 1.0  #: length of open leaflets in their plane over that free of stress
     leaflet_scale: Share = 0.0
-    frame_scale: Share = 0.0
+    frame_scale: Share = 0.0  #: relative error of the size of the open frame, too large
 
     def __post_init__(self) -> None:
         if self.kernel not in ("matern", *KERNELS):
@@ -119,13 +103,9 @@ class Misspecification:
     ) -> MechanicsSettings:
         """True mechanics of a valve of moduli ``E_f.REGION``, MPa.
 
-        All stresses of an exponential tissue are scaled so that where leaflets are stretched as
-        closed ones are, those along and across its fibres have the mean of the linear tissue's.
-
-        Raises
-        ------
-        InputError
-            If a region has no exponential tissue.
+        All stresses of an exponential tissue are scaled by one factor: at the stretches of closed
+        leaflets, the mean of those along and across its fibres is the linear tissue's. InputError
+        if a region has no exponential tissue.
         """
         tissue = dict(mechanics.tissue)
         if self.prestretch != 1.0:
@@ -142,20 +122,14 @@ class Misspecification:
         return mechanics if tissue == mechanics.tissue else replace(mechanics, tissue=tissue)
 
     def noise(self, std: float, points: FloatArray, length: float) -> ObservationError:
-        """Smooth errors of standard deviation ``std`` mm, of the stated correlation length.
+        """Smooth errors of standard deviation ``std`` mm, of the stated correlation length (mm).
 
-        Parameters
-        ----------
-        std : float
-        points : (n, 3) mm
-            Vertices at rest.
-        length : float
-            mm.
+        ``points (n, 3)`` mm are the vertices at rest.
         """
         length *= self.length_factor
         if self.kernel == "matern":
             return CorrelatedNoise(std, SpatialCorrelation(points, length))
-        # Such a correlation may be all but singular: its symmetric factor.
+        # Such a correlation may be nearly singular, so its symmetric factor is used.
         w, V = np.linalg.eigh(KERNELS[self.kernel](cdist(points, points) / length))
         factor = (V * np.sqrt(np.maximum(w, 0.0))) @ V.T
 
@@ -166,16 +140,11 @@ class Misspecification:
         return smooth
 
     def open_moves(self, valve: Valve, rng: np.random.Generator) -> FloatArray:
-        """Displacements ``(n, 3)`` mm of the open leaflets as seen, by the errors of their size.
+        """Errors ``(n, 3)`` mm of the open leaflets in size.
 
-        A leaflet grows away from its annulus, which stays. Within 20 degrees of a commissure its
-        error fades into the other leaflet. The whole frame grows from the centre of its annulus.
-
-        Parameters
-        ----------
-        valve : Valve
-            Sampled from a template (see `band_grid`).
-        rng : numpy.random.Generator
+        A leaflet grows away from its annulus, which does not move. Within 20 degrees of a
+        commissure its error fades into the other leaflet. The whole frame grows from the centre of
+        its annulus. The valve must be sampled from a template (see `band_grid`).
         """
         x = valve.surface.vertices
         annulus = x[valve.annulus]
@@ -191,7 +160,7 @@ class Misspecification:
     def boundary(
         self, annulus: FloatArray, tips: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """Displacements ``(k, 3)`` of the closed annulus and ``(t, 3)`` mm of the tips as seen."""
+        """Errors ``(k, 3)`` of the closed annulus and ``(t, 3)`` mm of the tips."""
         smooth = SpatialCorrelation(annulus, ANNULUS_LENGTH_MM).factor
         return (
             self.annulus_mm * (smooth @ rng.standard_normal(annulus.shape)),
@@ -201,7 +170,7 @@ class Misspecification:
     def seen(
         self, vertices: FloatArray, surface: LeafletSurface, rng: np.random.Generator
     ) -> FloatArray:
-        """Vertices ``(n, 3)`` mm of the closed leaflets as they are stated, from those seen."""
+        """Vertices ``(n, 3)`` mm of the closed leaflets with outliers and a filled-in patch."""
         vertices = np.array(vertices)
         if self.outliers:
             count = round(self.outliers * len(vertices))
@@ -217,7 +186,7 @@ class Misspecification:
 
 
 def _off(share: float, rng: np.random.Generator) -> float:
-    """A factor, or its inverse."""
+    """A factor 1 + share, or its inverse."""
     return float((1.0 + share) ** rng.choice([-1.0, 1.0]))
 
 

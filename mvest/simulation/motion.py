@@ -1,12 +1,11 @@
 """One simulated valve over a systole: closed step by step, then held under falling pressure.
 
-Motions are refused that would teach what no valve does.
-
 The closure is that of :mod:`mvest.closure.model` on a coarse mesh, with the steps of the pressure's
-rise as frames. A valve snaps shut within a small share of this rise, so that frames are chosen
-evenly along the way of the free edge and shown evenly over time: they look like a systole, but not
-as fast as a valve closes. After the closed frame, the valve is held at lower pressures
-while annulus and papillary tips return part of their way, each in equilibrium.
+rise as frames. A valve snaps shut within a small share of this rise. So frames are chosen evenly
+along the path of the free edge and shown evenly over time: they look like a systole, but slower
+than a real closure. After the closed frame, the valve is held at lower pressures while annulus and
+papillary tips return part of their way, each in equilibrium. Motions that no valve shows are
+refused, so that no detector learns from them.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class RefusedError(GeometryError):
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """What is refused. The values are choices.
+    """Motions beyond these limits are refused. The values are choices.
 
     Attributes
     ----------
@@ -62,9 +61,8 @@ class MotionLimits:
         Share of the open valve's orifice that midsurfaces may leave open in the closed one. A
         closed valve leaves some 5 %, as midsurfaces keep a thickness apart; a tethered one more.
     edge_gap : float
-        mm between the free edges of the closed valve, the median over its middle half. Where a
-        leaflet has closed first and holds the other one below it, they stay some 9 mm apart;
-        otherwise 1 to 5 mm.
+        mm between the free edges of the closed valve, the median over its middle half. If a leaflet
+        closed first and holds the other one below it, the gap is some 9 mm; otherwise 1 to 5 mm.
     edge_height : float
         mm by which the free edge of the closed valve may rise above its annulus plane.
     stretch : float
@@ -82,35 +80,25 @@ class MotionLimits:
 
 
 def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
-    """Refuse a valve beyond its limits.
+    """Raise RefusedError if a valve is beyond its limits.
 
-    Parameters
-    ----------
-    valve : MovingValve
-        Its first frame is the open one.
-    closed : int
-        Number of the closed frame.
-    limits : MotionLimits
-
-    Raises
-    ------
-    RefusedError
+    Its first frame is the open one, ``closed`` the number of the closed one.
     """
-    layout, name = valve.layout, valve.name
+    layout = valve.layout
     edges = surface_edges(layout.triangles)
     lengths = np.linalg.norm(
         valve.vertices[:, edges[:, 0]] - valve.vertices[:, edges[:, 1]], axis=2
     )
     stretch = float(np.quantile(lengths[1:] / lengths[0], 0.99, axis=1).max())
     if stretch > limits.stretch:
-        raise RefusedError(name, f"a leaflet is stretched to {stretch:.2f} times its length")
+        raise RefusedError(valve.name, f"a leaflet is stretched to {stretch:.2f} times its length")
     for k, vertices in enumerate(valve.vertices):
         crossings = len(intersecting_triangles(vertices, layout.triangles))
         if crossings > limits.crossings:
             raise RefusedError(
-                name, f"{crossings} pairs of triangles pass through each other in frame {k}"
+                valve.name, f"{crossings} pairs of triangles pass through each other in frame {k}"
             )
-    areas, plane = [], None
+    areas = []
     for frame in (0, closed):
         vertices = valve.vertices[frame]
         annulus = vertices[layout.annulus]
@@ -118,65 +106,42 @@ def check_motion(valve: MovingValve, closed: int, limits: MotionLimits) -> None:
         areas.append(orifice_area(vertices, layout.triangles, annulus, plane, 0.3))
     if areas[1] > limits.orifice * areas[0]:
         raise RefusedError(
-            name, f"closed it leaves {areas[1]:.0f} of {areas[0]:.0f} mm2 of its orifice open"
+            valve.name, f"closed it leaves {areas[1]:.0f} of {areas[0]:.0f} mm2 of its orifice open"
         )
     edge = valve.vertices[closed][layout.free_edge]
     middle = np.arange(layout.columns // 8, 3 * layout.columns // 8 + 1)
     gap = float(np.median(np.linalg.norm(edge[middle] - edge[-middle], axis=1)))
     if gap > limits.edge_gap:
-        raise RefusedError(name, f"the free edges of the closed valve lie {gap:.1f} mm apart")
-    assert plane is not None
+        raise RefusedError(valve.name, f"the free edges of the closed valve lie {gap:.1f} mm apart")
     height = -float(plane.coordinates(edge)[:, 2].min())
     if height > limits.edge_height:
-        raise RefusedError(name, f"its closed free edge lies {height:.1f} mm above the annulus")
+        raise RefusedError(
+            valve.name, f"its closed free edge lies {height:.1f} mm above the annulus"
+        )
 
 
 GIVE_UP: dict[str, Any] = {"max_iterations": 40, "max_halvings": 3, "largest_move": 2.0}
-"""Newton's method gives a step up sooner than elsewhere: another valve is drawn in less time than
-it takes to follow one whose leaflets have run away."""
+"""Newton's method gives up a step sooner than elsewhere, because drawing another valve takes less
+time than following one whose leaflets have run away."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
-    """How a valve's motion is simulated and shown.
+    """How a valve's motion is simulated and shown."""
 
-    Attributes
-    ----------
-    columns, rows : int
-        Of the layout in which it is returned.
-    element : str
-    mesh_columns, mesh_rows : int
-        Cells of the mesh that is closed.
-    contact_columns, contact_rows : int
-        Points at which contact is sampled.
-    steps : int
-        Time steps over the ramp of the pressure.
-    tolerance : float
-        Of Newton's method, relative.
-    frames : int
-        From the open to the closed one, both included; at most ``steps + 2``.
-    held_pressure : tuple of float
-        Shares of the closed frame's pressure in the frames after it.
-    held_relaxation : tuple of float
-        Share of its way back to the open shape that the annulus has gone in each; the tips too.
-    duration : float
-        s from the first to the last frame.
-    limits : MotionLimits
-    """
-
-    columns: PointsAround = 64
+    columns: PointsAround = 64  #: vertices of the returned layout
     rows: PointsAlong = 15
     element: str = "hex18"
-    mesh_columns: CellsAround = 24
+    mesh_columns: CellsAround = 24  #: cells of the mesh that is closed
     mesh_rows: CellsAlong = 3
-    contact_columns: PointsAround = 72
+    contact_columns: PointsAround = 72  #: points at which contact is sampled
     contact_rows: PointsAlong = 16
-    steps: Count = 24
-    tolerance: Tolerance = 1e-2
-    frames: Count = 8
-    held_pressure: tuple[Share, ...] = (0.8, 0.55, 0.35)
-    held_relaxation: tuple[Share, ...] = (0.15, 0.35, 0.55)
-    duration: BeatTime = 0.35
+    steps: Count = 24  #: time steps over the ramp of the pressure
+    tolerance: Tolerance = 1e-2  #: of Newton's method, relative
+    frames: Count = 8  #: from the open to the closed one, both included; at most steps + 2
+    held_pressure: tuple[Share, ...] = (0.8, 0.55, 0.35)  #: of the closed frame's, in later frames
+    held_relaxation: tuple[Share, ...] = (0.15, 0.35, 0.55)  #: share of the way back
+    duration: BeatTime = 0.35  #: s from the first to the last frame
     limits: MotionLimits = field(default_factory=MotionLimits)
 
     def __post_init__(self) -> None:
@@ -194,25 +159,15 @@ class MotionSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnValve:
-    """A valve that is to be closed.
-
-    Attributes
-    ----------
-    name : str
-    template : Template
-    values : mapping
-        Parameter -> true value: the moduli ``E_f.REGION`` in MPa, and any of the factors
-        ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
-    mechanics : MechanicsSettings
-        Its pressure is the stated one.
-    tip_motion : (2, 3) mm
-        Where the papillary tips are in the open valve relative to the closed one.
-    """
+    """A valve before it is closed."""
 
     name: str
     template: Template
+    #: Parameter -> true value: the moduli ``E_f.REGION`` in MPa, and any of the factors
+    #: ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
     values: Mapping[str, float]
-    mechanics: MechanicsSettings
+    mechanics: MechanicsSettings  #: with the stated pressure
+    #: (2, 3) mm, displacement of the papillary tips from the closed to the open valve.
     tip_motion: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
 
     def __post_init__(self) -> None:
@@ -233,12 +188,8 @@ class DrawnValve:
 def close_in_motion(drawn: DrawnValve, settings: MotionSettings) -> MovingValve:
     """Close a valve on a coarse mesh, hold it, and return its frames.
 
-    Raises
-    ------
-    RefusedError
-        If the valve does not close, or not as a valve does (see :class:`MotionLimits`).
-    InputError, MaterialError
-        If a value is inadmissible.
+    Raises RefusedError if it does not close, or beyond its `MotionLimits`; InputError or
+    MaterialError if a value is inadmissible.
     """
     closing, tips, model = closing_frames(drawn, settings)
     pressure = drawn.mechanics.protocol.pressure_mmHg
@@ -259,9 +210,9 @@ def close_in_motion(drawn: DrawnValve, settings: MotionSettings) -> MovingValve:
 def closing_frames(
     drawn: DrawnValve, settings: MotionSettings
 ) -> tuple[list[FloatArray], list[FloatArray], ClosureModel]:
-    """The frames of a valve up to the closed one, which are not checked.
+    """The frames of a valve up to the closed one, without checks.
 
-    Of the mechanics' protocol, pressure and ramp count; the steps are those of ``settings``.
+    Pressure and ramp are those of the mechanics' protocol, the steps those of ``settings``.
 
     Returns
     -------
@@ -274,19 +225,14 @@ def closing_frames(
     Raises
     ------
     RefusedError
-        If the valve does not close.
+        The valve does not close.
     """
     mesh = structured_mesh(
         drawn.template, settings.element, settings.mesh_columns, settings.mesh_rows
     )
-    mechanics = drawn.mechanics
-    ramp = mechanics.protocol.ramp
+    mechanics, ramp = drawn.mechanics, drawn.mechanics.protocol.ramp
     protocol = replace(
-        mechanics.protocol,
-        dt=ramp / settings.steps,
-        growth=3.0,
-        end=1.4 * ramp,
-        equilibrium=True,
+        mechanics.protocol, dt=ramp / settings.steps, growth=3.0, end=1.4 * ramp, equilibrium=True
     )
     newton = replace(mechanics.newton, tolerance=settings.tolerance, **GIVE_UP)
     seen = drawn.sampled(settings.columns, settings.rows)
@@ -318,14 +264,9 @@ def held_states(
 ) -> list[HeldState]:
     """The states of a valve that returns part of its way from the closed to the open shape.
 
-    Parameters
-    ----------
-    valve : Valve
-        The states have its annulus.
-    pressures_mmHg, relaxations : iterable of float
-        Of each state: its pressure, and the share of the way that annulus and tips have gone back.
-    lift : (float, float, float)
-        mm, further displacement of the tips per unit of relaxation.
+    Each has a pressure, and the share of the way (relaxation) that annulus and tips have gone back.
+    The states have the valve's annulus. ``lift`` is a further displacement of the tips (mm) per
+    unit of relaxation.
     """
     annulus, tips = valve.motion.annulus, valve.motion.papillary_tips
     return [
@@ -347,12 +288,8 @@ def moving_valve(
 ) -> MovingValve:
     """A valve in two or more frames, ``vertices (n, 3)`` and ``tips (2, 3)`` mm.
 
-    ``closed`` is the number of the closed frame, the first one is open.
-
-    Raises
-    ------
-    RefusedError
-        If it is beyond the limits of the settings.
+    The first frame is open, ``closed`` the number of the closed one. Raises RefusedError if the
+    valve is beyond the limits of the settings.
     """
     layout, count = ValveLayout(settings.columns, settings.rows), len(vertices)
     phi, s, _, tip = drawn.template.chord_places()
@@ -372,22 +309,17 @@ def moving_valve(
 
 
 def frames_along(points: FloatArray, count: int) -> IntArray:
-    """Choose ``count`` frames, the first and the last among them, evenly along a way.
+    """Choose ``count`` frames (2 to f), the first and the last among them, evenly along a path.
 
-    Parameters
-    ----------
-    points : (f, k, 3) mm
-        What goes the way; it is as long as its points' mean displacements.
-    count : int
-        2 to f.
+    The length of the path of ``points (f, k, 3)`` mm is that of their mean displacements.
     """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    total, last = len(way), 0
+    path = np.concatenate([[0.0], np.cumsum(steps)])
+    total, last = len(path), 0
     chosen = [0]
     for k in range(1, count - 1):
         # No frame twice, and enough of them left.
         allowed = np.arange(last + 1, total - (count - 1 - k))
-        last = int(allowed[np.argmin(np.abs(way[allowed] - way[-1] * k / (count - 1)))])
+        last = int(allowed[np.argmin(np.abs(path[allowed] - path[-1] * k / (count - 1)))])
         chosen.append(last)
     return np.array([*chosen, total - 1], dtype=np.int64)

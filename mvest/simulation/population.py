@@ -1,7 +1,7 @@
 """Populations of simulated valves in motion: anatomies, moduli, pressures and timing drawn.
 
-Every valve has a random stream of its own, spawned from the seed, so that it does not depend on
-how many processes work or on how often another valve was drawn again.
+Every valve has its own random stream, spawned from the seed. So it does not depend on the number of
+processes or on how often another valve was drawn again.
 
 A population is stored in one ``.npz`` file without pickled objects.
 """
@@ -31,39 +31,23 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
 
 MAX_DRAWS = 20
-"""Valves drawn in a row until one closes."""
+"""Largest number of valves drawn until one closes."""
 
 
 @dataclass(frozen=True, slots=True)
 class PopulationSettings:
-    """What is drawn. Spreads are standard deviations of logarithms.
+    """What is drawn. Spreads are standard deviations of logarithms."""
 
-    Attributes
-    ----------
-    motion : MotionSettings
-        ``duration`` is the median one.
-    scale : (float, float)
-        Range of the factor on the anatomical variation (:mod:`mvest.valve.anatomy.variation`).
-    moduli : mapping
-        Parameter -> median in MPa, the paper's for a normal valve.
-    moduli_spread : float
-    pressure_spread : float
-    chord_rest_length_spread : float
-    duration_spread : float
-    tip_motion : (float, float)
-        mm, range of the distance that each papillary tip goes during closure.
-    """
-
-    motion: MotionSettings = field(default_factory=MotionSettings)
-    scale: tuple[Factor, Factor] = (1.0, 1.5)
-    moduli: Mapping[str, Modulus] = field(
+    motion: MotionSettings = field(default_factory=MotionSettings)  #: with the median duration
+    scale: tuple[Factor, Factor] = (1.0, 1.5)  #: range of the factor on the anatomical variation
+    moduli: Mapping[str, Modulus] = field(  #: medians in MPa, the paper's for a normal valve
         default_factory=lambda: {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
     )
     moduli_spread: Logarithm = 0.35
     pressure_spread: Logarithm = 0.12
     chord_rest_length_spread: Logarithm = 0.015
     duration_spread: Logarithm = 0.15
-    tip_motion: tuple[Length, Length] = (1.0, 3.0)
+    tip_motion: tuple[Length, Length] = (1.0, 3.0)  #: mm, range of each tip's way during closure
 
     def __post_init__(self) -> None:
         for name in ("scale", "tip_motion"):
@@ -81,22 +65,11 @@ def draw_population(
     *,
     processes: int = 1,
 ) -> Iterator[MovingValve]:
-    """Draw and close valves, one after another in their order.
+    """Draw and close valves, returned in their order.
 
-    Parameters
-    ----------
-    count, seed : int
-    bases : mapping
-        Name -> median anatomy; they take turns, in a random order.
-    settings : PopulationSettings
-    mechanics : MechanicsSettings
-    processes : int
-        1 computes here, without further processes.
-
-    Raises
-    ------
-    InputError
-        If no valve is requested or no anatomy given, or a valve is refused 20 times in a row.
+    The median anatomies (``bases``, by name) are used equally often, in a random order. A single
+    process is this one. InputError if no valve is requested or no anatomy given, GeometryError if a
+    valve is refused `MAX_DRAWS` times.
     """
     if count < 1 or processes < 1 or not bases:
         raise InputError(
@@ -136,10 +109,9 @@ def _draw(
         }
         motion = replace(settings.motion, duration=values.pop("duration"))
         tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
+        drawn = DrawnValve(name, template, values, mechanics, tip_motion)
         try:
-            return close_in_motion(
-                DrawnValve(name, template, values, mechanics, tip_motion), motion
-            )
+            return close_in_motion(drawn, motion)
         except RefusedError as error:
             reasons.append(str(error))
     raise GeometryError(f"simulated valve {name}: refused {MAX_DRAWS} times: {'; '.join(reasons)}")
@@ -148,16 +120,10 @@ def _draw(
 def draw_tip_motion(
     template: Template, reach: tuple[float, float], rng: np.random.Generator
 ) -> FloatArray:
-    """Where open tips are relative to closed ones ``(2, 3)`` mm: nearer to their insertions.
+    """Displacement of open from closed tips ``(2, 3)`` mm, towards their chordae's insertions.
 
-    Farther away, chordae would be taut in the open valve, which is to be free of stress.
-
-    Parameters
-    ----------
-    template : Template
-    reach : (float, float)
-        mm, range of the distance.
-    rng : numpy.random.Generator
+    Farther away, chordae would be taut in the open valve, which must be free of stress. ``reach``
+    is the range of the distance, mm.
     """
     direction = rng.standard_normal((2, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -173,16 +139,13 @@ SHAPES: dict[str, tuple[str, tuple[int | None, ...]]] = {
     "tips": ("f", (None, 2, 3)), "thickness": ("f", (None,)), "chord_phi": ("f", (None,)),
     "chord_s": ("f", (None,)), "chord_tip": ("i", (None,)),
 }  # fmt: skip
-"""Array of a valve -> its kind (integers or numbers) and shape."""
+"""Array of a valve -> its kind (integer or float) and shape."""
 
 
 def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
-    """Write a population, whole or not at all, positions and times in single precision.
+    """Write a population atomically, positions and times in single precision.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
+    InputError if the file cannot be written.
     """
     arrays: dict[str, Any] = {"names": np.array([valve.name for valve in valves])}
     for k, valve in enumerate(valves):
@@ -194,13 +157,7 @@ def save_population(path: Path, valves: Sequence[MovingValve]) -> None:
 
 
 def load_population(path: Path) -> tuple[MovingValve, ...]:
-    """Read what :func:`save_population` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, or anything in it is not as it must be.
-    """
+    """Read what :func:`save_population` wrote; InputError if it is missing or malformed."""
     stored = read_npz(path)
     valves: list[MovingValve] = []
     try:
@@ -211,8 +168,7 @@ def load_population(path: Path) -> tuple[MovingValve, ...]:
             }
             own["layout"] = ValveLayout(*own["layout"].tolist())
             valves.append(MovingValve(name, **own))
-    except KeyError as error:
-        raise InputError(f"{path}: {error} is missing") from error
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    except (KeyError, InputError) as error:
+        missing = " is missing" if isinstance(error, KeyError) else ""
+        raise InputError(f"{path}: {error}{missing}") from error
     return tuple(valves)

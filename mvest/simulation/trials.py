@@ -1,9 +1,8 @@
-"""Trials of detectors: volumes of valves that no training saw are simulated and searched."""
+"""Trials of detectors on simulated volumes of valves that are not in the training."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,7 +15,7 @@ from mvest.cases.from_images.measures import OPEN_SHARE
 from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
-from mvest.imaging.detection.pose import pose_of
+from mvest.imaging.detection.pose import Poses, pose_of
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
@@ -29,18 +28,17 @@ from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
 from mvest.valve.measure.coaptation import orifice_area
 
-Row = Mapping[str, Any]
 Shape = tuple[FloatArray, FloatArray]
 """Vertices ``(n, 3)`` and papillary tips ``(2, 3)`` of a valve, mm."""
 
 ABSENT_DB = -80.0
-"""Echo of what is absent: far below the noise."""
+"""Echo of absent tissue, far below the noise."""
 
 VALVE = ("leaflet_db", "annulus_db", "chord_db")
 REST = ("wall_db", "vessel_db", "papillary_db")
 
 WITHOUT_VALVE = {"walls only": VALVE, "no tissue": (*VALVE, *REST), "white noise": ()}
-"""Kinds of volumes without a valve -> what sends no echo. White noise is not simulated at all."""
+"""Kinds of volumes without a valve -> tissue without echo. White noise is not simulated."""
 
 VOLUMES = ("in distribution", "shifted")
 """Kinds of volumes of one frame of a valve: within and outside the ranges of the training."""
@@ -61,13 +59,13 @@ class Trial:
     Attributes
     ----------
     kind : str
-        One of :data:`VOLUMES`, :data:`WITHOUT_VALVE` or :data:`SEQUENCES`.
+        One of :data:`KINDS`.
     number : int
         Among those of its kind.
     seed : int
         Of the study.
     acquisition : Acquisition
-        About which its own is drawn.
+        Acquisitions are drawn about it.
     closed : int
         Number of the closed frame of its valve; the first one is open.
     """
@@ -80,7 +78,7 @@ class Trial:
 
     @property
     def spread(self) -> Setting:
-        """Whether its acquisition is drawn as in training, or in part or wholly outside."""
+        """Whether its acquisition is drawn as in training, or partly or completely outside."""
         if self.kind.startswith("wide"):
             return "wide"
         return "shifted" if self.kind.startswith("shifted") else "training"
@@ -99,16 +97,12 @@ def _model(path: str) -> DetectionModel:
 def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:
     """Simulate one frame and search it.
 
-    Returns
-    -------
-    dict
-        ``row``: JSON text with kind, number, valve, frame and confidence. Where there is a valve,
-        also the errors of `_errors`, with sign.
+    Returns ``row``, JSON text with kind, number, valve, frame and confidence. For a volume of a
+    valve it has also the errors of `_errors`, with sign.
     """
     choose, render = trial.random.spawn(2)
     frame = int(np.random.default_rng(choose).integers(len(valve.times)))
-    has_valve = trial.kind not in WITHOUT_VALVE
-    base = trial.acquisition
+    base, has_valve = trial.acquisition, trial.kind not in WITHOUT_VALVE
     if not has_valve:
         nothing = dict.fromkeys(WITHOUT_VALVE[trial.kind], ABSENT_DB)
         base = replace(base, **nothing, shadow_db_per_cm=0.0)  # type: ignore[arg-type]
@@ -133,16 +127,16 @@ def try_volume(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, 
 def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str, Any]:
     """Simulate all frames of a valve as one volume and search it.
 
-    However low its confidence, what is found counts as the valve.
+    The detected valve counts however low its confidence is.
 
     Returns
     -------
     dict
-        ``row``: JSON text like that of `try_volume`, with means over the frames of errors without
-        sign; ``confidence`` is that of the best frame. In mm, found minus
-        true in the valve's own axes, ``errors`` (2, n, 3) and ``tip_errors`` (2, 2, 3) of the open
-        and the closed frame; ``shapes`` and ``tip_shapes``, where the valve was found, in its found
-        axes; ``rest`` (n, 3), the true open vertices.
+        ``row``: JSON text like that of `try_volume`, with means of the absolute errors over the
+        frames; ``confidence`` is that of the best frame. ``errors`` (2, n, 3) and ``tip_errors``
+        (2, 2, 3), detected minus true in the valve's own axes, mm, in the open and the closed
+        frame. ``shapes`` and ``tip_shapes``: the detected valve in its detected axes. ``rest``
+        (n, 3): the true open vertices.
     """
     draw, scan = trial.random.spawn(2)
     rng = np.random.default_rng(draw)
@@ -155,6 +149,10 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
     shapes = (list(zip(one.vertices, one.tips, strict=True)) for one in (found, true))
     frames = [_errors(a, b, layout) for a, b in zip(*shapes, strict=True)]
     two = [0, trial.closed]
+    sizes: dict[str, float | None] = {}
+    for name in frames[0]:
+        known = [abs(value) for one in frames if (value := one[name]) is not None]
+        sizes[name] = float(np.mean(known)) if known else None
     row = {
         "kind": trial.kind,
         "number": trial.number,
@@ -162,41 +160,31 @@ def try_sequence(valve: MovingValve, trial: Trial, model_file: Path) -> dict[str
         "frames": len(frames),
         "confidence": float(found.frame_confidence.max()),
         "median_confidence": float(np.median(found.frame_confidence)),
-        **{name: _mean_size(frames, name) for name in frames[0]},
+        **sizes,
         "surface_open": frames[0]["surface"],
         "surface_closed": frames[trial.closed]["surface"],
     }
-    axes = [pose_of(true.vertices[k], true.tips[k], layout) for k in two]
-    turn = np.concatenate([pose.rotation for pose in axes])
-    own = [pose_of(found.vertices[k], found.tips[k], layout) for k in two]
-    centre = np.stack([pose.centre for pose in own])
-    found_turn = np.concatenate([pose.rotation for pose in own])
+    own, right = (
+        Poses.joined([pose_of(one.vertices[k], one.tips[k], layout) for k in two])
+        for one in (found, true)
+    )
     return {
         "row": json.dumps(row),
-        "errors": (found.vertices[two] - true.vertices[two]) @ turn,
-        "tip_errors": (found.tips[two] - true.tips[two]) @ turn,
-        "shapes": (found.vertices[two] - centre) @ found_turn,
-        "tip_shapes": (found.tips[two] - centre) @ found_turn,
-        "rest": (true.vertices[0] - axes[0].centre[0]) @ turn[0],
+        "errors": (found.vertices[two] - true.vertices[two]) @ right.rotation,
+        "tip_errors": (found.tips[two] - true.tips[two]) @ right.rotation,
+        "shapes": (found.vertices[two] - own.centre[:, None]) @ own.rotation,
+        "tip_shapes": (found.tips[two] - own.centre[:, None]) @ own.rotation,
+        "rest": (true.vertices[0] - right.centre[0]) @ right.rotation[0],
     }
 
 
-def _mean_size(frames: Sequence[Row], name: str) -> float | None:
-    """Mean over the frames without sign; None where no frame has the value."""
-    known = [abs(frame[name]) for frame in frames if frame[name] is not None]
-    return float(np.mean(known)) if known else None
-
-
 def _errors(found: Shape, true: Shape, layout: ValveLayout) -> dict[str, float | None]:
-    """How far a valve is found from the truth, and what clinicians would measure wrongly.
+    """Errors of a detected valve, and of its clinical measures.
 
-    Returns
-    -------
-    dict
-        Mean distances in mm: ``surface`` (of the vertices of each surface from the other one),
-        ``points`` (of corresponding vertices) and ``tips``. Found minus true: ``annulus_area`` (%
-        of the true one) and ``ap_diameter`` (mm). ``state_right``: 100 where an open orifice is
-        found open and a closed one closed, otherwise 0. None if a shape defies it.
+    Mean distances in mm: ``surface`` (of the vertices of each surface from the other one),
+    ``points`` (of corresponding vertices) and ``tips``. Detected minus true: ``annulus_area`` (% of
+    the true one) and ``ap_diameter`` (mm). ``state_right``: 100 if an open valve is detected as
+    open and a closed one as closed, otherwise 0. None if a shape cannot be measured.
     """
     (x, tips), (true_x, true_tips) = found, true
     there, back = (
@@ -210,28 +198,16 @@ def _errors(found: Shape, true: Shape, layout: ValveLayout) -> dict[str, float |
         **dict.fromkeys(("annulus_area", "ap_diameter", "state_right")),
     }
     with suppress(GeometryError):
-        (area, diameter, is_open), (true_area, true_diameter, truly_open) = (
-            _measures(*one, layout) for one in (found, true)
-        )
+        measured = []
+        for vertices, at in (found, true):
+            annulus = vertices[layout.annulus]
+            plane = annulus_plane(annulus, at.mean(axis=0), annulus[layout.column(90.0)])
+            size = measure_annulus(annulus, plane)
+            orifice = orifice_area(vertices, layout.triangles, annulus, plane, PIXEL_MM)
+            open_ = bool(orifice >= OPEN_SHARE * size.projected_area)
+            measured.append((size.projected_area, size.anteroposterior_diameter, open_))
+        (area, diameter, is_open), (true_area, true_diameter, truly_open) = measured
         errors["annulus_area"] = 100.0 * (area - true_area) / true_area
         errors["ap_diameter"] = diameter - true_diameter
         errors["state_right"] = 100.0 * (is_open == truly_open)
     return errors
-
-
-def _measures(
-    vertices: FloatArray, tips: FloatArray, layout: ValveLayout
-) -> tuple[float, float, bool]:
-    """Area (mm²) and anteroposterior diameter (mm) of the annulus, and whether the valve is open.
-
-    Raises
-    ------
-    GeometryError
-        If the shape defies it.
-    """
-    annulus = vertices[layout.annulus]
-    plane = annulus_plane(annulus, tips.mean(axis=0), annulus[layout.column(90.0)])
-    size = measure_annulus(annulus, plane)
-    orifice = orifice_area(vertices, layout.triangles, annulus, plane, PIXEL_MM)
-    is_open = bool(orifice >= OPEN_SHARE * size.projected_area)
-    return size.projected_area, size.anteroposterior_diameter, is_open

@@ -1,9 +1,8 @@
-"""Virtual patients: simulated cases, and what no estimator is given of them.
+"""Virtual patients: simulated cases, and the truth that no estimator is given.
 
 A virtual patient is closed on another mesh than any estimator's. Its pressure, its chordae and its
-errors differ from what its case states. The hidden values are returned beside the case and belong
-in another place. Nothing here knows how a case is estimated, so that a stored patient depends on
-nothing of it.
+errors differ from what its case states. The true values are returned separately from the case.
+Nothing here knows how a case is estimated, so that a stored patient does not depend on it.
 """
 
 from __future__ import annotations
@@ -52,89 +51,50 @@ REFERENCE, CLOSED = "open", "closed"
 """Names of the first two frames of a virtual patient."""
 
 FITTED, HELD = "fitted", "held"
-"""Beginnings of the names of further frames, which are fitted or held out."""
+"""Prefixes of the names of further frames, which are fitted or held out."""
 
 GUIDES = (("hex18", 24, 3), ("hex18", 36, 4))
-"""Element, columns and rows of the coarser meshes on which a closure is followed."""
+"""Element, columns and rows of the coarser meshes that guide the closure."""
 
 FRAME_INTERVAL = 0.05
-"""s between the closed frame and those that follow."""
+"""s between consecutive frames from the closed one on."""
 
 
 # -- settings -------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """Standard deviations of the hidden values from what a case states.
+    """Standard deviations of the true values about what a case states."""
 
-    Attributes
-    ----------
-    pressure, chord_rest_length, chord_stiffness : float
-        Relative.
-    shift_mm, turn_degrees : float
-        Of each component of the displacement.
-    pressure_offset_mmHg, pressure_each_mmHg : float
-        Of the pressures of several fitted frames, see `mvest.closure.frames`; not drawn for one.
-    """
-
-    pressure: Logarithm = 0.10
+    pressure: Logarithm = 0.10  #: relative, as the two below
     chord_rest_length: Factor = 0.02
     chord_stiffness: Factor = 0.20
-    shift_mm: Length = 1.0
+    shift_mm: Length = 1.0  #: of each component of the displacement
     turn_degrees: Angle = 2.0
-    pressure_offset_mmHg: PressureError = 5.0
+    pressure_offset_mmHg: PressureError = 5.0  #: of several fitted frames (`mvest.closure.frames`)
     pressure_each_mmHg: PressureError = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class PatientSimulation:
-    """How virtual patients are made.
-
-    Attributes
-    ----------
-    element : str
-    columns, rows : int
-        Cells of the mesh that is closed.
-    dt_factor : float
-        On the time step of the mechanics.
-    contact_columns, contact_rows : int
-    seen_columns, seen_rows : int
-        Vertices of the surface that is seen.
-    std_mm, correlation_length_mm : float
-        Error of each coordinate of each vertex in each frame but the first, and its correlation
-        length. Frames are independent.
-    rough_std_mm : float
-        Further independent errors in these frames, which the case does not state.
-    rest_std_mm : float
-        Error of the open shape, ends of the chordae included; 0: it is seen exactly.
-    fitted_pressure_mmHg : tuple of float
-        In further frames that an estimator is to fit with the closed one.
-    fitted_relaxation : tuple of float
-        Share of its way back to the open shape that the annulus has gone in each.
-    held_pressure_mmHg, held_relaxation : tuple of float
-        The same of the frames that are held out, one after another.
-    held_tips : (float, float, float)
-        mm, displacement of the papillary tips per unit of relaxation.
-    misspecification : Misspecification
-        Further differences from what the case states and an estimator assumes.
-    """
+    """How virtual patients are closed and observed."""
 
     element: str = "hex18"
-    columns: CellsAround = 72
+    columns: CellsAround = 72  #: cells of the mesh that is closed
     rows: CellsAlong = 8
-    dt_factor: Factor = 0.5
+    dt_factor: Factor = 0.5  #: on the time step of the mechanics
     contact_columns: PointsAround = 168
     contact_rows: PointsAlong = 38
-    seen_columns: PointsAround = 80
+    seen_columns: PointsAround = 80  #: vertices of the observed surface
     seen_rows: PointsAlong = 21
-    std_mm: Length = 0.6
-    correlation_length_mm: Length = 10.0
-    rough_std_mm: Length = 0.0
-    rest_std_mm: Length = 0.0
-    fitted_pressure_mmHg: tuple[Pressure, ...] = ()
-    fitted_relaxation: tuple[Share, ...] = ()
-    held_pressure_mmHg: tuple[Pressure, ...] = (100.0, 80.0, 60.0)
+    std_mm: Length = 0.6  #: of each coordinate of each vertex in each frame but the first
+    correlation_length_mm: Length = 10.0  #: of these errors; frames are independent
+    rough_std_mm: Length = 0.0  #: further independent errors, not stated by the case
+    rest_std_mm: Length = 0.0  #: error of the open shape, ends of the chordae included
+    fitted_pressure_mmHg: tuple[Pressure, ...] = ()  #: frames fitted with the closed one
+    fitted_relaxation: tuple[Share, ...] = ()  #: share of the way back to the open shape
+    held_pressure_mmHg: tuple[Pressure, ...] = (100.0, 80.0, 60.0)  #: frames that are held out
     held_relaxation: tuple[Share, ...] = (0.15, 0.3, 0.45)
-    held_tips: tuple[Place, Place, Place] = (0.0, 0.0, 2.0)
+    held_tips: tuple[Place, Place, Place] = (0.0, 0.0, 2.0)  #: mm per unit of relaxation
     misspecification: Misspecification = field(default_factory=Misspecification)
 
     def __post_init__(self) -> None:
@@ -148,8 +108,8 @@ class PatientSimulation:
                 )
             if len(set(pressures)) != len(pressures):
                 raise InputError(
-                    f"{kind}_pressure_mmHg = {pressures}, expected different ones: they name the "
-                    "frames"
+                    f"{kind}_pressure_mmHg = {pressures}, expected different pressures: they name "
+                    "the frames"
                 )
 
     @property
@@ -171,25 +131,25 @@ class PatientSimulation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatientSettings:
-    """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
+    """A virtual patient. The estimator sees only the case that is written."""
 
     name: str
     description: str
-    misspecification: str = ""  # the misspecification in words
-    moduli: dict[str, Modulus] = field(default_factory=dict)  # MPa
-    moduli_spread: Factor = 0.0  # SD of the logarithm by which they are drawn about these
-    variation: Factor = 0.0  # size of the random variation of the anatomy; 0: as configured
+    misspecification: str = ""  #: the misspecification in words
+    moduli: dict[str, Modulus] = field(default_factory=dict)  #: MPa
+    moduli_spread: Factor = 0.0  #: SD of the logarithm by which they are drawn about these
+    variation: Factor = 0.0  #: size of the random variation of the anatomy; 0: as configured
     simulation: PatientSimulation = field(default_factory=PatientSimulation)
     deviations: Deviations = field(default_factory=Deviations)
-    paper_distance_mm: tuple[Length, ...] = ()  # generic, personalised
+    paper_distance_mm: tuple[Length, ...] = ()  #: generic, personalised
 
 
 # -- drawing --------------------------------------------------------------------------------------
 def draw_patient_values(patient: PatientSettings, rng: np.random.Generator) -> dict[str, float]:
     """True value of each parameter: moduli in MPa, factors, displacement, errors of pressures.
 
-    Moduli and factors are log-normal, so that they are positive. Displacements are normal, and so
-    are the errors of the pressures of several fitted frames.
+    Moduli and factors are log-normal, so that they are positive. Displacements, and the errors of
+    the pressures of several fitted frames, are normal.
     """
     own, fitted = patient.deviations, patient.simulation.fitted_frames
     moduli = {
@@ -220,12 +180,9 @@ def first_that_closes(
     rng: np.random.Generator,
     simulate: Callable[[Template], T],
 ) -> tuple[T, int]:
-    """What ``simulate`` makes of the first anatomy that closes, and how many were drawn.
+    """Simulate the first anatomy that closes, and return the number of anatomies drawn.
 
-    Raises
-    ------
-    GeometryError
-        If none of ``max_draws`` does.
+    Raises the last GeometryError if none of ``max_draws`` anatomies closes.
     """
     for draws in range(1, max_draws + 1):
         drawn = Template(vary(template.parameters, rng, variation)) if variation else template
@@ -239,21 +196,13 @@ def first_that_closes(
 # -- closing --------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualPatient:
-    """A simulated case, and what it does not state.
-
-    Attributes
-    ----------
-    case : ValveCase
-    values : mapping
-        Parameter -> true value: the moduli in MPa, factors on what the case states, and the
-        displacement of the leaflets as they were seen.
-    positions : mapping
-        Frame -> ``(n, 3)`` mm, where the vertices of the case would have been seen without errors,
-        the displacement included.
-    """
+    """A simulated case and its truth."""
 
     case: ValveCase
+    #: Parameter -> true value: moduli in MPa, factors on what the case states, and the displacement
+    #: of the observed leaflets.
     values: Mapping[str, float]
+    #: Frame -> (n, 3) mm, vertices of the case without errors but with the displacement.
     positions: Mapping[str, FloatArray]
 
 
@@ -266,25 +215,11 @@ def simulate_patient(
     mechanics: MechanicsSettings,
     rng: np.random.Generator,
 ) -> VirtualPatient:
-    """Close a template and see it.
+    """Close a template and observe it with errors.
 
-    Parameters
-    ----------
-    name, description : str
-        Of the case.
-    template : Template
-    values : mapping
-        As from :func:`draw_patient_values`.
-    simulation : PatientSimulation
-    mechanics : MechanicsSettings
-        Its pressure is what the case states.
-    rng : numpy.random.Generator
-        For the errors.
-
-    Raises
-    ------
-    GeometryError
-        If the valve does not close, or has no equilibrium in a further frame.
+    Name and description are those of the case, ``values`` those of :func:`draw_patient_values`. The
+    pressure of the mechanics is what the case states; ``rng`` draws the errors. GeometryError if
+    the valve does not close, or has no equilibrium in a further frame.
     """
     misspecification, other = simulation.misspecification, rng.spawn(1)[0]
     values = misspecification.values(values, other)
@@ -303,15 +238,10 @@ def simulate_patient(
 def close_patient(
     drawn: DrawnValve, seen: Valve, simulation: PatientSimulation
 ) -> dict[str, FloatArray]:
-    """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
+    """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices of ``seen``.
 
-    The first frame is the closed one; the fitted and the held-out ones follow. ``seen`` is the
-    valve where it is seen.
-
-    Raises
-    ------
-    GeometryError
-        If the valve does not close, or has no equilibrium in one of these.
+    The first frame is the closed one; the fitted and the held-out ones follow. Raises GeometryError
+    if the valve does not close, or has no equilibrium in one of these.
     """
     model, values = _model(drawn, seen, simulation), drawn.values
     states = simulation.held_states(model.contact_valve)
@@ -337,17 +267,16 @@ def close_patient(
 
 
 def _model(drawn: DrawnValve, seen: Valve, simulation: PatientSimulation) -> ClosureModel:
-    """The model that closes a virtual patient, with the guides that it follows."""
+    """The model that closes a virtual patient, guided by coarser meshes."""
     not_modelled = {*REGISTRATION, *filter(is_frame_pressure, drawn.values)}
     if simulation.misspecification.exponential:
-        # Its coefficients follow from a modulus, which is no parameter of its own.
+        # Its coefficients are scaled to the modulus, which is no parameter of this law.
         not_modelled |= {name for name in drawn.values if name.startswith("E_f.")}
     protocol = drawn.mechanics.protocol
     finer = replace(protocol, dt=protocol.dt * simulation.dt_factor)
     contact = drawn.sampled(simulation.contact_columns, simulation.contact_rows)
     guide = None
     own = (simulation.element, simulation.columns, simulation.rows)
-    # Closures are followed on coarser meshes only.
     guides = [cells for cells in GUIDES if cells[1] * cells[2] < own[1] * own[2]]
     for element, columns, rows in (*guides, own):
         guide = ClosureModel(
@@ -358,7 +287,7 @@ def _model(drawn: DrawnValve, seen: Valve, simulation: PatientSimulation) -> Clo
             tuple(name for name in drawn.values if name not in not_modelled),
             continuation=True,
             guide=guide,
-            # A valve that does not follow its guide has more than one way to close.
+            # A valve that leaves its guide has more than one closed state.
             repeat=False,
         )
     assert guide is not None
@@ -388,10 +317,10 @@ def _case(
         open_shape = rest_error(open_shape[None], exact[None], rng)[0]
     if np.any(open_shape != exact):
         surface = replace(surface, vertices=open_shape)
-        # Where a chord ends is seen on the leaflet, and in error as it is.
+        # The ends of chordae are seen on the leaflet, with its error.
         nearest = cKDTree(exact).query(chordae.insertion)[1]
-        moved_ends = (open_shape - exact)[nearest]
-        chordae = replace(chordae, insertion=chordae.insertion + moved_ends)
+        insertion = chordae.insertion + (open_shape - exact)[nearest]
+        chordae = replace(chordae, insertion=insertion)
     at_annulus, at_tips = misspecification.boundary(
         motion.annulus[-1], motion.papillary_tips[-1], other
     )

@@ -21,24 +21,20 @@ All use one thread, which the package of this module sees to before any of them 
 from __future__ import annotations
 
 import json
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 import mvest
-from mvest.errors import InputError
 from mvest.mechanics import (
     Loads,
     NewtonSettings,
-    Parameter,
     Simulation,
     Step,
     System,
@@ -52,7 +48,6 @@ from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from tests.benchmark import THREADS
 
 MESHES = ((40, 40, 1), (60, 60, 1))
 SIZE = (20.0, 20.0, 1.3)
@@ -68,6 +63,8 @@ REPEATS = 6
 """Whole solves by each library; the first is not counted."""
 AGREEMENT = 1e-6
 """Relative difference of the deflections from mvest's above which the comparison is void."""
+
+Row = dict[str, Any]
 
 MU = YOUNG / (2 * (1 + POISSON))
 LAMBDA = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
@@ -87,20 +84,6 @@ class Candidate(NamedTuple):
     version: str
     note: str
     solve: Callable[[], Solved]
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One line of the table; what a row has not is None."""
-
-    library: str
-    version: str | None
-    nodes: int
-    seconds_per_iteration: float | None
-    iterations: int | None
-    deflection_mm: float | None
-    difference: float | None
-    note: str
 
 
 class Sheet:
@@ -152,20 +135,6 @@ class SaintVenantKirchhoff:
     def kinds(self) -> tuple[str, ...]:
         """Nothing is differentiated."""
         return ()
-
-    def partial_stress(
-        self, parameter: Parameter, at: Points, *, which: int, stress: FloatArray
-    ) -> FloatArray:
-        """No parameter is known."""
-        raise InputError(f"parameter {parameter.name!r}: the sheet has none")
-
-    def history_stress(self, at: Points, d_previous: FloatArray) -> FloatArray:
-        """Zero: the stress has no history."""
-        return np.zeros_like(at.green)
-
-    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
-        """The change of the strain itself."""
-        return d_green
 
 
 class Mvest:
@@ -400,7 +369,7 @@ def measure(sheet: Sheet) -> list[Row]:
         try:
             candidates.append(prepare(sheet))
         except ImportError as error:
-            missing.append(Row(name, None, n, None, None, None, None, f"not importable: {error}"))
+            missing.append({"library": name, "nodes": n, "note": f"not importable: {error}"})
     seconds: list[list[float]] = [[] for _ in candidates]
     solved: list[Solved] = []
     for _ in range(REPEATS):
@@ -410,14 +379,15 @@ def measure(sheet: Sheet) -> list[Row]:
             solved.append(candidate.solve())
             taken.append((time.process_time() - start) / solved[-1].iterations)
     expected = solved[0].deflection
-    assert expected is not None
-    rows = []
-    for (library, version, note, _), taken, (iterations, deflection) in zip(
-        candidates, seconds, solved, strict=True
-    ):
-        difference = None if deflection is None else abs(deflection / expected - 1)
-        median = float(np.median(taken[1:]))
-        rows.append(Row(library, version, n, median, iterations, deflection, difference, note))
+    rows: list[Row] = []
+    for own, taken, (iterations, moved) in zip(candidates, seconds, solved, strict=True):
+        rows.append({
+            "library": own.library, "version": own.version, "nodes": n,
+            "seconds_per_iteration": float(np.median(taken[1:])), "iterations": iterations,
+            "deflection_mm": moved,
+            "difference": None if moved is None else abs(moved / expected - 1),
+            "note": own.note,
+        })  # fmt: skip
     return rows + missing
 
 
@@ -429,42 +399,13 @@ PREPARE: dict[str, Callable[[Sheet], Candidate]] = {
 }
 
 
-def table(rows: list[Row]) -> str:
-    """The rows as plain text."""
-
-    def cell(value: float | None, form: str) -> str:
-        return "-" if value is None else format(value, form)
-
-    lines = [
-        f"{'library':<21}{'version':>10}{'nodes':>7}{'s/iteration':>13}{'iterations':>12}"
-        f"{'deflection mm':>16}{'difference':>12}  note"
-    ]
-    lines += [
-        f"{row.library:<21}{row.version or '-':>10}{row.nodes:>7}"
-        f"{cell(row.seconds_per_iteration, '.4f'):>13}{cell(row.iterations, 'd'):>12}"
-        f"{cell(row.deflection_mm, '.10f'):>16}{cell(row.difference, '.1e'):>12}  {row.note}"
-        for row in rows
-    ]
-    return "\n".join(lines)
-
-
 def main(arguments: list[str]) -> str | None:
-    """Print the table, write it where told; returns what is wrong, if anything."""
-    rows: list[Row] = []
-    for cells in MESHES:
-        rows += measure(Sheet(cells))
-    print(table(rows))
+    """Print the rows and write them to the named file; returns what is wrong, if anything."""
+    rows = [row for cells in MESHES for row in measure(Sheet(cells))]
+    print(pd.DataFrame(rows).to_string(index=False))
     if arguments:
-        record = {
-            "rows": [asdict(row) for row in rows],
-            "tolerance": TOLERANCE,
-            "repeats": REPEATS - 1,
-            "threads": {name: os.environ.get(name) for name in THREADS},
-            "python": platform.python_version(),
-            "machine": platform.machine(),
-        }
-        Path(arguments[0]).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    apart = [r.library for r in rows if r.difference is not None and not r.difference < AGREEMENT]
+        Path(arguments[0]).write_text(json.dumps({"rows": rows}, indent=2) + "\n")
+    apart = [row["library"] for row in rows if not (row.get("difference") or 0.0) < AGREEMENT]
     return f"deflections differ from mvest's: {', '.join(apart)}" if apart else None
 
 

@@ -1,9 +1,8 @@
 """Tables and plot of ``make bench``: ``python -m tests.benchmark.report FILE.json ...``.
 
 Writes ``benchmark.csv``, ``.md`` and ``.png`` to ``results/``. Seconds depend on the machine and on
-what else it does; the column to compare is the time over a calibration kernel that ran in the same
-process, and its ratio to the stored baseline, ``results/benchmark_baseline.csv`` (copy
-``benchmark.csv`` there to set a new one).
+its load. Compare the time over a calibration kernel that ran in the same process, and its ratio to
+the stored baseline, ``results/benchmark_baseline.csv`` (copy ``benchmark.csv`` there to set it).
 """
 
 from __future__ import annotations
@@ -23,30 +22,31 @@ from tests.tables import markdown, write_text
 
 KEY = ["what", "element", "size", "parameters", "points", "threads"]
 DRAWN = {
-    "closure": "o",
-    "guided closure": "P",
-    "tangent": "s",
-    "factorisation": "^",
-    "solve": "D",
+    "closure": "o", "guided closure": "P", "tangent": "s", "factorisation": "^", "solve": "D",
     "contact search": "v",
-}
+}  # fmt: skip
+ABOUT = (
+    "Median seconds of the rounds in one process, and the same over a calibration kernel of that "
+    "process: seconds of the CPU with one thread, of the clock with two and for batches. A closure "
+    "starts from the open valve and ends in equilibrium; `parameters` counts the derivatives that "
+    "it carries."
+)
 
 
 def benchmark_table(
     runs: Sequence[Mapping[str, Any]], baseline: pd.DataFrame | None = None
 ) -> pd.DataFrame:
     """One row for each benchmark of pytest-benchmark's reports, over an earlier table if given."""
-    entries = [(entry, entry["extra_info"]) for run in runs for entry in run["benchmarks"]]
+    entries = [(entry["stats"], entry["extra_info"]) for run in runs for entry in run["benchmarks"]]
     table = pd.DataFrame(
         {
-            "what": entry["name"].partition("[")[0].removeprefix("test_").replace("_", " "),
-            **{name: extra.get(name) for name in ("element", "size", "nodes", *KEY[3:])},
-            "rounds": entry["stats"]["rounds"],
-            "seconds": entry["stats"]["median"],
-            "over calibration": entry["stats"]["median"] / extra["calibration"],
+            **{name: extra.get(name) for name in (*KEY[:3], "nodes", *KEY[3:])},
+            "rounds": stats["rounds"],
+            "seconds": stats["median"],
+            "over calibration": stats["median"] / extra["calibration"],
             "peak memory [MB]": extra.get("peak_mb"),
         }
-        for entry, extra in entries
+        for stats, extra in entries
     )
     if baseline is not None:
         old = baseline[[*KEY, "over calibration"]].rename(columns={"over calibration": "old"})
@@ -80,13 +80,8 @@ def draw(table: pd.DataFrame) -> Any:
     axes = figure.subplots()
     for what, element, group in _sized(table):
         if what in DRAWN:
-            axes.loglog(
-                group["nodes"],
-                group["seconds"],
-                marker=DRAWN[what],
-                color={"hex18": "C0"}.get(element, "C1"),
-                label=f"{what}, {element}",
-            )
+            style = {"marker": DRAWN[what], "color": {"hex18": "C0"}.get(element, "C1")}
+            axes.loglog(group["nodes"], group["seconds"], label=f"{what}, {element}", **style)
     axes.set(xlabel="nodes", ylabel="seconds, one thread")
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside right upper", fontsize=7)
@@ -99,58 +94,20 @@ def shown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
     return markdown(table.map(lambda v: f"{v:.3g}" if isinstance(v, float) else v))
 
 
-def _profile(entry: Mapping[str, Any]) -> list[str]:
-    """Where the time of a closure went, and what its largest parts reached of the machine."""
-    parts = pd.Series(entry["parts"], name="seconds").sort_values(ascending=False)
-    shares = parts.rename_axis("part").reset_index()
-    shares["share [%]"] = 100 * shares["seconds"] / entry["seconds"]
-    bounds = pd.DataFrame(entry["bounds"])[["what", "reached", "machine", "bound by"]]
-    return [
-        f"## Where the time of a {entry['closure']} closure goes: {entry['nodes']} nodes",
-        f"{entry['seconds']:.1f} s of the CPU with two derivatives, guides included; "
-        f"{entry['iterations on the finest mesh']} Newton iterations on the finest mesh, "
-        f"{entry['factorisations']} factorisations and {entry['evaluations']} evaluations.",
-        shown(shares),
-        "What bounds its parts, one thread (dense products for arithmetic, a long vector sum "
-        "for memory):",
-        shown(bounds.set_axis(["what", "reached", "of what this machine can do", "unit"], axis=1)),
-    ]
-
-
-def text(table: pd.DataFrame, contents: Sequence[Mapping[str, Any]]) -> list[str]:
-    """All that was measured, in Markdown: timings, starts, profiles and other libraries."""
-    starts, profiles, peers = (
-        [row for content in contents for row in content.get(name, [])]
-        for name in ("startup", "profile", "rows")
-    )
-    parts = [
-        "# Benchmark",
-        "Median seconds of the rounds in one process, and the same over a calibration kernel "
-        "of that process: seconds of the CPU with one thread, of the clock with two and for "
-        "batches. A closure starts from the open valve and ends in equilibrium; `parameters` "
-        "counts the derivatives that it carries.",
-        shown(table),
-        "## Order of the time in the number of nodes",
-        shown(fitted_orders(table)),
-    ]
-    if starts:
-        parts += [
-            "## Until something begins",
-            "Least CPU seconds of some processes, with warm caches.",
-            shown(starts),
-        ]
-    parts += [part for entry in profiles for part in _profile(entry)]
-    return parts + (["## The same pressurised sheet elsewhere", shown(peers)] if peers else [])
-
-
 def main(files: Sequence[str], results: Path = ROOT / "results") -> None:
     """Write table and plot of the named reports."""
     contents = [json.loads(Path(file).read_text(encoding="utf-8")) for file in files]
-    runs = [content for content in contents if "benchmarks" in content]
+    peers = [row for content in contents for row in content.get("rows", ())]
     stored = results / "benchmark_baseline.csv"
-    table = benchmark_table(runs, pd.read_csv(stored) if stored.is_file() else None)
+    table = benchmark_table(
+        [content for content in contents if "benchmarks" in content],
+        pd.read_csv(stored) if stored.is_file() else None,
+    )
+    parts = ["# Benchmark", ABOUT, shown(table)]
+    parts += ["## Order of the time in the number of nodes", shown(fitted_orders(table))]
+    parts += ["## The same pressurised sheet elsewhere", shown(peers)] if peers else []
     write_atomically(results / "benchmark.csv", table.to_csv(index=False))
-    write_text(results / "benchmark.md", *text(table, contents))
+    write_text(results / "benchmark.md", *parts)
     write_atomically(results / "benchmark.png", lambda part: draw(table).savefig(part, dpi=150))
 
 

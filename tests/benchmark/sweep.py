@@ -54,11 +54,6 @@ def spent(folder: Path, jobs: int) -> dict[str, float]:
     return {"cpu_s": cpu, "cpu_ms_a_job": 1e3 * cpu / jobs, "wall_s": wall, "largest_mib": mib}
 
 
-def size(*paths: Path) -> float:
-    """MiB of files."""
-    return sum(path.stat().st_size for path in paths) / 2**20
-
-
 def measure(folder: Path, jobs: int) -> dict[str, Any]:
     """Run a sweep twice in an empty folder."""
     swept = folder / "outputs" / "debug"
@@ -67,17 +62,7 @@ def measure(folder: Path, jobs: int) -> dict[str, Any]:
     ran = (folder / "runs").read_text(encoding="utf-8").split()
     if states != ["converged"] * jobs or sorted(map(int, ran)) != list(range(jobs)):
         raise RuntimeError("a job was lost, or done twice")
-    results = [path for path in swept.glob("*/*") if path.is_file()]
-    return {
-        "jobs": jobs,
-        "run": run,
-        "again, when all is done": again,
-        "plan_mib": size(swept / "plan.json"),
-        "sweep_json_mib": size(swept / "sweep.json"),
-        "database_mib": size(folder / "outputs" / "mlflow.db"),
-        "files_of_jobs": len(results),
-        "files_of_jobs_mib": size(*results),
-    }
+    return {"jobs": jobs, "run": run, "again, when all is done": again}
 
 
 def main(arguments: Sequence[str]) -> None:

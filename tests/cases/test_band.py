@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from mvest.cases.band import commissures, directed, find_loops, match_annulus, without_ears
-from mvest.cases.folder import read_case
 from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.surface_coordinates import boundary_loops
-from tests.cases.folders import TIPS, plain_folder, save, save_frames
+from tests.cases.folders import TIPS
 
 
 def parts(valve):
@@ -119,12 +118,3 @@ def test_an_ear_gets_a_corner_elsewhere_and_the_edges_stay():
     same, cured = without_ears(good)
     assert np.array_equal(same, good)
     assert not len(cured)
-
-
-def test_a_case_with_an_ear_is_read_and_says_so(tmp_path):
-    document, valve = plain_folder(tmp_path), Template().valve(24, 8)
-    bad, ear = with_an_ear(valve.surface.triangles, valve.annulus[4:7])
-    save_frames(tmp_path, bad)
-    case = read_case(save(tmp_path, document))
-    assert any(f"inner edge turned of triangles [{ear}]" in text for text in case.derived)
-    assert case.frames[1].corresponds

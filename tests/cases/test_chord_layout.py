@@ -1,4 +1,4 @@
-"""The layout on a cylinder, where the harmonic coordinates are angle and height."""
+"""The layout of chordae on a cylinder and the template; a case of one open frame alone."""
 
 from dataclasses import replace
 
@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.cases.folder import read_case
-from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
+from mvest.cases.folder import read_case, write_case
+from mvest.cases.tissue import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import band_grid
-from tests.cases.folders import band_of, plain_folder, save, save_frames
-from tests.closure.test_model import CLOSING, model_of
+from tests.cases.folders import band_of, plain_folder, save, save_frames, template_case
+from tests.cases.test_folder import assert_equal
 
 RADIUS, HEIGHT = 15.0, 12.0
 
@@ -83,21 +83,6 @@ def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one(
     assert [chordae.family_names[k] for k in chordae.family] == ["marginal", "basal"] * 2
 
 
-def test_a_closed_frame_of_another_mesh_gives_the_same_chordae():
-    band = LeafletBand.of(*cylinder(), anterior=1)
-    x, t, r, annulus, free_edge = cylinder(72, 9)
-    tips = np.array([[20.0, 1.0, -30.0], [-20.0, 0.0, -30.0]])
-    shape = [0.9, 0.9, 1.4]
-    other = LeafletBand.of(x * shape, t, r, annulus, free_edge, anterior=1)
-    same = lay_out_chordae(band, tips, band.vertices * shape, tips, SEEN_ON_BAND)
-    found = lay_out_chordae(band, tips, other, tips, SEEN_ON_BAND)
-    np.testing.assert_array_equal(found.insertion, same.insertion)
-    # The finer polygon lies within R (1 - cos 5 deg) = 0.06 mm of the coarser.
-    np.testing.assert_allclose(found.rest_length, same.rest_length, atol=0.06)
-    with pytest.raises(InputError, match="3 papillary tips; the layout of chordae needs two"):
-        lay_out_chordae(band, np.zeros((3, 3)), band.vertices, np.zeros((3, 3)), SEEN_ON_BAND)
-
-
 def test_on_the_template_it_comes_near_the_templates_own(tmp_path):
     document = plain_folder(tmp_path, 40, 12)
     given = read_case(save(tmp_path, document)).chordae
@@ -113,37 +98,6 @@ def test_on_the_template_it_comes_near_the_templates_own(tmp_path):
     assert gap[laid_out.family == 1].max() < 2.8
     np.testing.assert_array_equal(laid_out.tip, given.tip[order])
     np.testing.assert_array_equal(laid_out.family, given.family[order])
-
-
-def test_where_a_closed_frame_was_seen_chordae_are_nearly_as_long_as_in_the_valve_that_closed():
-    # Of a closure by the model, not the one that the template intends: on a coarse mesh, and
-    # without the variation of the valves that the layout's lengths were measured on, so to 2.5 %.
-    # By the template's slack basal chordae would be 5 % too long.
-    model = model_of(
-        replace(CLOSING, pressure_mmHg=120.0), cells=(24, 3), samples=(84, 20), continuation=True
-    )
-    valve = Template().valve(40, 12)
-    prediction = replace(model, valve=valve)(np.array([6.23, 2.09]))
-    assert prediction.converged
-    band, tips = band_of(valve), valve.motion.papillary_tips
-    closed = prediction.y.reshape(2, -1, 3)[1]
-    laid_out = lay_out_chordae(band, tips[0], closed, tips[-1], SEEN_ON_BAND)
-    own = valve.chordae
-    for family in (0, 1):
-        ratio = [np.mean(each.rest_length[each.family == family]) for each in (laid_out, own)]
-        assert ratio[0] == pytest.approx(ratio[1], rel=0.025)
-    by_intent = lay_out_chordae(band, tips[0], closed, tips[-1], ChordLayout())
-    basal = by_intent.rest_length[by_intent.family == 1].mean()
-    assert basal > 1.04 * own.rest_length[own.family == 1].mean()
-
-
-def test_a_case_with_a_closed_frame_lays_chordae_out_by_what_was_seen(tmp_path):
-    document = plain_folder(tmp_path, 40, 12)
-    del document["chordae"]
-    case = read_case(save(tmp_path, document))
-    band, tips, closed = band_of(case), case.frames[0].papillary_tips, case.frame(Role.CLOSED)
-    seen = lay_out_chordae(band, tips, closed.vertices, closed.papillary_tips, SEEN_ON_BAND)
-    np.testing.assert_allclose(case.chordae.rest_length, seen.rest_length, rtol=1e-9)
 
 
 def test_frames_without_correspondence_are_matched(tmp_path):
@@ -166,3 +120,58 @@ def test_frames_without_correspondence_are_matched(tmp_path):
         case.chordae.rest_length, expected.chordae.rest_length, atol=0.056 * 62 / 4
     )
     assert case.valve.motion.annulus.shape == (2, 40, 3)
+
+
+@pytest.fixture
+def anatomy():
+    case = template_case(40, 12)
+    return replace(case, frames=case.frames[:1], derived=())
+
+
+def test_an_open_frame_alone_comes_back_as_it_was_written(tmp_path, anatomy):
+    back = read_case(write_case(tmp_path / "case", anatomy))
+    assert_equal(back, anatomy, "sha256")
+    assert back.closed is None
+    assert str(back).splitlines()[2] == "frames: open (reference, -0.333 mmHg)"
+    # Its boundary stays where it is.
+    motion = back.valve.motion
+    for positions in (motion.annulus, motion.papillary_tips):
+        np.testing.assert_array_equal(positions[0], positions[1])
+
+
+def test_the_closed_frame_is_asked_for_in_one_line(anatomy):
+    with pytest.raises(InputError, match=r"case template: no closed frame.*valve=folder") as raised:
+        anatomy.frame(Role.CLOSED)
+    assert "\n" not in str(raised.value)
+    held = replace(template_case(40, 12).frames[1], time=0.5)
+    with pytest.raises(InputError, match="0 frames have the role closed"):
+        replace(anatomy, frames=(*anatomy.frames, held))
+
+
+def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
+    document = plain_folder(tmp_path / "case", 40, 12)
+    document["frames"] = document["frames"][:1]
+    del document["chordae"]
+    case = read_case(save(tmp_path / "case", document))
+    assert any("an assumed closure: the free edges meet" in each for each in case.derived)
+    # By the slack that the template gives them at a closure that is intended, as this one is.
+    band, frame = band_of(case), case.frames[0]
+    goal = assumed_closure(band, frame.annulus, frame.papillary_tips)
+    tips = frame.papillary_tips
+    expected = lay_out_chordae(band, tips, goal, tips, ChordLayout()).rest_length
+    np.testing.assert_allclose(case.chordae.rest_length, expected, rtol=1e-9)
+
+
+def test_an_assumed_closure_brings_the_edges_together(anatomy):
+    band = band_of(anatomy)
+    frame = anatomy.frames[0]
+    closed = assumed_closure(band, frame.annulus, frame.papillary_tips)
+    np.testing.assert_allclose(closed[anatomy.annulus], frame.annulus, atol=1e-9)
+    phi = np.linspace(10.0, 170.0, 9)
+    moved = replace(band, vertices=closed)
+    gap = moved.position(phi, np.ones(9)) - moved.position(360.0 - phi, np.ones(9))
+    before = band.position(phi, np.ones(9)) - band.position(360.0 - phi, np.ones(9))
+    assert np.linalg.norm(gap, axis=1).max() < 0.5 < 5.0 < np.linalg.norm(before, axis=1).max()
+    middle = frame.annulus[:, 2].mean()
+    depth = closed[anatomy.free_edge, 2].mean() - middle
+    assert depth == pytest.approx(CLOSED_DEPTH * (frame.free_edge[:, 2].mean() - middle), rel=0.02)

@@ -128,11 +128,6 @@ def test_frames_converge_with_the_first_order_in_the_time_step():
     assert [one["unevenness"] for one in found] == [1.0] * 3
 
 
-def test_time_steps_that_are_not_halves_are_refused():
-    with pytest.raises(InputError, match="each to be half of the one before"):
-        compare_time_steps(model_of(), (0.05, 0.02), AT[None])
-
-
 def test_a_time_step_that_cannot_be_followed_is_said(monkeypatch):
     def frames(self, m):
         if m[0] < 2:
@@ -145,10 +140,3 @@ def test_a_time_step_that_cannot_be_followed_is_said(monkeypatch):
     assert [one["reason"] for one in found] == ["no cycle with the parameters"] * 2
     assert [one["unevenness"] for one in found] == [None, None]
     assert found[0]["change"] == 0.0
-
-
-def test_inadmissible_tissue_is_a_failed_prediction(cycle):
-    model, _ = cycle
-    failed = model(np.array([-1.0, 4.0, 1.0, 1.0]))
-    assert not failed.converged
-    assert "E_f" in failed.reason

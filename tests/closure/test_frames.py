@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.anchors import ClosedState
+from mvest.closure.continuation import ClosedState
 from mvest.closure.frames import ERROR, OFFSET, FramesModel
 from mvest.errors import InputError
 from mvest.mechanics.valve_system import HeldState

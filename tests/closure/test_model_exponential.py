@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError, MaterialError
-from mvest.estimation import Gaussian, IteratedFilter, Log
-from mvest.estimation.information.consistency import chi_square_band
 from mvest.mechanics.law import Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
@@ -20,7 +18,6 @@ from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, Tissu
 from mvest.mechanics.valve_system import material_law
 from tests.closure.test_model import (
     CLOSING,
-    MODULI,
     OPEN,
     SMALL,
     TINY,
@@ -53,10 +50,6 @@ def mixed(protocol, names=NAMES, **changes):
     model = model_of(protocol, names, **changes)
     model.settings = replace(model.settings, tissue=MIXED)
     return model
-
-
-def test_every_kind_of_the_exponential_law_is_here():
-    assert {name.partition(".")[0] for name in NAMES} >= set(EXPONENTIAL_KINDS)
 
 
 def test_derivatives_of_a_moving_valve_agree_with_differences():
@@ -137,13 +130,6 @@ def test_parameters_of_the_other_law_are_refused_before_anything_is_closed(names
         model.close(np.ones(len(names)))
 
 
-def test_inadmissible_coefficients_are_a_failed_prediction():
-    model = mixed(OPEN, ("c0.anterior", "E_f.posterior"), **TINY)
-    prediction = model(np.array([-0.1, 4.0]))
-    assert not prediction.converged
-    assert "c0 = -0.1" in prediction.reason
-
-
 def test_settings_name_the_law_and_bring_its_coefficients():
     with pytest.raises(InputError, match="'hyper', expected biot, corotational, expon"):
         TissueSettings(1.0, law="hyper")
@@ -153,22 +139,3 @@ def test_settings_name_the_law_and_bring_its_coefficients():
         LINEAR.coefficients({})
     with pytest.raises(MaterialError, match="c1 = -1"):
         MIXED["anterior"].coefficients({"c1": -1.0})
-
-
-def test_either_law_is_fitted_to_the_same_data_and_the_right_one_fits():
-    truth, noise = np.array([0.03, 0.02]), 0.002
-    right, wrong = (
-        model_of(OPEN, names, **TINY) for names in (("mu.anterior", "mu.posterior"), MODULI)
-    )
-    right.settings = replace(right.settings, tissue=BOTH)
-    y = right(truth).y
-    y = y + np.random.default_rng(1).normal(0, noise, y.shape)
-    found, misfit = {}, {}
-    for name, model, start in (("right", right, [0.02, 0.03]), ("wrong", wrong, [5.0, 3.0])):
-        prior = Gaussian.from_variance(start, np.square(start))
-        found[name] = IteratedFilter()(model, prior, y, noise**2, transform=Log())
-        assert found[name].converged
-        misfit[name] = np.mean((found[name].prediction.y - y) ** 2) / noise**2
-    assert np.all(np.abs(found["right"].mean - truth) < 4 * found["right"].std)
-    _, high = np.divide(chi_square_band(y.size), y.size)
-    assert misfit["right"] < high < misfit["wrong"] / 2

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.anchors import STIFFENED, ClosedState, Coordinates
+from mvest.closure.continuation import STIFFENED, ClosedState, Coordinates
 from mvest.mechanics.law.exponential import StiffeningLaw
 from mvest.mechanics.law.regional import LeafletLaw
 from mvest.mechanics.settings import ExponentialTissue
@@ -76,7 +76,7 @@ def test_a_way_begins_without_any_stiffening():
     assert coordinates(AT)[2] == pytest.approx(STIFFENED * np.log(1.5))
     rates = coordinates.expected_move(ClosedState(AT, None, slopes=np.eye(3)), 1.001 * AT)
     np.testing.assert_allclose(rates, 0.001 * AT, rtol=1e-3)
-    assert coordinates(np.array([6.23, 2.09, -1.5])) is None
+    assert coordinates.distance(AT, np.array([6.23, 2.09, -1.5])) == np.inf
 
 
 def test_a_closure_begins_with_linear_tissue_and_ends_where_any_other_does():

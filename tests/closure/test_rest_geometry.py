@@ -1,7 +1,7 @@
-"""Derivatives of a closed valve by its geometry, against equilibria of valves that are displaced.
+"""Derivatives of a closed valve by its geometry, against equilibria of displaced valves.
 
-A displaced valve is a system of its own: another mesh, other samples of contact, other targets.
-Only what is embedded where stays, as the derivative says. Central differences fall as h^2, see
+A displaced valve is a system of its own, with another mesh, other contact samples and other
+targets. Only the embeddings stay. Central differences fall as h^2, see
 `tests.closure.test_model.step_study`.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.closure.anchors import ClosedState
+from mvest.closure.continuation import ClosedState
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.mechanics.forces.contact import Contact
@@ -18,32 +18,28 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Step
-from mvest.mechanics.valve_system import boundary_loading, build_system, patch_change, patch_members
+from mvest.mechanics.valve_system import boundary_loading, build_system, patch_members
 from mvest.valve.mesh.solid_mesh import embed
 from tests.closure.test_model import AT, CLOSING, OPEN, model_of
 
-KINDS = ("shape", "thickness", "fibres", "annulus", "tips", "rest length", "insertions")
+PARTS = {
+    "shape": lambda at, model: np.stack(
+        [np.sin(at[0] + at[1]), np.cos(at[1] - at[2]), np.sin(at[2])], axis=-1
+    ),
+    "thickness": lambda at, model: 1.0 + 0.3 * np.sin(at[0]),
+    "fibres": lambda at, model: np.array([1.0, -0.5]),
+    "annulus": lambda at, model: 0.1 * model.contact_valve.motion.annulus[-1][:, [1, 2, 0]],
+    "tips": lambda at, model: np.array([[0.5, 0.7, -0.3], [-0.2, 0.4, 0.9]]),
+    "rest_lengths": lambda at, model: np.linspace(-1, 1, len(model.valve.chordae)),
+    "insertions": lambda at, model: 0.5 * np.roll(model.valve.chordae.insertion / 20, 1, 1),
+}
+"""Smooth changes of each part, of about 1 mm, 1 or 1 rad."""
 
 
-def variation_of(geometry, kind):
-    """One smooth quantity of a kind, of about 1 mm, 1 or 1 rad."""
-    model = geometry.model
-    surface = geometry.surface
-    x, y, z = surface.vertices.T / 10.0
-    if kind == "shape":
-        return geometry.shape(np.stack([np.sin(x + y), np.cos(y - z), np.sin(z)], axis=-1)[None])
-    if kind == "thickness":
-        return geometry.thickness((1.0 + 0.3 * np.sin(x))[None])
-    if kind == "fibres":
-        return geometry.fibres(np.array([[1.0, -0.5]]))
-    annulus = model.contact_valve.motion.annulus[-1]
-    if kind == "annulus":
-        return geometry.annulus((0.1 * annulus[:, [1, 2, 0]])[None])
-    if kind == "insertions":
-        return geometry.insertions(0.5 * np.roll(model.valve.chordae.insertion / 20, 1, 1)[None])
-    tips = np.array([[[0.5, 0.7, -0.3], [-0.2, 0.4, 0.9]]])
-    lengths = np.linspace(-1, 1, len(model.valve.chordae))[None]
-    return geometry.tips(tips if kind == "tips" else 0 * tips, None if kind == "tips" else lengths)
+def variation_of(geometry, part):
+    """A smooth change of one part, as the geometry's derivative has it."""
+    move = PARTS[part](geometry.surface.vertices.T / 10.0, geometry.model)
+    return geometry.variation({part: move[None]})
 
 
 def displaced(model, variation, h, start):
@@ -117,7 +113,7 @@ def closed():
     return model
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PARTS)
 def test_the_closed_valve_moves_with_its_geometry_as_displaced_valves_do(closed, kind):
     coarse, fine, best = study(closed, kind)
     assert coarse / fine == pytest.approx(16, rel=0.15)
@@ -126,26 +122,12 @@ def test_the_closed_valve_moves_with_its_geometry_as_displaced_valves_do(closed,
 
 def test_quantities_together_are_what_each_is_alone(closed):
     geometry = RestGeometry(closed)
-    parts = [variation_of(geometry, kind) for kind in KINDS]
+    parts = [variation_of(geometry, kind) for kind in PARTS]
     together = geometry.change(AT, RestVariation.joined(parts))
-    assert together.shape == (2, len(closed.valve.surface.vertices), 3, len(KINDS))
+    assert together.shape == (2, len(closed.valve.surface.vertices), 3, len(PARTS))
     for k in (0, 2, 4):
         alone = geometry.change(AT, parts[k])[..., 0]
         np.testing.assert_allclose(together[..., k], alone, atol=1e-9 * np.abs(alone).max())
-
-
-PARTS = {
-    "shape": lambda at, model: np.stack(
-        [np.sin(at[0] + at[1]), np.cos(at[1] - at[2]), np.sin(at[2])], axis=-1
-    ),
-    "thickness": lambda at, model: 1.0 + 0.3 * np.sin(at[0]),
-    "fibres": lambda at, model: np.array([1.0, -0.5]),
-    "annulus": lambda at, model: 0.1 * model.contact_valve.motion.annulus[-1][:, [1, 2, 0]],
-    "tips": lambda at, model: np.array([[0.5, 0.7, -0.3], [-0.2, 0.4, 0.9]]),
-    "rest_lengths": lambda at, model: np.linspace(-1, 1, len(model.valve.chordae)),
-    "insertions": lambda at, model: 0.5 * np.roll(model.valve.chordae.insertion / 20, 1, 1),
-}
-"""Smooth changes of each part, of about 1 mm, 1 or 1 rad."""
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -203,25 +185,3 @@ def test_a_leaflet_is_thicker_on_both_faces_and_moves_as_a_whole(closed):
 def test_a_valve_that_still_moves_has_no_derivative_by_its_geometry():
     with pytest.raises(InputError, match="ends in equilibrium"):
         RestGeometry(model_of(OPEN))
-
-
-def test_weights_of_a_chords_end_follow_its_insertion():
-    valve, move = model_of(CLOSING).contact_valve, np.array([0.3, -0.5, 0.2])
-    members, weights, slope = patch_members(valve, 2.0, valve.chordae.insertion)
-
-    def all_weights(h):
-        there, own, _ = patch_members(valve, 2.0, valve.chordae.insertion + h * move)
-        out = np.zeros((len(own), len(valve.surface.vertices)))
-        np.add.at(out, (np.arange(len(own))[:, None], there), own)
-        return out
-
-    exact = np.zeros((len(weights), len(valve.surface.vertices)))
-    ends = np.broadcast_to(move, (1, *slope.shape))
-    change = patch_change(weights, slope, ends)[0]
-    np.add.at(exact, (np.arange(len(weights))[:, None], members), change)
-    difference = (all_weights(1e-5) - all_weights(-1e-5)) / 2e-5
-    # Of chords whose patch has a radius of its own, by their nearest vertex, that changes as well.
-    d = np.linalg.norm(valve.surface.vertices[:, None] - valve.chordae.insertion, axis=2).min(0)
-    fixed = 1.05 * d < 2.0 - 1e-3
-    assert fixed.sum() > 10
-    np.testing.assert_allclose(exact[fixed], difference[fixed], atol=1e-6)

@@ -1,4 +1,4 @@
-"""The gate with cheap stand-ins for the valve, whose states and derivatives are known by hand."""
+"""The gate with cheap stand-ins for the valve, whose closed states are known by hand."""
 
 import numpy as np
 import pytest
@@ -57,33 +57,6 @@ def test_one_closed_state_passes():
     assert [row.case for row in report.rows] == ["reference", *BY_NAME]
     assert all(row.passed for row in report.rows)
     assert max(row.max_mm for row in report.rows) < 1e-12
-    np.testing.assert_allclose(report.closed, OPEN + DIRECTION + 1.5)
-
-
-def test_the_cases_are_the_variations_that_must_not_matter():
-    # Each changes what its name says and nothing else.
-    plain = GateCase("x")
-    changed = {
-        case.name: {k for k in plain.__slots__ if getattr(case, k) != getattr(plain, k)} - {"name"}
-        for case in GATE_CASES
-    }
-    assert list(changed.values()) == [
-        {"dt"},
-        {"dt"},
-        {"dt"},
-        {"dt", "converged_path"},
-        {"dt", "ramp", "converged_path"},
-        {"activation"},
-        {"sampling"},
-        {"mesh"},
-        {"guided"},
-        {"perturbed"},
-        {"start"},
-        {"start"},
-    ]
-    # Of the default ramp of 0.3 s in one step: less than 10 ms, and a ramp of 0.1 s.
-    assert all(0.3 * case.dt < 0.01 for case in GATE_CASES[3:5])
-    assert 0.3 * GATE_CASES[4].ramp == pytest.approx(0.1)
 
 
 def test_moduli_are_followed_together_and_one_by_one():
@@ -104,14 +77,6 @@ def test_moduli_are_followed_together_and_one_by_one():
     assert [path.closures for path in report.paths] == [4, 2, 2]
 
 
-def test_a_valve_of_one_modulus_is_followed_once():
-    class One(Valve):
-        names = ("E_f.leaflet", "chord_stiffness", "pressure_scale")
-
-    report = run_gate(lambda case: One(), AT, [])
-    assert [path.name for path in report.paths] == ["E_f"]
-
-
 def test_a_jump_along_the_moduli_fails():
     report = run_gate(built(jump_at=1.1), AT)
     assert not report.passed
@@ -127,7 +92,7 @@ def test_a_wrong_derivative_fails():
     report = run_gate(built(wrong=1.1), AT)
     assert not report.passed
     assert all(row.passed for row in report.rows)
-    assert "of the whole way" in report.paths[0].reason
+    assert "of the whole motion" in report.paths[0].reason
 
 
 def move(vertices, distance):
@@ -136,7 +101,7 @@ def move(vertices, distance):
     return Valve(shift=shift)
 
 
-@pytest.mark.parametrize("name", list(BY_NAME))
+@pytest.mark.parametrize("name", ["time step / 2", "continued from E_f - 20 %"])
 @pytest.mark.parametrize(
     ("vertices", "distance", "mean", "largest"),
     # Everything by more than 0.1 mm fails by its mean; one of four by 0.6 mm also by its maximum.
@@ -149,33 +114,6 @@ def test_a_jump_in_one_case_fails(name, vertices, distance, mean, largest):
     assert row.case == name
     assert row.mean_mm == pytest.approx(mean)
     assert row.max_mm == pytest.approx(largest)
-
-
-def test_the_limits_are_a_tenth_in_the_mean_and_half_a_millimetre_anywhere():
-    # With 2 x 12 points one far point changes the mean little: only the maximum can see it.
-    class Many(Valve):
-        def __call__(self, m):
-            one = super().__call__(m)
-            open_, closed = one.y.reshape(2, -1)
-            calm = OPEN + (m[0] + m[1]) / 8.0 * DIRECTION + m[2]
-            y = np.concatenate([open_, open_, open_, closed, calm.ravel(), calm.ravel()])
-            by_open, by_closed = np.split(one.jacobian, 2)
-            return Prediction(y, np.concatenate([by_open] * 3 + [by_closed] * 3))
-
-    def report(distance):
-        shift = np.zeros((4, 3))
-        shift[0, 0] = distance
-        return run_gate(
-            lambda case: Many(shift=shift) if case.mesh != 1 else Many(),
-            AT,
-            [BY_NAME["mesh x 1.5"]],
-        )
-
-    assert report(0.49).passed
-    failed = report(0.51)
-    assert failed.rows[1].mean_mm < 0.1
-    assert not failed.rows[1].passed
-    assert not failed.passed
 
 
 def test_a_continued_closure_ends_where_the_valve_is_closed_at_once():
@@ -199,35 +137,12 @@ def test_a_failed_closure_is_a_row_with_its_reason():
     report = run_gate(built({"mesh x 1.5": Valve(reason="it buckled")}), AT)
     (row,) = [row for row in report.rows if not row.passed]
     assert (row.case, row.reason) == ("mesh x 1.5", "it buckled")
-    assert np.isnan(row.mean_mm)
-    assert np.isnan(row.max_mm)
+    assert np.isnan([row.mean_mm, row.max_mm]).all()
     assert not report.passed
-
-
-def test_without_a_reference_nothing_else_is_run():
-    asked = []
-
-    def build(case):
-        asked.append(case.name)
-        return Valve(reason="no convergence")
-
-    seen = []
-    report = run_gate(build, AT, on_case=seen.append)
-    assert asked == ["reference"]
+    # Without a reference nothing else is run.
+    report = run_gate(lambda case: Valve(reason="no convergence"), AT)
     assert not report.passed
-    assert report.closed is None
-    (row,) = report.rows
-    assert row is seen[0]
-    assert (row.case, row.passed, row.reason) == ("reference", False, "no convergence")
-
-
-def test_rows_and_paths_are_told_as_they_are_finished():
-    seen, followed = [], []
-    cases = [GateCase("time step / 2", dt=0.5), GateCase("ramp / 3", ramp=1 / 3)]
-    report = run_gate(built(), AT, cases, on_case=seen.append, on_path=followed.append)
-    assert tuple(seen) == report.rows
-    assert [row.case for row in seen] == ["reference", "time step / 2", "ramp / 3"]
-    assert tuple(followed) == report.paths
+    assert [(row.case, row.reason) for row in report.rows] == [("reference", "no convergence")]
 
 
 def test_a_model_is_varied_as_its_case_says_and_begins_anew():
@@ -250,29 +165,15 @@ def test_a_model_is_varied_as_its_case_says_and_begins_anew():
             vary(model, case)
 
 
-def test_a_perturbed_start_is_smooth_of_the_stated_size_and_another_with_another_seed():
-    model = model_of(GENTLE, **SMALL)
-    one, other = (vary(model, GateCase("x", perturbed=seed)) for seed in (1, 2))
-    nodes = model.mesh.nodes
-    for varied in (one, other):
-        assert np.linalg.norm(varied.perturbation, axis=1).max() == pytest.approx(PERTURBATION)
-    assert np.abs(one.perturbation - other.perturbation).max() > 0.5 * PERTURBATION
-    # Neighbouring nodes move alike: the leaflets are warped, not torn.
-    near = np.linalg.norm(nodes - nodes[0], axis=1) < 2.0
-    spread = np.linalg.norm(one.perturbation[near] - one.perturbation[0], axis=1)
-    assert spread.max() < PERTURBATION
-    np.testing.assert_allclose(
-        vary(model, GateCase("x", perturbed=1)).perturbation, one.perturbation
-    )
-
-
 def test_a_perturbed_valve_closes_in_the_same_state():
     model = model_of(GENTLE, **SMALL)
     at = np.array([6.0, 2.0])[: len(model.names)]
-    moved = vary(model, GateCase("x", perturbed=1))
+    moved, other = (vary(model, GateCase("x", perturbed=seed)) for seed in (1, 2))
+    assert np.linalg.norm(moved.perturbation, axis=1).max() == pytest.approx(PERTURBATION)
+    assert np.abs(moved.perturbation - other.perturbation).max() > 0.5 * PERTURBATION
     here, there = (m.close(at, sensitivities=False).simulation for m in (model, moved))
     assert here.converged
     assert there.converged
-    # It began elsewhere, which its first frame says, and ends in the same equilibrium.
+    # It began elsewhere, and ends in the same equilibrium.
     assert np.abs(there.frames[0] - here.frames[0]).max() > 0.3
     np.testing.assert_allclose(there.frames[-1], here.frames[-1], atol=1e-6)

@@ -1,6 +1,6 @@
-"""Made-up closed states along a modulus: curvature passes, jumps do not, kinks as is said of them.
+"""Made-up closed states along a modulus: curvature passes, jumps and wrong derivatives do not.
 
-States are of 400 vertices, of which a few may jump: in a mean that would be lost.
+States have 400 vertices, of which a few may jump, which a mean would not show.
 """
 
 import numpy as np
@@ -64,7 +64,7 @@ def test_smooth_responses_pass_however_curved(shape, slope):
     assert [p.high for p in path.pieces[:-1]] == [p.low for p in path.pieces[1:]]
 
 
-@pytest.mark.parametrize("place", [-0.2, -0.07, -0.03, -0.005, 0.005, 0.03, 0.07, 0.15])
+@pytest.mark.parametrize("place", [-0.2, -0.005, 0.07])
 @pytest.mark.parametrize("curve", [waves(0.1, 0.3), waves(0.3, 0.08)])
 def test_a_jump_of_few_vertices_is_seen_wherever_it_is(place, curve):
     path = judged(response(*curve, place, 0.3))
@@ -77,17 +77,6 @@ def test_a_jump_of_few_vertices_is_seen_wherever_it_is(place, curve):
     assert last.width < RESOLUTION
     assert f"at {FEW} vertices" in path.reason
     assert "a jump of 0.3" in path.reason or "a jump of 0.2" in path.reason
-
-
-def test_the_same_jump_is_invisible_in_the_mean():
-    # 0.3 mm at 4 of 400 vertices: 0.003 mm in the mean; and 1.5 % of the way from 0.8 to 1.2.
-    one, two = (response(*waves(1.0, 1.0), 0.1, jump) for jump in (0.0, 0.3))
-    moved = np.linalg.norm(two(1.2).y - one(1.2).y, axis=1)
-    assert moved.mean() == pytest.approx(0.003)
-    central = (two(1.2).y - two(0.8).y) / np.log(1.5)
-    exact = two(1.0).slope
-    assert np.linalg.norm(central - exact) / np.linalg.norm(exact) < SLOPE_LIMIT
-    assert not judged(two).passed
 
 
 def test_a_jump_within_the_limit_passes_and_one_beyond_does_not():
@@ -131,7 +120,7 @@ def test_a_derivative_that_is_wrong_everywhere_is_seen_by_its_share():
     assert judged(response(*right)).passed
     path = judged(response(*right, wrong=1.1))
     assert not path.passed
-    assert path.reason.startswith("9.1 % of the whole way")
+    assert "explain 9.1 % of the whole motion" in path.reason
     assert path.pieces[-1].unexplained_mm < SEEN
 
 
@@ -145,21 +134,14 @@ def test_a_slope_that_doubles_passes_where_it_moves_less_than_is_seen(slope, pas
     path = judged(response(shape, lambda s: slope * (1.0 + (s > 0.003))))
     assert max(piece.share for piece in path.pieces) == pytest.approx(0.132, abs=0.01)
     assert path.passed == passes, path.reason
-    assert passes or "13 % of the way between +0 % and +1 %, up to 0.046 mm" in path.reason
-
-
-@pytest.mark.parametrize(("jump", "passes"), [(0.004, True), (0.01, False)])
-def test_a_jump_of_all_vertices_passes_where_it_is_less_than_is_seen(jump, passes):
-    # 14 and 35 micrometres at the vertex that jumps farthest: both below the limit of one vertex.
-    path = judged(response(lambda s: s + jump * (s > 0.1), lambda s: 1.0 + 0.0 * s))
-    assert path.passed == passes, path.reason
+    assert passes or "13 % of the motion between +0 % and +1 %, up to 0.046 mm" in path.reason
 
 
 def test_many_small_jumps_are_seen_by_what_they_add_up_to():
     # 14 micrometres every 2 %: each less than is seen, together 7 % of the way.
     path = judged(response(lambda s: 3.0 * s + 0.004 * np.round(s / 0.02), lambda s: 3.0 + 0.0 * s))
     assert max(piece.unexplained_mm for piece in path.pieces) < SEEN
-    assert "% of the whole way" in path.reason
+    assert "% of the whole motion" in path.reason
     assert path.share == pytest.approx(0.004 / (3.0 * 0.02), rel=0.1)
 
 
@@ -179,14 +161,6 @@ def test_what_is_seen_is_what_an_estimator_believes_of_a_point():
     assert ErrorBeliefs().resolution_mm == SEEN
 
 
-def test_closures_are_few_where_nothing_is_amiss_and_bounded_where_it_is():
-    calm = judged(response(*waves(0.1, 0.5)))
-    assert calm.closures == len(FACTORS)
-    jump = judged(response(*waves(0.1, 0.5), 0.1, 0.3))
-    # 0.13 wide: halved until narrower than the resolution, three times.
-    assert jump.closures == len(FACTORS) + 3
-
-
 def test_a_closure_that_fails_is_the_reason():
     def close(factor):
         return "it buckled" if factor > 1.1 else response(*waves(0.1, 0.5))(factor)
@@ -194,7 +168,3 @@ def test_a_closure_that_fails_is_the_reason():
     path = follow("E_f.anterior", close, response(*waves(0.1, 0.5))(1.0), FACTORS)
     assert not path.passed
     assert path.reason == "no closed state at +20 %: it buckled"
-
-
-def test_a_valve_that_does_not_move_is_smooth():
-    assert judged(response(lambda s: 0.0 * s, lambda s: 0.0 * s)).passed

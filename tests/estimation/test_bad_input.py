@@ -16,7 +16,6 @@ from mvest.estimation import (
     moran,
     nees,
     observation_noise,
-    zero_mean,
 )
 from tests.estimation.problems import bound
 
@@ -54,22 +53,17 @@ BAD = [
     (lambda: Gaussian(np.eye(2), np.eye(2)), r"shape \(p,\).*\(2, 2\)"),
     (lambda: normal(np.empty((0, 0)), ()), r"p at least 1; got \(0,\)"),
     (lambda: normal(np.eye(2), (1.0, np.nan)), "mean.*entry 1 is nan"),
-    (lambda: normal(np.eye(3)), r"\(2, 2\); got \(3, 3\)"),
     (lambda: normal(np.diag([1.0, np.inf])), r"entry \(1, 1\) is inf"),
     (lambda: normal(np.diag([1.0, -0.5])), "negative variance -0.5 in row 1"),
     (lambda: normal([[1.0, 0.2], [0.1, 1.0]]), r"\(0, 1\) is 0.2 and entry \(1, 0\) is 0.1"),
     (lambda: normal([[1.0, 2.0], [2.0, 1.0]]), "semi-definite; the smallest eigenvalue.*-1"),
-    (lambda: normal([[0.0, 1e-30], [1e-30, 1.0]]), "symmetric|semi-definite"),
     (lambda: Gaussian.from_variance(np.zeros(2), np.ones(3)), r"have shape \(2, 2\); got \(3,\)"),
     (lambda: noise(np.ones(4), 3), "the 3 variances.*\\(4,\\)"),
-    (lambda: noise(0.0, 3), "variance in R is 0, expected > 0"),
     (lambda: noise([1.0, -2.0]), "variance in R is -2"),
     (lambda: noise(np.nan), "R must be finite"),
     (lambda: noise(np.eye(3)), r"\(2, 2\); got shape \(3, 3\)"),
     (lambda: noise([[1.0, 0.5], [0.0, 1.0]]), "R must be symmetric"),
     (lambda: noise([[1.0, 2.0], [2.0, 1.0]]), "positive definite"),
-    (lambda: noise([[1.0, 1.0], [1.0, 1.0]]), "positive definite"),
-    (lambda: noise([[np.nan, 0.0], [0.0, 1.0]]), "R must be finite"),
     (lambda: observation_noise(sparse.eye_array(3), 3), "R must be numbers"),
     (lambda: prediction(PATH, [[1.0], [0.0]]), r"\(n, p\); got \(3,\) and \(2, 1\)"),
     (lambda: prediction([0.0, np.nan], [[0.0], [0.0]]), "y must be finite; entry 1 is nan"),
@@ -77,7 +71,6 @@ BAD = [
     (lambda: prediction([0.0], [[0.0]], converged=False), "no values.*Prediction.failed"),
     (lambda: Prediction.failed(" "), "must say why"),
     (lambda: run(y=[[1.0]]), r"shape \(n,\).*\(1, 1\)"),
-    (lambda: run(y=[]), r"n > 0; got \(0,\)"),
     (lambda: run(y=[1.0, np.nan, 2.0]), "y must be finite; entry 1"),
     (lambda: run(y=[1.0, 2.0]), r"must predict 2 observations.*y of shape \(3,\)"),
     (
@@ -89,24 +82,18 @@ BAD = [
     (lambda: run(PaperFilter(Q=np.ones(3))), r"Q must have shape \(2, 2\); got \(3,\)"),
     (lambda: run(PaperFilter(Q=-0.01)), "Q has a negative variance -0.01"),
     (lambda: PaperFilter(tolerance=0.0), "filter tolerance = 0.0, expected > 0"),
-    (lambda: IteratedFilter(tolerance=np.nan), "filter tolerance = nan"),
     (lambda: IteratedFilter(objective_tolerance=-1.0), "filter objective_tolerance = -1.0"),
     (lambda: PaperFilter(max_iterations=0), "max_iterations = 0, expected >= 1"),
-    (lambda: IteratedFilter(max_iterations=0), "max_iterations = 0, expected >= 1"),
     (lambda: run(IteratedFilter(start=(1.0,))), r"start must be 2 finite numbers; got \(1.0,\)"),
-    (lambda: run(IteratedFilter(start=(1.0, np.inf))), "start must be 2 finite numbers"),
     (lambda: run(IteratedFilter(start=(1.0, 4.0)), prior=HALF_FIXED), "holds fixed"),
     (lambda: run(prior=normal(np.eye(2), (2.0, -3.0)), transform=Log()), "parameter 1 is -3"),
     (lambda: run(IteratedFilter(start=(0.0, 1.0)), transform=Log()), "positive; parameter 0 is 0"),
     (lambda: run(transform=Log((True,))), "names 1 parameters, but there are 2"),
     (lambda: run().interval(1.0), "between 0 and 1; got 1"),
     (lambda: chi_square_band(0), "degree of freedom"),
-    (lambda: chi_square_band(3, 95.0), "between 0 and 1; got 3 and 95"),
     (lambda: nees(np.zeros((2, 2)), np.eye(2)), r"\(p,\).*got \(2, 2\)"),
     (lambda: nees(np.zeros(2), np.diag([1.0, 0.0])), "positive definite"),
-    (lambda: nees(np.zeros(2), np.eye(3)), r"\(2, 2\); got \(3, 3\)"),
-    (lambda: zero_mean(np.array([1.0, 2.0])), "n at least 3"),
-    (lambda: zero_mean(np.ones(5)), "all 5 innovations equal 1"),
+    (lambda: moran(np.ones(3), sparse.eye_array(3)), "different numbers"),
     (lambda: moran(PATH, sparse.eye_array(4)), r"\(3, 3\); got \(4, 4\)"),
     (lambda: moran(PATH, sparse.eye_array(3)), "zero diagonal"),
     (lambda: moran(PATH, sparse.csr_array((3, 3))), "one pair"),
@@ -148,10 +135,3 @@ def test_round_off_in_a_covariance_is_accepted():
     P = np.outer([1.0, -2.0, 0.5], [1.0, -2.0, 0.5])
     L = Gaussian(np.zeros(3), P).factor
     np.testing.assert_allclose(L @ L.T, P, atol=1e-14)
-
-
-def test_variances_of_all_shapes():
-    full = np.array([[2.0, 1.0], [1.0, 2.0]])
-    for given, P in ((0.01, 0.01 * np.eye(2)), ([1.0, 4.0], np.diag([1.0, 4.0])), (full, full)):
-        found = Gaussian.from_variance(np.zeros(2), np.array(given)).covariance
-        np.testing.assert_array_equal(found, P)

@@ -15,7 +15,7 @@ from mvest.estimation import (
     Prediction,
     UnscentedFilter,
 )
-from mvest.estimation.prediction import Remembered, SharedStart, as_prediction, of_some, predict
+from mvest.estimation.prediction import Remembered, as_prediction, of_some, predict
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import Problem
 from mvest.reporting.expectation import expectation_text
@@ -49,13 +49,6 @@ def test_a_filter_takes_a_pair_as_a_prediction_and_hands_on_what_comes_with_it(n
     np.testing.assert_array_equal(found.covariance, whole.covariance)
     assert found.converged
     np.testing.assert_allclose(whole.prediction.aux, whole.mean, rtol=1e-12)
-
-
-def test_what_a_model_without_derivatives_hands_on_arrives_too() -> None:
-    model = lambda m: Prediction(H @ m, np.empty((6, 0)), aux=tuple(m))  # noqa: E731
-    found = UnscentedFilter()(model, PRIOR, Y, 0.1)
-    assert found.prediction.differentiated
-    np.testing.assert_allclose(found.prediction.aux, found.mean, rtol=1e-12)
 
 
 def run_expectation(model):
@@ -144,18 +137,3 @@ def test_a_remembered_run_is_not_repeated() -> None:
     assert (len(exact.runs), len(near.runs), len(calls)) == (3, 2, 5)
     Remembered(model, near.runs)(np.array([5.0, 5.0]))
     assert len(near.runs) == 2
-
-
-def test_a_shared_start_takes_pairs() -> None:
-    class Model:
-        closed = None
-
-        def restart(self, closed) -> None:
-            pass
-
-        def __call__(self, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return pair(m)
-
-    shared = SharedStart(Model(), np.ones(2))
-    for m in (np.ones(2), np.zeros(2)):
-        np.testing.assert_array_equal(shared(m).y, H @ m)

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from mvest.errors import InputError
-from mvest.estimation import Gaussian, kalman_update, observation_noise
+from mvest.estimation import observation_noise
 from mvest.estimation.sampled import SampledErrors
 
 N, P0 = 60, np.diag([0.25, 0.16, 0.01])
@@ -54,38 +54,6 @@ def test_intervals_hold_the_truth_as_often_as_stated_and_those_of_the_filter_do_
             tries += 1
     assert np.all(hits / tries > 0.9)
     assert filters[0] / tries < 0.8
-
-
-def test_without_the_leave_one_out_the_formula_is_that_of_joseph():
-    # Where the base dominates, leaving one out changes nothing.
-    known = sampled(20.0, errors(200, 3))
-    K = gain_of(covariance_of(known.noise))
-    rest = np.eye(3) - K @ H
-    left = rest @ P0 @ rest.T
-    part = widened(200) * K @ (known.samples @ known.samples.T / 200) @ K.T
-    found = known.posterior(H, P0)
-    np.testing.assert_allclose(found.covariance, left + part, rtol=0.02, atol=1e-6)
-    np.testing.assert_allclose(found.covariance - found.from_samples, left, rtol=1e-8, atol=1e-12)
-
-
-def test_the_noise_is_that_of_the_base_and_the_mean_square_of_the_samples():
-    known = sampled(0.3, errors(7, 5))
-    expected = 0.09 * np.eye(N) + known.samples @ known.samples.T / 7
-    np.testing.assert_allclose(covariance_of(known.noise), expected, rtol=1e-6, atol=1e-9)
-
-
-def test_tiny_samples_leave_only_the_prior_s_part():
-    own = kalman_update(Gaussian(np.zeros(3), P0), np.zeros(N), H, observation_noise(0.09, N))
-    covariance = sampled(0.3, 1e-9 * errors(5, 6)).posterior(H, P0).covariance
-    assert np.all(np.diag(covariance) < own.posterior.std**2)
-
-
-def test_few_samples_widen_by_student_s_distribution():
-    # So little weight that all gains are one: leaving one out changes nothing.
-    samples = errors(4, 7)
-    moved = gain_of(1e6 * np.eye(N)) @ samples
-    found = sampled(1e3, samples).posterior(H, P0).from_samples
-    np.testing.assert_allclose(found, widened(4) / 4 * moved @ moved.T, rtol=1e-3)
 
 
 def test_samples_of_one_source_are_left_out_together():

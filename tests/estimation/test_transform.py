@@ -61,44 +61,6 @@ def test_derivative_is_that_of_the_inverse(transform):
     np.testing.assert_allclose(transform.forward(transform.inverse(z)), z)
 
 
-def test_both_coordinates_find_the_same_mode_where_the_data_decide():
-    # With a vague prior the answer is the data's, and the Gauss-Newton covariance H'R^-1 H inverse
-    # is the same to first order in either coordinate.
-    def model(m):
-        return Prediction(
-            np.array([m[0] * m[1], m[0] / m[1], m[1] ** 2]),
-            np.array([[m[1], m[0]], [1.0 / m[1], -m[0] / m[1] ** 2], [0.0, 2.0 * m[1]]]),
-        )
-
-    prior = Gaussian.from_variance(np.array([5.0, 3.0]), 1e6)
-    truth = np.array([6.23, 2.09])
-    tight = IteratedFilter(tolerance=1e-9)
-    results = [tight(model, prior, model(truth).y, 1e-4, transform=t) for t in (Identity(), Log())]
-    for estimate in results:
-        assert estimate.converged
-        np.testing.assert_allclose(estimate.mean, truth, rtol=1e-6)
-    np.testing.assert_allclose(results[0].covariance, results[1].covariance, rtol=1e-5)
-
-
-def test_logarithms_keep_iterates_positive_where_the_identity_does_not():
-    # h = 100/m, seen 100 from m0 = 8: the slope -100/64 sends the identity's step below zero.
-    def model(m):
-        if m[0] <= 0.0:
-            return Prediction.failed("a modulus must be positive")
-        return Prediction(100.0 / m, -100.0 / m[:, None] ** 2)
-
-    prior, y = Gaussian(np.array([8.0]), np.array([[100.0]])), np.array([100.0])
-    plain = PaperFilter()(model, prior, y, 0.01)
-    assert plain.reason is Reason.MODEL_FAILED
-    assert "must be positive" in plain.detail
-    # The iterated filter shortens the step instead, or never meets one in logarithms.
-    for transform in (Identity(), Log()):
-        estimate = IteratedFilter()(model, prior, y, 0.01, transform=transform)
-        assert estimate.converged
-        assert np.all(estimate.iterates > 0.0)
-        assert estimate.mean[0] == pytest.approx(1.0, rel=1e-3)
-
-
 def test_an_overflowing_step_is_a_value():
     # exp of the first full step overflows; the paper's mode cannot go on, and says so.
     def model(m):

@@ -7,8 +7,6 @@ import pytest
 
 from experiments.common.cases.own_case import ImagedInput
 from experiments.studies.imaging.detectors import ImagingSettings
-from mvest.imaging.detection.trained_model import STAGES
-from mvest.imaging.valve_sequence import LANDMARKS
 from tests.places import ROOT
 
 OWN, PAGE = ROOT / "mvest" / "imaging" / "README.md", ROOT / "docs" / "volume.md"
@@ -26,16 +24,6 @@ def test_settings_that_are_named_exist(path, parts):
         named = set(re.findall(rf"(?<![\w./]){part}\.(\w+)\b", text)) - {"md"}
         assert named, part
         assert named <= {f.name for f in fields(SETTINGS[part])}
-
-
-def test_all_stages_and_landmarks_are_named():
-    text = OWN.read_text(encoding="utf-8")
-    for name in LANDMARKS:
-        assert f"`{name}`" in text
-    for name in {re.sub(r"_\d+$", "", stage) for stage in STAGES}:
-        assert re.search(rf"`{name}(_0)?`", text), name
-    last = max(int(found[1]) for stage in STAGES if (found := re.match(r"landmark_(\d+)", stage)))
-    assert f"`landmark_0` to `_{last}`" in text
 
 
 def test_local_links_lead_somewhere():

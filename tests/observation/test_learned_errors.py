@@ -62,18 +62,6 @@ def test_frames_scales_and_unseen_vertices_are_those_of_the_observation() -> Non
     assert np.abs(R[: 3 * (N - 30), 3 * (N - 30) :]).max() < 1e-12
 
 
-def test_errors_stated_independent_are_mostly_rough() -> None:
-    seen = Observation(("closed",), np.zeros((1, N, 3)), np.array(0.25))
-    smooth, length, rough = BELIEFS.parts(0.5, 0.0)
-    assert (smooth.median, length.median, rough.median) == (0.1, BELIEFS.length_mm, 0.5)
-    family = error_family(seen, BELIEFS, 0.0, POINTS)
-    assert family.quantities[ROUGH] == rough
-    with pytest.raises(InputError, match="all vertices at rest"):
-        error_family(seen, BELIEFS, 0.0, POINTS[1:])
-    with pytest.raises(InputError, match="all vertices at rest"):
-        error_family(seen, BELIEFS, 0.0)
-
-
 def surface_observation(height: FloatArray, curve: FloatArray) -> SurfaceObservation:
     """A sheet of two leaflets seen displaced by a height (n,), and its border."""
     border = np.concatenate(

@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import GeometryError, InputError
 from mvest.estimation import observation_noise
-from mvest.estimation.noise import kronecker_noise, stacked_noise
+from mvest.estimation.noise import stacked_noise
 from mvest.observation.errors import (
     AnnulusOffset,
     CoaptationDropout,
@@ -14,7 +14,6 @@ from mvest.observation.errors import (
     WhiteNoise,
     observe,
 )
-from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import LeafletSurface
 
 
@@ -56,21 +55,6 @@ def test_correlated_noise_has_its_variance_and_correlation_everywhere() -> None:
     assert np.abs(np.corrcoef(between.T) - np.eye(3)).max() < 4.5 / np.sqrt(DRAWS)
 
 
-def test_frames_are_independent_of_each_other() -> None:
-    noise = CorrelatedNoise(1.0, SpatialCorrelation(LINE, 5.0))
-    generator = rng(4)
-    drawn = np.array(
-        [noise(np.zeros((2, 41, 3)), np.zeros((2, 41, 3)), generator)[:, 7] for _ in range(DRAWS)]
-    )
-    assert abs(np.corrcoef(drawn[:, 0, 0], drawn[:, 1, 0])[0, 1]) < 4.5 / np.sqrt(DRAWS)
-
-
-def test_the_paper_s_vertices_can_be_correlated() -> None:
-    surface = Template().valve(56, 15).surface
-    correlation = SpatialCorrelation(surface.vertices, 5.0)
-    np.testing.assert_allclose((correlation.factor**2).sum(axis=1), 1.0, rtol=1e-9)
-
-
 @pytest.mark.parametrize("length", [0.0, -1.0, np.nan])
 def test_an_inadmissible_length_is_refused(length: float) -> None:
     with pytest.raises(InputError, match="correlation length"):
@@ -89,14 +73,6 @@ def test_inadmissible_noise_is_refused(make, std: float) -> None:
 def test_noise_of_other_vertices_is_refused() -> None:
     with pytest.raises(InputError, match="40 vertices"):
         observe(np.zeros((1, 40, 3)), [CorrelatedNoise(1.0, SpatialCorrelation(LINE, 5.0))], rng())
-
-
-def test_seeds_are_reproducible_and_independent() -> None:
-    true = np.zeros((1, 41, 3))
-    errors = [WhiteNoise(0.5), CorrelatedNoise(0.5, SpatialCorrelation(LINE, 5.0))]
-    one, again, other = (observe(true, errors, rng(seed)) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, again)
-    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 4.5 / np.sqrt(123)
 
 
 def facing(gap: float) -> tuple[LeafletSurface, np.ndarray]:
@@ -147,17 +123,6 @@ def test_what_is_near_at_rest_is_no_coaptation() -> None:
     np.testing.assert_array_equal(observe(true, [CoaptationDropout(1.2, joined)], rng()), true)
 
 
-def test_what_is_hidden_depends_on_the_truth_and_not_on_the_noise() -> None:
-    surface, closed = facing(0.5)
-    true = closed[None]
-    masks = [
-        np.isnan(observe(true, [WhiteNoise(5.0), CoaptationDropout(1.2, surface)], rng(seed)))
-        for seed in (1, 2)
-    ]
-    np.testing.assert_array_equal(*masks)
-    assert masks[0].any()
-
-
 def test_a_drop_out_of_everything_is_refused() -> None:
     surface, closed = facing(0.5)
     with pytest.raises(GeometryError, match="hides every vertex"):
@@ -194,9 +159,3 @@ def test_structured_noise_is_the_dense_covariance() -> None:
     assert observation_noise(noise, n) is noise
     with pytest.raises(InputError, match="expected 7"):
         observation_noise(noise, 7)
-
-
-def test_kronecker_noise_without_correlation_is_white() -> None:
-    noise = kronecker_noise(4.0, np.eye(5), 3)
-    np.testing.assert_allclose(noise.whiten(np.ones(15)), 0.5)
-    assert noise.log_determinant == pytest.approx(15 * np.log(4.0))

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.observation.surfaces import (
     UNKNOWN,
@@ -11,6 +10,7 @@ from mvest.observation.surfaces import (
     PredictedSurface,
     SurfaceObservation,
 )
+from mvest.observation.vertices import vertex_sets
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.moving_distance import smooth_distances, smooth_offsets
 
@@ -46,7 +46,7 @@ def seen(points, region, **more):
     return ObservedSurface("closed", points, region, **more)
 
 
-def observation(count=300, off=0.6, seed=1):
+def observation(count=80, off=0.6, seed=1):
     rng = np.random.default_rng(seed)
     picked = rng.integers(0, len(SURFACE.triangles), count)
     corners = moved(np.zeros(3))[0][SURFACE.triangles[picked]]
@@ -123,15 +123,11 @@ def test_an_edge_is_compared_with_that_of_its_own_leaflet():
     assert smooth_offsets(point, across, two, still, 0.5)[0][0] < 0.5
 
 
-def test_leaflets_along_the_free_edge_are_those_of_its_triangles():
-    along = FINE.leaflet_along(FINE.free_edge)
-    assert along.shape == FINE.free_edge.shape
-    for leaflet in (0, 1):
-        number = VALVE.surface.region_names[leaflet]
-        assert np.count_nonzero(along == leaflet) == len(along) // 2, number
-
-
-def test_regions_of_an_edge_must_fit():
-    curve = REST[VALVE.free_edge]
-    with pytest.raises(InputError, match=r"expected \(40,\)"):
-        seen(REST, np.zeros(len(REST), int), free_edge=curve, free_edge_region=np.zeros(3, int))
+def test_sets_of_vertices():
+    # Vertices row by row, the annulus first.
+    rows = {name: members.reshape(7, 12) for name, members in vertex_sets(12, 7).items()}
+    assert rows["all vertices"].all()
+    assert [int(r.any()) for r in rows["belly (middle third)"]] == [0, 0, 1, 1, 1, 0, 0]
+    assert [int(r.any()) for r in rows["free edge"]] == [0, 0, 0, 0, 0, 0, 1]
+    assert [int(r.any()) for r in rows["annulus and free edge"]] == [1, 0, 0, 0, 0, 0, 1]
+    assert rows["20 landmarks"].sum(axis=1).tolist() == [0, 0, 0, 10, 0, 0, 10]

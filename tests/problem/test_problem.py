@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mvest.closure.anchors import ClosedState
+from mvest.closure.continuation import ClosedState
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
 from mvest.estimation.prediction import SharedStart

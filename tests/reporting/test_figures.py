@@ -34,16 +34,11 @@ def test_several_estimates_are_lines_without_bands() -> None:
     axes, _ = iterates_figure([*cases, made_up_estimate(None)]).axes
     assert [line.get_label() for line in axes.lines] == ["one", "other", "truth"]
     assert not axes.collections
-
-
-def test_without_iterates_nothing_is_drawn() -> None:
     assert iterates_figure([made_up_estimate(None)]) is None
 
 
 def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
-    names = []
-    for base in ("a", "b"):
-        names.append(save_figure_with(tmp_path / base, drawn(), LINE, pdf=True))
+    names = [save_figure_with(tmp_path / base, drawn(), LINE, pdf=True) for base in ("a", "b")]
     for first, second in zip(*names, strict=True):
         assert first.read_bytes() == second.read_bytes()
     assert [path.suffix for path in names[0]] == [".png", ".pdf"]
@@ -62,6 +57,7 @@ def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
     [
         ("a" * 150 + "\n" + "b" * 150, "a" * 150 + "\n" + "b" * 150),
         ("a" * 161, "a" * 20 + "…"),
+        ("$\\frac$ 5 %", r"\$\frac\$ 5 %"),
         ("\n".join("abcdefghijklmno"), "a\nb\nc\nd\ne\nf\ng\nh\ni\nj\n…"),
     ],
 )

@@ -35,12 +35,6 @@ HOSTILE = (
 )
 LONG = HOSTILE + "W" * 10_000
 
-MEASURE = (
-    "<script>document.documentElement.dataset.width="
-    "document.documentElement.scrollWidth + '/' + window.innerWidth;</script>"
-)
-"""Put at the end of a copy without its policy, to see how wide it is."""
-
 ACTING = re.compile("[\u200e\u200f\u202a-\u202e\u2066-\u2069\u2028]")
 
 
@@ -65,15 +59,6 @@ class Seen(HTMLParser):
 
 def looked_at(page: Path) -> Seen:
     return Seen(look_at(page.as_uri(), "--dump-dom"))
-
-
-def widths(page: Path) -> tuple[int, int]:
-    """Pixels of what the page holds and of the window."""
-    text = page.read_text(encoding="utf-8")
-    copy = page.with_name(f"measured_{page.name}")
-    copy.write_text(re.sub("<meta http-equiv=[^>]*>", "", text) + MEASURE, encoding="utf-8")
-    held, _, window = (looked_at(copy).root["data-width"] or "").partition("/")
-    return int(held), int(window)
 
 
 STEP = {
@@ -118,12 +103,6 @@ def test_nothing_that_a_record_says_runs(case_page) -> None:
     assert seen.handlers == []
     assert not {"iframe", "object", "embed", "base"} & set(seen.tags)
     assert not [address for address in seen.addresses if address.startswith("javascript:")]
-
-
-@needs_browser
-def test_a_page_stays_as_wide_as_its_window(case_page) -> None:
-    held, window = widths(case_page)
-    assert held <= window
 
 
 @needs_browser

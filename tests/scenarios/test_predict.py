@@ -1,16 +1,22 @@
-"""A scenario at the estimate and at samples: statistics on a made-up valve, and a real one."""
+"""A scenario at the estimate and at samples: a linear stand-in, and a real valve."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mvest.errors import InputError, MaterialError
-from mvest.estimation import Gaussian, Identity, IteratedFilter, Prediction, observation_noise
+from mvest.estimation import Gaussian, IteratedFilter, Prediction, Reason, observation_noise
 from mvest.mechanics.steps import StepReason
 from mvest.scenarios import predict
 from mvest.scenarios.measures import measure_closed
-from mvest.scenarios.predict import posterior_samples, predict_scenario
+from mvest.scenarios.predict import (
+    PredictedScenario,
+    Sample,
+    posterior_samples,
+    predict_scenario,
+)
 from mvest.scenarios.scenario import Clip, Scenario, model_under
 from tests.scenarios.valves import NAMES, model
 
@@ -26,8 +32,44 @@ def estimated():
         h @ np.array([6.0, 2.0]),
         observation_noise(np.array([0.04, 0.01]), 2),
         names=NAMES,
-        transform=Identity(),
     )
+
+
+def test_samples_have_the_moments_of_the_posterior():
+    estimate = estimated()
+    samples, posterior = posterior_samples(estimate, 1024, 7), estimate.transformed
+    # A Sobol sequence of n points is off by about 1/n of a standard deviation, not 1/sqrt(n) = 3 %.
+    assert np.all(np.abs(samples.mean(axis=0) - posterior.mean) < 0.005 * posterior.std)
+    scale = np.outer(posterior.std, posterior.std)
+    assert np.all(np.abs(np.cov(samples.T) - posterior.covariance) < 0.01 * scale)
+    assert abs(posterior.covariance[0, 1]) > 0.2 * scale[0, 1]  # or the factor is not tested
+    np.testing.assert_array_equal(posterior_samples(estimate, 1024, 7), samples)
+
+
+def test_other_counts_and_failed_estimates_have_no_samples():
+    with pytest.raises(InputError, match="samples = 24, expected a power of two"):
+        posterior_samples(estimated(), 24, 1)
+    with pytest.raises(InputError, match="has not converged"):
+        posterior_samples(replace(estimated(), reason=Reason.NO_DECREASE), 8, 1)
+
+
+def spread_of(values):
+    samples = tuple(Sample({"a": float(value)}) for value in values)
+    return PredictedScenario(Sample({}), None, (*samples, Sample({}, "did not close"))).spread("a")
+
+
+def test_the_interval_is_that_of_the_samples():
+    # Type 8 of n = 40 numbers 1 to 40: at position (n + 1/3) p + 1/3 = 1.3417 for p = 0.025.
+    spread = spread_of(range(1, 41))
+    assert spread["samples"] == 40
+    assert spread["low"] == pytest.approx(1.3417, abs=1e-4)
+    assert spread["high"] == pytest.approx(41 - 1.3417, abs=1e-4)
+    assert spread["mean"] == 20.5
+    assert spread["std"] == pytest.approx(np.std(range(40), ddof=1))
+    # One sample has no spread.
+    spread = spread_of([3.0])
+    assert (spread["mean"], spread["samples"]) == (3.0, 1)
+    assert np.isnan([spread["std"], spread["low"], spread["high"]]).all()
 
 
 class Linear:
@@ -135,28 +177,6 @@ def test_intervals_carry_the_error_of_the_mesh(linear):
     assert found.interval("load") == (7.0, 7.0)
 
 
-def test_only_measures_that_are_never_negative_have_no_negative_interval(linear, monkeypatch):
-    def measured(model, system, x):
-        return {"gap_mm2": abs(x[0, 0] - 16), "tenting_height_mm": abs(x[0, 0] - 16)}
-
-    monkeypatch.setattr(predict, "measure_closed", measured)
-    estimate = estimated()
-    found = predict_scenario(linear, estimate, posterior_samples(estimate, 16, 3), finer=Finer())
-    assert found.mesh_error("gap_mm2") == pytest.approx(0.5)
-    assert found.interval("gap_mm2")[0] == 0.0
-    # Leaflets above the annulus have a negative tenting height.
-    assert found.interval("tenting_height_mm")[0] < 0
-    assert found.interval("gap_mm2")[1] == found.interval("tenting_height_mm")[1]
-
-
-def test_a_finer_mesh_that_does_not_close_leaves_the_error_unknown(linear):
-    estimate = estimated()
-    finer = Finer(lambda m: StepReason.SINGULAR)
-    found = predict_scenario(linear, estimate, posterior_samples(estimate, 4, 3), finer=finer)
-    assert found.finer.reason == StepReason.SINGULAR.value
-    assert np.all(np.isnan(found.interval("sum_mm")))
-
-
 def test_a_valve_that_does_not_close_at_the_estimate_is_a_result(linear):
     linear.refuse = lambda m: StepReason.SINGULAR
     found = predict_scenario(linear, estimated(), posterior_samples(estimated(), 2, 1))
@@ -166,38 +186,23 @@ def test_a_valve_that_does_not_close_at_the_estimate_is_a_result(linear):
     assert len(found.failures) == 2
 
 
-def test_an_estimate_of_other_parameters_is_refused(linear):
-    linear.names = ("E_f.anterior", "chord_rest_length")
-    with pytest.raises(InputError, match="chord_rest_length"):
-        predict_scenario(linear, estimated(), np.zeros((2, 2)))
-
-
-@pytest.fixture(scope="module")
-def closed():
-    """The default anatomy, closed on a coarse mesh: without and with a clip."""
-    whole = model((24, 3), (64, 15), (96, 20))
-    found = {}
+def test_a_clip_holds_the_leaflets_at_its_distance():
+    whole, found = model((24, 3), (64, 15), (96, 20)), {}
     for scenario in (Scenario("as observed"), Scenario("clip", clip=Clip())):
         changed = model_under(whole, scenario)
         result = changed.close(np.array([6.23, 2.09]), sensitivities=True)
         assert result.simulation.converged
         found[scenario.title] = changed, result
-    return found
-
-
-def test_a_competent_valve_has_no_gap(closed):
-    changed, result = closed["as observed"]
-    measures = measure_closed(changed, result.system, result.simulation.frames[-1])
+    changed, result = found["clip"]
+    ties, x = result.system.ties, result.simulation.frames[-1]
+    # As stiff as it is, the clip gives way by less than a twentieth of a mm.
+    assert np.all(np.abs(ties.lengths(x) - changed.ties.length) < 0.05)
+    changed, result = found["as observed"]
+    x = result.simulation.frames[-1]
+    assert np.any(ties.lengths(x) - found["clip"][0].ties.length > 0.1)
+    # A competent valve has no gap.
+    measures = measure_closed(changed, result.system, x)
     assert measures["gap_mm2"] == 0.0
     assert measures["coaptation_length_mm"] > 2.0
     assert 0 < measures["stress_p95_anterior_mpa"] < measures["stress_p99_anterior_mpa"]
     assert measures["stress_p99_anterior_mpa"] < measures["stress_max_anterior_mpa"]
-
-
-def test_a_clip_holds_the_leaflets_at_its_distance(closed):
-    changed, result = closed["clip"]
-    ties, x = result.system.ties, result.simulation.frames[-1]
-    # As stiff as it is, the clip gives way by less than a twentieth of a mm.
-    assert np.all(np.abs(ties.lengths(x) - changed.ties.length) < 0.05)
-    without = closed["as observed"][1].simulation.frames[-1]
-    assert np.any(ties.lengths(without) - changed.ties.length > 0.1)

@@ -11,7 +11,6 @@ from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import System
 from mvest.scenarios.measures import (
-    _peaks,
     contact_pressure,
     nodal_stress,
     peak_stress,
@@ -79,13 +78,6 @@ def test_contact_pressure_is_force_over_area():
     assert force > 0
     assert np.array_equal(rest, contact.sheet.rest)
     assert len(contact_pressure(SimpleNamespace(contact=None), y)[1]) == 0
-
-
-def test_percentiles_are_of_the_volume_and_not_of_points():
-    # 94, 97 and 99.5 % of the volume lie below or at 1, 2 and 3 MPa.
-    values, volumes = np.array([3.0, 1.0, 4.0, 2.0]), np.array([2.5, 94.0, 0.5, 3.0])
-    peak = _peaks(values, volumes)
-    assert peak == {"p95": 2.0, "p99": 3.0, "max": 4.0}
 
 
 def test_a_small_part_under_high_stress_counts_by_its_volume():

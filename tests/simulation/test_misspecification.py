@@ -92,13 +92,6 @@ def test_annulus_and_tips_are_off_by_their_size():
     assert np.mean(off[:, 1:] * off[:, :-1]) > 0.8
 
 
-def test_one_vertex_in_fifty_is_somewhere_else():
-    moved = Misspecification(outliers=0.02, outlier_mm=4.0).seen(POINTS, VALVE.surface, rng())
-    off = np.linalg.norm(moved - POINTS, axis=1)
-    assert np.count_nonzero(off) == round(0.02 * len(POINTS))
-    assert 2.0 < off[off > 0].mean() < 12.0
-
-
 def test_what_is_missing_is_filled_in_without_its_detail():
     gradient = np.array([[0.1, 0.0, 0.2], [0.0, 0.1, 0.0], [0.1, 0.0, 0.0]])
     smooth = POINTS + POINTS @ gradient
@@ -150,12 +143,6 @@ def test_one_open_leaflet_is_too_large():
     np.testing.assert_allclose(own, 1.04, atol=1e-12)
     np.testing.assert_allclose(other, 1.0, atol=1e-12)
     np.testing.assert_allclose(ratio[[0, 16]], 1.02)
-    # Both leaflets are drawn.
-    drawn, misspecification = rng(), Misspecification(leaflet_scale=0.04)
-    middles = [
-        misspecification.open_moves(VALVE, drawn)[[8 * 32 + 8, 8 * 32 + 24]] for _ in range(40)
-    ]
-    assert 10 < np.count_nonzero(np.any(middles, axis=2)[:, 0]) < 30
 
 
 def test_the_open_frame_is_too_large():
@@ -191,13 +178,15 @@ def test_exponential_tissue_is_as_stiff_as_its_modulus_where_leaflets_are_closed
         )
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"kernel": "cubic"}, "expected one of matern, exponential, gaussian"),
-        ({"missing": 1.0}, "expected a share below 1"),
-    ],
-)
-def test_what_is_no_world_is_refused(settings, message):
-    with pytest.raises(InputError, match=message):
-        Misspecification(**settings)
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InputError, match="expected one of matern, exponential, gaussian"):
+        Misspecification(kernel="cubic")
+    with pytest.raises(InputError, match="expected a share below 1"):
+        Misspecification(missing=1.0)
+
+
+def test_one_vertex_in_fifty_is_somewhere_else():
+    moved = Misspecification(outliers=0.02, outlier_mm=4.0).seen(POINTS, VALVE.surface, rng())
+    off = np.linalg.norm(moved - POINTS, axis=1)
+    assert np.count_nonzero(off) == round(0.02 * len(POINTS))
+    assert 2.0 < off[off > 0].mean() < 12.0

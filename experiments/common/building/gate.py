@@ -18,7 +18,7 @@ from experiments.common.places import GATE_RECORDS
 from experiments.common.progress import SolveBar, say
 from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import Values, build
-from mvest.closure.anchors import content_digest
+from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.closure.robustness import GATE_CASES, GateReport, run_gate
 from mvest.errors import InputError

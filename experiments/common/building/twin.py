@@ -25,7 +25,7 @@ from experiments.common.building.closure import (
 from experiments.common.building.filters import build_filter, observation_variance, require_one_each
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import Values
-from mvest.closure.anchors import content_digest
+from mvest.cache import content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.prediction import ObservationModel, SharedStart
@@ -233,7 +233,6 @@ def build_twin(config: Values) -> Twin:
     )
     if config["guided"]:
         model.guide = guide_of(model, anatomy, config["mesh"])
-        model.anchors = Path(config["paths"]["outputs"]) / "anchors"
 
     truth_model, source = build_truth(config, plain, true_settings, anatomy)
     for own, point in ((model, prior.mean), (model, values), (truth_model, values)):

@@ -25,10 +25,10 @@ from mvest.cases.folder import read_case
 from mvest.cases.from_images.detected import (
     CASE,
     DetectedValve,
+    ImagedSettings,
     detect_in_volume,
     read_for_case,
 )
-from mvest.cases.from_images.settings import ImagedSettings
 from mvest.cases.plausibility import implausible_values
 from mvest.cases.schema import files_of_case
 from mvest.errors import ConfigurationError
@@ -90,7 +90,6 @@ class ImagedInput(ImagedSettings):
 
     model: InputFile = None
     package_model: str | None = "${package_model:}"  # SHA-256 of the one for ultrasound
-    landmarks: Annotated[tuple[Any, ...], Reads(contents)] = ()
     pressure_curve: InputFile = None
 
 

@@ -1,13 +1,12 @@
-"""What the study of detectors makes: valves, training samples, detectors and trials of them.
+"""Valves, training samples, detectors and trials of the study of detectors.
 
-All of it is cached on disk under a key of its inputs and of the code that makes it, so an
-interrupted study goes on where it was.
+All are cached on disk under a key of their inputs and code, so an interrupted study continues.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,15 +58,15 @@ class DrawnValves:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOutSettings:
-    """The test: numbers of simulated volumes of valves that no training saw."""
+    """Numbers of simulated test volumes, of valves that were not trained on."""
 
-    volumes: Some  # of one frame, drawn as those of training are
+    volumes: Some  # of one frame, within the ranges of training
     shifted: Some  # of one frame, outside the ranges of training
-    sequences: Some  # of all frames of a valve, drawn as those of training are
+    sequences: Some  # of all frames, within the ranges of training
     shifted_sequences: Count
-    wide_calibration: Count  # of valves to calibrate with, each setting within or outside
-    without_valve: Some  # of each kind of volume in which there is none
-    # mm: what is found is not the valve if its points are on average this far off.
+    wide_calibration: Count  # of valves for calibration, each setting within or outside the ranges
+    without_valve: Some  # of each kind of volume without a valve
+    # mm: a detection whose points are on average this far off is not the valve.
     wrong_mm: Length = 5.0
 
 
@@ -78,36 +77,28 @@ class ImagingSettings:
     bases: dict[str, TemplateParameters] = field(default_factory=dict)
     population: PopulationSettings = field(default_factory=PopulationSettings)
     train: DrawnValves
-    calibration: DrawnValves  # measures the errors that detectors state
+    calibration: DrawnValves  # for the stated errors of the detectors
     test: DrawnValves
     training: TrainingSettings = field(default_factory=TrainingSettings)
-    min_confidence: Share = MIN_CONFIDENCE  # from here on something is called a valve
+    min_confidence: Share = MIN_CONFIDENCE  # of a detected valve
     evaluate: bool = True
     held_out: HeldOutSettings
     processes: Annotated[Processes, NOT_HASHED] = 1
-    model: str | None = None  # file or "package": detectors to be tested; null trains them
+    model: str | None = None  # file or "package" of detectors to be tested; null trains them
 
 
 SAMPLED_BY = (volume_samples, train_stage, fit_shape_model)
 
 
 def _grow(name: str, files: Sequence[Path], settings: TrainingSettings, seed: int) -> Boosters:
-    """Trees of one stage; samples of all stages would fill the memory."""
+    """Trees of one stage at a time, since samples of all stages would fill the memory."""
     samples = (read_npz(file, [f"{name}.x", f"{name}.y"]).values() for file in files)
     x, y = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     return train_stage(name, x, y, settings, seed)
 
 
 class ImagingStore:
-    """Makes and finds the parts of a study of detectors.
-
-    Parameters
-    ----------
-    config : mapping
-        The resolved configuration, checked.
-    settings : ImagingSettings
-        Of the study.
-    """
+    """The cached parts of a study of detectors with a resolved configuration."""
 
     def __init__(self, config: Values, settings: ImagingSettings) -> None:
         self._folder = Path(config["paths"]["outputs"]) / "detectors"
@@ -129,25 +120,19 @@ class ImagingStore:
         drawn, own = getattr(self.settings, which), self.settings
 
         def draw() -> tuple[MovingValve, ...]:
-            valves = []
-            with PartBar(f"valves: {which}", drawn.count, "valve") as bar:
-                for valve in draw_population(
-                    drawn.count, drawn.seed, own.bases, own.population, self._mechanics,
-                    processes=own.processes,
-                ):  # fmt: skip
-                    valves.append(valve)
-                    bar.step()
-            return tuple(valves)
+            what = drawn.count, drawn.seed, own.bases, own.population, self._mechanics
+            made = draw_population(*what, processes=own.processes)
+            return tuple(_followed(f"valves: {which}", drawn.count, "valve", made))
 
         return self._valves(which).get_or_make(draw, save_population)
 
     def model_entry(self) -> Entry[DetectionModel]:
-        """Where the trained detectors are cached."""
+        """The cache entry of the trained detectors."""
         described = {**self._sampling(), "training": asdict(self.settings.training)}
         return entry_of(self._folder / "models", described, (*SAMPLED_BY, save_model), load_model)
 
     def samples_entry(self, number: int) -> Entry[Path]:
-        """Where the samples of a training volume are cached, however many volumes there are."""
+        """The cache entry of the samples of a training volume, for any number of volumes."""
         described = {**self._sampling(), "number": number}
         return entry_of(self._folder / "samples", described, SAMPLED_BY, lambda path: path)
 
@@ -160,7 +145,7 @@ class ImagingStore:
         }
 
     def train(self, trained_on: Values) -> DetectionModel:
-        """Detectors trained on the valves to train on; the first volumes make a draft."""
+        """Trained detectors; the first volumes train a draft."""
         settings, valves = self.settings.training, self.population("train")
 
         def train() -> DetectionModel:
@@ -183,7 +168,7 @@ class ImagingStore:
         numbers: Sequence[int],
         make_draft: Callable[[], Trees | None],
     ) -> list[Path]:
-        """Files of the samples of training volumes; a draft is made if some are missing."""
+        """Files of the samples of training volumes; a draft is trained if some are missing."""
 
         def make(missing: list[int]) -> Iterator[Any]:
             draft, settings = make_draft(), self.settings.training
@@ -200,8 +185,8 @@ class ImagingStore:
         return dict(zip(stages, self._made("stages", _grow, calls, len(stages)), strict=True))
 
     def tried(self, function: Any, trials: Sequence[Trial], file: Path) -> list[Seen]:
-        """Rows and arrays of trials, by `try_volume` or `try_sequence`, of detectors in a file."""
-        # What was measured of the detectors changes nothing of what they find.
+        """Rows and arrays of trials by `try_volume` or `try_sequence`, for detectors in a file."""
+        # The measured accuracy of the detectors does not affect detection.
         boosters = load_model(file).boosters
         trees = "".join(text for name in STAGES for text in boosters[name].texts)
         key = hashlib.sha256(trees.encode()).hexdigest()
@@ -224,11 +209,17 @@ class ImagingStore:
         return get_or_make(entries, make, _write)
 
     def _made(self, title: str, function: Any, calls: Any, total: int) -> Iterator[Any]:
-        """What calls return, with a bar."""
-        with PartBar(title, total, "part") as bar:
-            for made in side_by_side(function, calls, self.settings.processes):
-                yield made
-                bar.step()
+        return _followed(
+            title, total, "part", side_by_side(function, calls, self.settings.processes)
+        )
+
+
+def _followed(title: str, total: int, part: str, made: Iterable[Any]) -> Iterator[Any]:
+    """The same values, with a progress bar."""
+    with PartBar(title, total, part) as bar:
+        for one in made:
+            yield one
+            bar.step()
 
 
 def _write(path: Path, arrays: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""How far the detectors of valves in echo volumes are off, and how they are trained."""
+"""Training of the detectors of valves in echo volumes, and their errors."""
 
 from __future__ import annotations
 
@@ -46,27 +46,24 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 
-MODEL = "tee.npz"
-"""The trained detectors, in the folder of a run."""
-
-PACKAGED = "package"
-"""Stands for the detectors that come with the package."""
+MODEL, PACKAGED = "tee.npz", "package"
+"""File of the trained detectors in the folder of a run, and name of those of the package."""
 
 POPULATIONS = ("train", "calibration", "test")
 
 CALIBRATION, *TESTED, WIDE = SEQUENCES
-"""Kinds of volumes over time: those that measure the errors, those tested on, and those that say
-how errors grow as confidence falls."""
+"""Kinds of volumes over time: for measuring errors, for tests, and for the growth of errors with
+falling confidence."""
 
 LIMIT_MM = 1.5
-"""Mean surface distance from which on a detected valve counts as wrong."""
+"""A detected valve with a larger mean surface distance counts as wrong."""
 
 ERRORS = {
     **dict.fromkeys(("surface", "surface_open", "surface_closed", "points", "tips"), "mm"),
     "annulus_area": "%",
     "ap_diameter": "mm",
 }
-"""Errors of a trial and their units: distances, and what clinicians would measure wrongly."""
+"""Errors of a trial and their units: distances, and errors of clinical measurements."""
 
 SHARE = Column("%", ".0f")
 COLUMNS: Mapping[str, Column] = {
@@ -79,7 +76,7 @@ COLUMNS: Mapping[str, Column] = {
     "percentile_90": Column(label="90th percentile"),
     **dict.fromkeys(("rms", "stated", "rms_handed_on", "stated_handed_on"), Column("mm", ".2f")),
 }
-"""Columns of all tables that have a unit."""
+"""Columns with a unit, of all tables."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +88,7 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_imaging(job: Job[Settings]) -> Result:
-    """Train detectors and test them on valves that no training saw; the model is left beside."""
+    """Train detectors, test them on other valves, and save them in the folder of the run."""
     require_imaging(job.values)
     settings = job.settings.imaging
     store = ImagingStore(job.values, settings)
@@ -134,13 +131,10 @@ def run_imaging(job: Job[Settings]) -> Result:
 
 
 def _held_out(store: ImagingStore, file: Path) -> list[Seen]:
-    """What is found in volumes of one frame, and in volumes over time."""
+    """Detections in volumes of one frame, and in volumes over time."""
     settings, counts = store.settings, store.settings.held_out
-    over_time = (
-        settings.calibration.count, counts.sequences, counts.shifted_sequences,
-        counts.wide_calibration,
-    )  # fmt: skip
-    numbers = dict(zip(SEQUENCES, over_time, strict=True))
+    tested = counts.sequences, counts.shifted_sequences, counts.wide_calibration
+    numbers = dict(zip(SEQUENCES, (settings.calibration.count, *tested), strict=True))
     numbers |= dict(zip(VOLUMES, (counts.volumes, counts.shifted), strict=True))
     numbers |= dict.fromkeys(WITHOUT_VALVE, counts.without_valve)
     acquisition, closed = settings.training.acquisition, settings.population.motion.frames - 1
@@ -160,16 +154,14 @@ def calibrated(
 ) -> tuple[DetectionAccuracy, list[str]]:
     """Errors in the calibration volumes whose valve was detected, and the names of these valves.
 
-    Where it was not, or where something else was taken for it, no standard deviation says how far.
-
     Parameters
     ----------
     seen : sequence
         Rows and arrays of `try_sequence`, of all kinds.
     min_confidence : float
-        From here on something is called a valve.
+        Of a detected valve.
     wrong_mm : float
-        What is found is not the valve if its points are on average this far off.
+        A detection whose points are on average this far off is not the valve.
 
     Raises
     ------
@@ -182,7 +174,7 @@ def calibrated(
         raise InputError(
             f"imaging.calibration: in {len(own)} of {count} volumes the valve was detected "
             f"(confidence at least {min_confidence:g}, points nearer than {wrong_mm:g} mm), "
-            "expected two or more: more volumes to train on"
+            "expected two or more: train on more volumes"
         )
     errors, tips, rest, shapes, tip_shapes = (
         _stacked(own, name) for name in ("errors", "tip_errors", "rest", "shapes", "tip_shapes")
@@ -190,8 +182,8 @@ def calibrated(
     accuracy = measure_accuracy(errors, tips, rest.mean(axis=0))
     accuracy = replace(accuracy, shapes=shapes, tip_shapes=tip_shapes)
     if wide := _detected(seen, WIDE, min_confidence, wrong_mm):
-        others = _stacked(wide, "errors"), _confidence(wide)
-        accuracy = widened(accuracy, _confidence(own), *others)
+        errors = _stacked(wide, "errors")
+        accuracy = widened(accuracy, _confidence(own), errors, _confidence(wide))
     return accuracy, [row["valve"] for row, _ in own]
 
 
@@ -253,26 +245,25 @@ def result_of(
 
 def tables_of(trials: DataFrame, covered: Sequence[Row]) -> dict[str, Table]:
     """The tables of a test, with the meaning of their columns (`COLUMNS`)."""
-    tables: dict[str, Any] = {
-        "": kind_rows(trials),
-        "errors": error_rows(trials),
-        "coverage": covered,
-        "trials": trials,
+    tables = {
+        "": table(kind_rows(trials)),
+        "errors": table(error_rows(trials)),
+        "coverage": table(covered),
+        "trials": table(trials),
     }
-    return {name: _with_units(table(rows)) for name, rows in tables.items()}
-
-
-def _with_units(plain: Table) -> Table:
-    return replace(plain, columns={name: COLUMNS.get(name, Column()) for name in plain.values})
+    return {
+        part: replace(one, columns={name: COLUMNS.get(name, Column()) for name in one.values})
+        for part, one in tables.items()
+    }
 
 
 def judge(
     rows: Sequence[Row], min_confidence: float, wrong_mm: float, like_from: float
 ) -> DataFrame:
-    """Rows of trials, and for each whether it is called a valve, is right and is unlike.
+    """Rows of trials, and whether each is called a valve, is right, and is unlike the training.
 
-    Right is a valve whose points are nearer than ``wrong_mm``; unlike the training's are volumes of
-    a confidence below ``like_from``, over time that of the middle frame.
+    A valve is right if its points are nearer than ``wrong_mm``. Volumes are unlike if their
+    confidence, or that of the median frame over time, is below ``like_from``.
     """
     import pandas as pd
 
@@ -289,9 +280,9 @@ def judge(
 
 
 def kind_rows(trials: DataFrame) -> DataFrame:
-    """A row for each kind of volumes: how sure the detectors are, and whether rightly.
+    """A row for each kind of volumes: confidence of the detectors and shares of right detections.
 
-    A valve is lost where it is not found or something else is; without a valve none is lost.
+    A valve is lost if it is not found or something else is.
     """
     found, wrong = trials["called"], trials["surface"] >= LIMIT_MM
     judged = trials.assign(
@@ -309,10 +300,7 @@ def kind_rows(trials: DataFrame) -> DataFrame:
 
 
 def error_rows(trials: DataFrame) -> DataFrame:
-    """A row for each error and kind of volumes to test on, of those that are called a valve.
-
-    Of their size: mean, median and 90th percentile.
-    """
+    """Mean, median and 90th percentile of the sizes of errors of detected valves, by kind."""
     found = trials[trials["called"] & trials["kind"].isin([*VOLUMES, *TESTED])]
     errors = found.melt("kind", list(ERRORS), "error", "size").dropna(subset="size")
     sizes = errors.assign(size=errors["size"].abs()).groupby(["error", "kind"], sort=False)["size"]
@@ -323,7 +311,7 @@ def error_rows(trials: DataFrame) -> DataFrame:
 
 
 def figure(results: Results) -> Figure | None:
-    """Confidence and surface distance in every volume; nothing of a run that only trained."""
+    """Confidence and surface distance in every volume; None if the run only trained."""
     from mvest.reporting.figures import COLOURS, SMALL, headline, log_axis, panels
 
     record = results.first
@@ -349,8 +337,8 @@ def figure(results: Results) -> Figure | None:
     grid[0, 0].set_ylim(len(kinds) - 0.5, -0.5)
     headline(
         drawn,
-        "Detectors in simulated volumes that no training saw",
-        "Hollow: there is no valve, or what was found is not it. Dashed: called a valve from here, "
+        "Detectors in simulated volumes that were not trained on",
+        "Hollow: no valve, or not the valve. Dashed: least confidence of a valve, "
         f"and {LIMIT_MM:g} mm.",
     )
     return drawn
@@ -358,13 +346,7 @@ def figure(results: Results) -> Figure | None:
 
 # -- settings -------------------------------------------------------------------------------------
 def require_imaging(config: Values) -> None:
-    """Refuse settings that the study could not run with.
-
-    Raises
-    ------
-    MvestError
-        The message names the setting.
-    """
+    """Raise a MvestError that names an inadmissible setting."""
     settings = build(Settings, config).imaging
     seeds = [getattr(settings, which).seed for which in POPULATIONS]
     if len(set(seeds)) < len(seeds):

@@ -1,4 +1,4 @@
-"""Figure 3 of the virtual patients, and where truths lie in the posteriors of scenarios."""
+"""Figure 3 of the virtual patients, and ranks of truths in the posteriors of scenarios."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from mvest.problem.fields import CaseFields
 
 MODELS = {"generic": "generic", "personalised": "fitted"}
-"""What Figure 3 calls models -> their fields of a case."""
+"""Names of models in Figure 3 -> their fields of a case."""
 
 AT = np.linspace(0.0, 1.0, 101)[1:-1]
-"""Where distributions of the truth's place in the posterior are drawn."""
+"""Quantiles at which distributions are drawn."""
 
 LEAFLETS = ("#2b6ca3", "#c8452f")
 """Colours of the moduli."""
 
 
 def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Figure:
-    """The closed valves from the atrium, generic above personalised, on one scale for all.
+    """The closed valves from the atrium, generic above personalised, on one scale.
 
     Parameters
     ----------
     fields : mapping
         Name of each patient -> its arrays.
     denied : sequence of str
-        Names of those whose verdict is that there is no estimate, which is written above them.
+        Names of patients with the verdict "no estimate", which is written above them.
 
     Raises
     ------
@@ -49,13 +49,7 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    from mvest.reporting.case.drawing import (
-        corner_colours,
-        distance_top,
-        draw_valve,
-        paint_leak,
-        same_scale,
-    )
+    from mvest.reporting.case import drawing
     from mvest.reporting.figures import ATRIUM, DISTANCE_MAP
 
     closed = {
@@ -63,21 +57,20 @@ def figure_3(fields: Mapping[str, CaseFields], denied: Sequence[str] = ()) -> Fi
         for name, valve in fields.items()
     }
     distances = [distance for models in closed.values() for _, distance in models.values()]
-    scale = ScalarMappable(Normalize(0.0, distance_top(*distances)), DISTANCE_MAP)
+    scale = ScalarMappable(Normalize(0.0, drawing.distance_top(*distances)), DISTANCE_MAP)
     drawn = Figure(figsize=(2.6 * len(fields) + 0.6, 5.4), layout="constrained")
     grid = drawn.subplots(2, len(fields), squeeze=False)
     for column, (name, valve) in zip(grid.T, fields.items(), strict=True):
-        above = {
-            "generic": name.replace("_", " "),
-            "personalised": "NO ESTIMATE" * (name in denied),
-        }
+        no_estimate = "NO ESTIMATE" if name in denied else ""
+        above = {"generic": name.replace("_", " "), "personalised": no_estimate}
         k = valve.closed + 1
         for axes, (label, (shape, distance)) in zip(column, closed[name].items(), strict=True):
-            colours = corner_colours(scale, distance, valve.triangles)
-            draw_valve(axes, valve, shape, colours, ATRIUM, k, strength=0.3)
-            paint_leak(axes, valve, shape, k)
+            colours = drawing.corner_colours(scale, distance, valve.triangles)
+            drawing.draw_valve(axes, valve, shape, colours, ATRIUM, k, strength=0.3)
+            drawing.paint_leak(axes, valve, shape, k)
             axes.set_title(f"{above[label]}\n{Spread.of(distance)} mm".strip(), fontsize=9)
-        same_scale(list(column), [shape for shape, _ in closed[name].values()], ATRIUM)
+        shapes = [shape for shape, _ in closed[name].values()]
+        drawing.same_scale(list(column), shapes, ATRIUM)
     for axes, label in zip(grid[:, 0], MODELS, strict=True):
         axes.text(
             -0.06, 0.5, label, transform=axes.transAxes, rotation=90, va="center", ha="right",
@@ -98,11 +91,11 @@ def _closed(valve: CaseFields, which: str) -> tuple[FloatArray, FloatArray]:
 
 
 def ranks_figure(scenarios: Groups) -> Figure:
-    """Where the truth lies in the posterior, a panel for each scenario.
+    """Ranks of the truth in the posterior, in a panel for each scenario.
 
-    Difference of the empirical distribution function of the truth's place from that of the uniform
-    distribution, with the band that 95 % of samples do not leave anywhere (Kolmogorov 1933, Giorn.
-    Ist. Ital. Attuari 4:83). Above zero on the left: truths lie too low in the posterior.
+    Drawn is the difference of their empirical distribution function from the uniform one, with the
+    band that contains 95 % of samples everywhere (Kolmogorov 1933, Giorn. Ist. Ital. Attuari 4:83).
+    Above zero on the left: truths are too low in the posterior.
     """
     from mvest.reporting.figures import panels
 

@@ -1,9 +1,9 @@
-"""Virtual patients: simulated, estimated by a process that cannot see the truth, then revealed.
+"""Virtual patients: simulated, estimated blindly by another process, and compared with the truth.
 
-Three published tables come of this study. ``patients`` holds the paper's Tables 2 and 3 and Figure
-3 for five virtual patients. ``population`` counts how often the intervals of thirty patients drawn
-at random hold the truth. ``calibration`` counts the same in misspecification scenarios, each of
-which breaks one assumption of the estimator: there it is seen what a verdict is worth.
+The study has three published tables. ``patients`` has the paper's Tables 2 and 3 and Figure 3 for
+five virtual patients. ``population`` counts how often intervals contain the truth for thirty random
+patients. ``calibration`` counts the same in misspecification scenarios, each of which violates one
+assumption of the estimator, and so measures the value of a verdict.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from experiments.common.building.gate import gate_of
@@ -37,7 +36,7 @@ from experiments.studies.patient.figures import figure_3, ranks_figure
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.estimation.information.consistency import nees
-from mvest.problem.record import EstimateRecord, FrameFit, Spread, Unknown
+from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.problem.verdict import TRUSTWORTHY
 from mvest.reading.npz import read_npz
 from mvest.reporting.skill import (
@@ -59,21 +58,16 @@ if TYPE_CHECKING:
 
 POPULATION, CALIBRATION = "population", "calibration"
 """Published tables other than that of the five patients."""
-
 ORDER = ("normal_small", "normal_large", "functional_mr", "prolapse", "fibroelastic")
-"""In which the five patients are listed; others follow by name."""
-
+"""Order of the five patients; others follow by name."""
 REFERENCE = "reference"
-"""The scenario in which everything is as the estimator assumes."""
-
+"""The scenario without misspecification."""
 WITH = "with nuisances"
-"""The estimation of all unknowns, to which the verdict belongs."""
-
+"""The estimate of all unknowns, which has the verdict."""
 ALTERNATIVES = {"moduli_only": "without nuisances", "paper": "paper's filter"}
-"""Name in a record -> what tables call it."""
-
+"""Name in a record -> label in tables."""
 WHICH = ("generic", "registered", "personalised")
-"""Closed valves whose distances are listed; registered: the generic one, rigidly moved."""
+"""Closed valves whose distances are listed; the registered one is the rigidly moved generic one."""
 
 MM = Column("mm", ".2f")
 TAILS = (0.025, 0.975)
@@ -97,30 +91,32 @@ class Settings:
 
 # -- run ------------------------------------------------------------------------------------------
 def run_patient(job: Job[Settings]) -> Result:
-    """Simulate a patient, estimate in a process of its own, reveal the truth."""
+    """Simulate a patient, estimate in another process, then reveal the truth."""
     patient = job.settings.patient
     place = make_patient(job.values, patient)
-    # A patient that is drawn has another anatomy than the one configured.
+    # A drawn patient has another anatomy than the configured one.
     gate = NOT_GATED if patient.variation else gate_of(job.values)
     estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden, gate)
     return reveal(estimated, place, patient, job.values["seed"])
 
 
 def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, seed: int) -> Result:
-    """The result of an estimation with what its case had hidden.
-
-    Raises
-    ------
-    InputError
-        If the patient hides nothing.
-    """
+    """The result of an estimation with the truth; an InputError if that is missing."""
     hidden, positions = place.truth()
     (blind,) = estimated.estimates
     arrays, frames = dict(estimated.arrays), blind.frames
     if arrays:
-        names = [str(name) for name in arrays["frames"]]
-        arrays["truth"] = np.stack([positions[name] for name in names]).astype(np.float32)
-        frames = _to_truth(frames, arrays)
+        truth = np.stack([positions[str(name)] for name in arrays["frames"]]).astype(np.float32)
+        arrays["truth"] = truth
+        shapes = zip(WHICH, ("generic", "registered", "fitted"), strict=True)
+        off = {
+            f"{which}_to_truth": np.linalg.norm(arrays[shape] - truth, axis=2)
+            for which, shape in shapes
+        }
+        frames = tuple(
+            frame.model_copy(update={name: Spread.of(each[k]) for name, each in off.items()})
+            for k, frame in enumerate(frames)
+        )
     seen = [frame.personalised_to_truth for frame in frames if frame.seen]
     about = {"seed": seed, "frames": frames, "distance_to_truth_mm": seen[-1] if seen else None}
     estimate = blind.with_truth(hidden["values"]).model_copy(update=about)
@@ -139,48 +135,28 @@ def reveal(estimated: Result, place: PatientPlace, patient: PatientSettings, see
 def _true_quantities(
     estimate: EstimateRecord, case: ValveCase, positions: Mapping[str, FloatArray]
 ) -> dict[str, Number]:
-    """Ratio and strains that an estimate states, as they truly are and as they are without it.
+    """True ratio and strains (``true NAME``), and their values without an estimate (``else NAME``).
 
-    ``true NAME`` and ``else NAME``: of a ratio the generic guess, of a strain that between the
-    frames as they were seen.
+    These are the generic ratio, and the strains between the observed frames.
     """
     known = {str(own["name"]): own for own in estimate.details.get("known", ())}
     truths = [own.truth for own in estimate.moduli if own.truth]
     numbers: dict[str, Number] = {}
-    for name in known:
+    for name, own in known.items():
         if name.startswith("ratio") and len(truths) == 2:
-            numbers |= {
-                f"true {name}": truths[0] / truths[1],
-                f"else {name}": known[name]["generic"],
-            }
-    strains, rest = [own for own in known if own.startswith("strain")], case.surface.vertices
-    seen = case.frame(Role.CLOSED)
+            ratio = truths[0] / truths[1]
+            numbers |= {f"true {name}": ratio, f"else {name}": own["generic"]}
+    strains, seen = [name for name in known if name.startswith("strain")], case.frame(Role.CLOSED)
     if strains and seen.corresponds:
         for label, frame in ("true", positions[seen.name]), ("else", seen.vertices):
-            values = 100.0 * mean_strains(rest, frame, case.surface).ravel()
-            numbers |= {
-                f"{label} {name}": float(value) for name, value in zip(strains, values, strict=True)
-            }
+            values = 100.0 * mean_strains(case.surface.vertices, frame, case.surface).ravel()
+            names = [f"{label} {name}" for name in strains]
+            numbers |= zip(names, map(float, values), strict=True)
     return numbers
 
 
-def _to_truth(
-    frames: Sequence[FrameFit], arrays: Mapping[str, NDArray[Any]]
-) -> tuple[FrameFit, ...]:
-    """Frames with distances to where the valve truly was."""
-    shapes = {"generic": "generic", "registered": "registered", "personalised": "fitted"}
-    off = {
-        f"{which}_to_truth": np.linalg.norm(arrays[shape] - arrays["truth"], axis=2)
-        for which, shape in shapes.items()
-    }
-    return tuple(
-        frame.model_copy(update={name: Spread.of(each[k]) for name, each in off.items()})
-        for k, frame in enumerate(frames)
-    )
-
-
 def _nees(estimate: EstimateRecord) -> float | None:
-    """Squared error in the posterior's covariance, over the number of unknowns."""
+    """Normalised estimation error squared over the number of unknowns."""
     scores = [score(unknown) for unknown in estimate.parameters]
     if not estimate.correlation or None in scores:
         return None
@@ -188,14 +164,14 @@ def _nees(estimate: EstimateRecord) -> float | None:
 
 
 def check_patient(values: Values, folder: Path) -> str:
-    """What to expect of a virtual patient's case, which is simulated first unless it is there."""
+    """Check a virtual patient's case, which is simulated first if necessary."""
     patient = values["patient"] and build(PatientSettings, values["patient"])
     return check(values, read_case(make_patient(values, patient).case), folder)
 
 
 # -- tables ---------------------------------------------------------------------------------------
 def summary(results: Results) -> dict[str, Table]:
-    """The tables of five patients, of a population or of scenarios."""
+    """The tables of the five patients, of the population or of the scenarios."""
     patients, which = _patients(results), results.first.table
     estimates = [estimate for _, estimate in patients]
     if which == CALIBRATION:
@@ -232,13 +208,13 @@ def summary(results: Results) -> dict[str, Table]:
 def _patients(results: Results) -> Patients:
     """Record and estimate of each patient, in the order of the tables."""
 
-    def place(item: tuple[Record, EstimateRecord]) -> tuple[int, bool, str, str]:
+    def key(item: tuple[Record, EstimateRecord]) -> tuple[int, bool, str, str]:
         record, estimate = item
         five = ORDER.index(estimate.case) if estimate.case in ORDER else len(ORDER)
         scenario = _scenario(record)
         return five, scenario != REFERENCE, scenario, estimate.case
 
-    return sorted(revealed(results), key=place)
+    return sorted(revealed(results), key=key)
 
 
 def _scenario(record: Record) -> str:
@@ -250,27 +226,20 @@ def _by_scenario(patients: Patients) -> Groups:
 
 
 def _by_way(estimates: Sequence[EstimateRecord]) -> Groups:
-    """Estimates by which unknowns they have and which filter; the patient's verdict counts."""
-    return grouped(
-        (name, way, estimate) for estimate in estimates for name, way in _ways(estimate).items()
-    )
+    """Estimates by their unknowns and filter, with the verdict on the patient."""
+    return grouped((name, way, one) for one in estimates for name, way in _ways(one).items())
 
 
 def _ways(estimate: EstimateRecord) -> dict[str, EstimateRecord]:
-    """An estimate and its alternatives, by what tables call them."""
-    others = {
-        label: estimate.alternatives[name]
-        for name, label in ALTERNATIVES.items()
-        if name in estimate.alternatives
+    """An estimate and its alternatives by their labels in tables."""
+    others = estimate.alternatives
+    return {WITH: estimate} | {
+        label: others[name] for name, label in ALTERNATIVES.items() if name in others
     }
-    return {WITH: estimate} | others
 
 
 def _table2(estimates: Sequence[EstimateRecord]) -> Table:
-    """A row for each patient and modulus: all estimates beside the truth.
-
-    The truth is what the paper estimated of its patient.
-    """
+    """A row for each patient and modulus, with all estimates; the truth is the paper's estimate."""
     rows = []
     for estimate in estimates:
         ways = _ways(estimate)
@@ -284,9 +253,8 @@ def _table2(estimates: Sequence[EstimateRecord]) -> Table:
                 row |= interval(label, None if way is None else way.unknown(own.name))
                 row[f"{label} converged"] = None if way is None else way.converged
             rows.append(row)
-    about = {"patient": Column(label="patient (simulated)")}
-    about |= {"verdict": Column(), "modulus": Column(), "truth": Column("MPa")}
-    about |= interval_columns("estimate")
+    about = {"patient": Column(label="patient (simulated)"), "verdict": Column()}
+    about |= {"modulus": Column(), "truth": Column("MPa")} | interval_columns("estimate")
     for label in ALTERNATIVES.values():
         about |= interval_columns(label) | {f"{label} converged": Column()}
     return table(rows, **about)
@@ -308,8 +276,8 @@ def _table3(patients: Patients) -> Table:
                 paper = record.numbers.get(f"paper_{which}_mm") if fit.seen else None
                 row[f"paper {which}"] = paper
             rows.append(row)
-    about = {"patient": Column(label="patient (simulated)")}
-    about |= {"verdict": Column(), "frame": Column(), "seen": Column(label="shown to the filter")}
+    about = {"patient": Column(label="patient (simulated)"), "verdict": Column()}
+    about |= {"frame": Column(), "seen": Column(label="shown to the filter")}
     about |= {which: replace(MM, std=f"{which} SD") for which in WHICH}
     about["closer"] = Column("%", ".0f", label="personalised closer than generic by")
     about |= dict.fromkeys(
@@ -319,7 +287,7 @@ def _table3(patients: Patients) -> Table:
 
 
 def _distances(frames: Table) -> Table:
-    """How often and by how much personalised valves are closer to what was observed."""
+    """How often and by how much personalised valves are closer to the observation."""
     if not len(frames):
         return table([])
     every = frames.frame
@@ -343,10 +311,7 @@ def _distances(frames: Table) -> Table:
 
 
 def _quantities(patients: Patients) -> dict[str, list[Unknown]]:
-    """Ratio and strains of all estimates that are stated; what they are without one as their guess.
-
-    See `_true_quantities`.
-    """
+    """Ratio and strains of all stated estimates, with `_true_quantities` as truth and guess."""
     groups: dict[str, list[Unknown]] = {}
     for record, estimate in patients:
         for own in estimate.details.get("known", ()) if estimate.is_stated else ():
@@ -359,7 +324,7 @@ def _quantities(patients: Patients) -> dict[str, list[Unknown]]:
 
 
 def _estimates(patients: Patients) -> Table:
-    """A row for each patient, way to estimate and unknown: the tidy table for programs."""
+    """A row for each patient, estimation and unknown, for programs."""
     rows = []
     for record, estimate in patients:
         failed_checks = () if estimate.verdict is None else estimate.verdict.failed_checks
@@ -377,16 +342,12 @@ def _estimates(patients: Patients) -> Table:
                 for own, row in zip(way.unknowns, way.rows(), strict=False)
                 if own.kind != "derived"
             ]
-    return table(
-        rows, **dict.fromkeys(("case", "scenario", "seed", "estimation"), "") if rows else {}
-    )
+    first = ("case", "scenario", "seed", "estimation") if rows else ()
+    return table(rows, **dict.fromkeys(first, ""))
 
 
 def _with_nees(skill: Table, patients: Patients) -> Table:
-    """The skill of scenarios, and the mean of their squared errors in the posterior's covariance.
-
-    Over the number of unknowns; if posteriors are right, 95 % of such means lie between the bounds.
-    """
+    """The skill of scenarios and their mean `_nees` with the 95 % bounds for right posteriors."""
     import pandas as pd
 
     numbers = pd.DataFrame([{"scenario": _scenario(one), **one.numbers} for one, _ in patients])
@@ -418,9 +379,9 @@ def figure(results: Results) -> dict[str, Figure]:
     return {"figure_3": figure_3(fields, denied)} if fields else {}
 
 
-# -- what is kept ---------------------------------------------------------------------------------
+# -- published records ----------------------------------------------------------------------------
 def keep(record: Record) -> Record:
-    """What tables and figures need of a record; all of it stays in the folder of the run."""
+    """The parts of a record that tables and figures need; the folder of the run has all of it."""
     details = ("known",) if record.table == POPULATION else ()
     return short(record, nuisances=record.table != CALIBRATION, details=details)
 
@@ -443,12 +404,13 @@ STUDY = Study(
     summary=summary,
     figure=figure,
     captions={
-        "figure_3": "Figure 3: distance of closed valves from what was observed, with generic and "
-        "with personalised stiffness. Drawn are midsurfaces: leaflets that touch lie a thickness "
-        "apart. White: what opens between them; grey: known to be no leak; red: a gap. Simulated.",
+        "figure_3": "Figure 3: distance of closed valves from the observed ones, with generic and "
+        "with personalised stiffness. Drawn are midsurfaces, which are a thickness apart where "
+        "leaflets touch. White: space between them; grey: known to be no leak; red: a gap. "
+        "Simulated.",
         "moduli": "Estimates with their 95 % intervals over the hidden truth. Simulated.",
-        "ranks": "Where the truth lies in the posterior: difference of its distribution from the "
-        "uniform one. Grey: right intervals stay there in 95 of 100 samples. Simulated.",
+        "ranks": "Ranks of the truth in the posterior: difference of their distribution from the "
+        "uniform one. Grey: 95 of 100 samples of right intervals stay there. Simulated.",
     },
     latex=("patients_table_2", "patients_table_3", "patients_figure_3"),
     words=case_words,

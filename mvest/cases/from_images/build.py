@@ -1,4 +1,4 @@
-"""The frames that are chosen of a sequence, and the case that they make."""
+"""The open and the closed frame of a sequence, and the case that they make."""
 
 from __future__ import annotations
 
@@ -31,26 +31,17 @@ from mvest.valve.geometry.surface_coordinates import surface_coordinates
 from mvest.valve.geometry.triangles import unit_rows
 
 UNSEEN_STD_MM = 10.0
-"""Standard deviation of a vertex whose error was never measured: it is given no weight."""
+"""Standard deviation of a vertex whose error was never measured, so that it has no weight."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaseFrames:
-    """Numbers of the open and the closed frame of a sequence, of which a case is made.
-
-    Attributes
-    ----------
-    open, closed : int
-    pressure_mmHg : float
-        Transmitral pressure in the closed frame.
-    derived : tuple of str
-        How frames were chosen that were not stated.
-    """
+    """Numbers of the open and the closed frame of a sequence, of which a case is made."""
 
     open: int
     closed: int
-    pressure_mmHg: float
-    derived: tuple[str, ...] = ()
+    pressure_mmHg: float  #: transmitral, in the closed frame
+    derived: tuple[str, ...] = ()  #: how frames were chosen that were not given
 
     def __post_init__(self) -> None:
         if self.open == self.closed:
@@ -77,27 +68,12 @@ def choose_frames(
     closed: int | None = None,
     min_confidence: float = MIN_CONFIDENCE,
 ) -> CaseFrames:
-    """Choose the open and the closed frame where they are not stated.
+    """Choose the open and the closed frame if they are not given.
 
     The closed frame is the one in which the leaflets touch over the largest area, the open frame
-    the one with the largest orifice, among frames of sufficient confidence.
-
-    Parameters
-    ----------
-    sequence : ValveSequence
-    rows : sequence
-        Its measures (`mvest.cases.from_images.measures.measure_sequence`).
-    pressure_mmhg : float or callable
-        In the closed frame, or at any time (s).
-    open_, closed : int, optional
-        If stated.
-    min_confidence : float
-        Of a frame that is chosen.
-
-    Raises
-    ------
-    InputError
-        A stated frame does not exist, or none can be chosen.
+    the one with the largest orifice, both among frames of sufficient confidence. ``rows`` are the
+    measures of the sequence (`measure_sequence`). The pressure is that of the closed frame, or a
+    function of time (s). InputError if a given frame does not exist, or none can be chosen.
     """
     count = len(sequence.times)
     for name, number in (("open", open_), ("closed", closed)):
@@ -122,8 +98,8 @@ def choose_frames(
     if open_ is None or closed is None:
         highest = float(np.max(sequence.frame_confidence))
         raise InputError(
-            f"no open and closed frame can be chosen {among} (the best: {highest:.2f}); give the "
-            "frames, or landmarks by hand"
+            f"no open and closed frame can be chosen {among} (the best: {highest:.2f}); give "
+            "imaged.open_frame and imaged.closed_frame"
         )
     if callable(pressure_mmhg):
         pressure_mmhg = pressure_mmhg(float(sequence.times[closed]))
@@ -138,9 +114,9 @@ def case_of_sequence(
     thickness_mm: Mapping[str, float] | None = None,
     error_samples: ErrorSamples | None = None,
 ) -> ValveCase:
-    """The case that the two frames of a sequence make.
+    """Make a case of two frames of a sequence.
 
-    Thickness and fibres vary over a leaflet as they do in the template: that cannot be seen.
+    Thickness and fibres vary over a leaflet as in the template, because images do not show them.
 
     Parameters
     ----------
@@ -149,40 +125,26 @@ def case_of_sequence(
     texts : mapping
         The case's name, description, source, licence and whether it is simulated.
     thickness_mm : mapping, optional
-        Of each leaflet next to the annulus; generic values if not given.
+        Of each leaflet next to the annulus; default: generic values.
     error_samples : ErrorSamples, optional
         In the frames of the case, in the order of time.
 
     Raises
     ------
     InputError, GeometryError
-        A surface is no valve: the message names the frame and the fault.
+        A surface is not a valve: the message names the frame and the fault.
     """
-    layout = sequence.layout
-    derived = list(frames.derived)
-    reference = sequence.vertices[frames.open]
-    side = ventricular_side(reference[layout.annulus], reference[layout.free_edge])
-    for number in frames.in_order:
-        _check_frame(sequence, number, side, is_reference=number == frames.open)
+    layout, reference = sequence.layout, sequence.vertices[frames.open]
+    _check_frames(sequence, frames)
     given = GENERIC_THICKNESS if thickness_mm is None else thickness_mm
     if set(given) != set(layout.region_names):
         raise InputError(
             f"thickness of {', '.join(given)}, expected of {', '.join(layout.region_names)}"
         )
-    if thickness_mm is None:
-        listed = ", ".join(f"{given[name]:g} mm ({name})" for name in layout.region_names)
-        derived.append(f"thickness: {listed} assumed")
     changes = {f"leaflets.{name}.thickness": mm for name, mm in given.items()}
     typical = Template(TemplateParameters().changed(changes))
     thickness = typical.thickness(layout.phi, layout.s)
     check_thickness(thickness)
-    derived += [
-        "thickness: falls towards the free edge as in the template, to "
-        f"{typical.parameters.leaflets.edge_thinning:.0%}",
-        "fibre: around the valve, turned as in the template near the commissures of the anterior "
-        "leaflet",
-        "annulus and free edge: the first and the last row of the image step's layout",
-    ]
     shape = reference, layout.triangles, layout.region, layout.region_names
     surface = LeafletSurface(*shape, _fibres(layout, reference, typical), thickness)
     chordae = lay_out_chordae(
@@ -192,10 +154,19 @@ def case_of_sequence(
         sequence.tips[frames.closed],
         SEEN_CLOSURE,
     )
-    derived.append(
+    derived = list(frames.derived)
+    if thickness_mm is None:
+        listed = ", ".join(f"{given[name]:g} mm ({name})" for name in layout.region_names)
+        derived.append(f"thickness: {listed} assumed")
+    derived += [
+        "thickness: falls towards the free edge as in the template, to "
+        f"{typical.parameters.leaflets.edge_thinning:.0%}",
+        "fibre: around the valve, turned as in the template near the commissures of the anterior "
+        "leaflet",
+        "annulus and free edge: the first and the last row of the image step's layout",
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
-        "rest lengths from the closed frame (through its vertices)"
-    )
+        "rest lengths from the closed frame (through its vertices)",
+    ]
     return ValveCase(
         **texts,
         surface=surface,
@@ -211,7 +182,7 @@ def case_of_sequence(
 
 
 def _fibres(layout: ValveLayout, vertices: FloatArray, typical: Template) -> FloatArray:
-    """Directions ``(n, 3)`` around the valve, turned towards its axis as they typically are."""
+    """Directions ``(n, 3)`` around the valve, turned by the template's angle."""
     loops = layout.annulus, layout.free_edge
     t = surface_coordinates(vertices, layout.triangles, *loops).circumferential
     grid = vertices.reshape(layout.rows, layout.columns, 3)
@@ -223,18 +194,22 @@ def _fibres(layout: ValveLayout, vertices: FloatArray, typical: Template) -> Flo
     return np.asarray(np.cos(angle) * t - np.sin(angle) * r)
 
 
-def _check_frame(sequence: ValveSequence, number: int, side: float, *, is_reference: bool) -> None:
-    layout, vertices, tips = sequence.layout, sequence.vertices[number], sequence.tips[number]
-    try:
-        if not (np.isfinite(vertices).all() and np.isfinite(tips).all()):
-            raise GeometryError("a position is not finite, expected a valve in this frame")
-        check_band(vertices, layout.triangles, self_intersections=is_reference)
-        check_annulus_size(vertices[layout.annulus])
-        check_tips(vertices[layout.annulus], side, tips)
-        check_normals(vertices, layout.triangles, layout.annulus, tips)
-    except InputError as fault:
-        kind = "open" if is_reference else "closed"
-        raise type(fault)(f"valve from images, {kind} frame {number}: {fault}") from fault
+def _check_frames(sequence: ValveSequence, frames: CaseFrames) -> None:
+    layout, reference = sequence.layout, sequence.vertices[frames.open]
+    side = ventricular_side(reference[layout.annulus], reference[layout.free_edge])
+    for number in frames.in_order:
+        vertices, tips = sequence.vertices[number], sequence.tips[number]
+        is_open = number == frames.open
+        try:
+            if not (np.isfinite(vertices).all() and np.isfinite(tips).all()):
+                raise GeometryError("a position is not finite, expected a valve in this frame")
+            check_band(vertices, layout.triangles, self_intersections=is_open)
+            check_annulus_size(vertices[layout.annulus])
+            check_tips(vertices[layout.annulus], side, tips)
+            check_normals(vertices, layout.triangles, layout.annulus, tips)
+        except InputError as fault:
+            kind = "open" if is_open else "closed"
+            raise type(fault)(f"valve from images, {kind} frame {number}: {fault}") from fault
 
 
 def _frame(sequence: ValveSequence, frames: CaseFrames, number: int) -> Frame:
@@ -255,7 +230,7 @@ def _frame(sequence: ValveSequence, frames: CaseFrames, number: int) -> Frame:
 
 
 def _uncertainty(sequence: ValveSequence, derived: list[str]) -> Uncertainty:
-    std, length = sequence.std_mm, sequence.correlation_length_mm
+    std = sequence.std_mm
     unknown = ~np.isfinite(std)
     if unknown.all():
         raise InputError(
@@ -267,4 +242,4 @@ def _uncertainty(sequence: ValveSequence, derived: list[str]) -> Uncertainty:
             f"observation: {int(unknown.sum())} vertices whose error was never measured are given "
             f"{UNSEEN_STD_MM:g} mm"
         )
-    return Uncertainty(np.where(unknown, UNSEEN_STD_MM, std), float(length))
+    return Uncertainty(np.where(unknown, UNSEEN_STD_MM, std), float(sequence.correlation_length_mm))

@@ -1,4 +1,4 @@
-"""A volume over time to a case: the valve is detected, measured, and written for other software."""
+"""From a volume over time to a case: the valve is detected, measured and written."""
 
 from __future__ import annotations
 
@@ -25,10 +25,8 @@ from mvest.cases.from_images.measures import (
     write_measures,
     write_surfaces,
 )
-from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import InputError
-from mvest.exchange.markups import read_markups
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import (
@@ -39,16 +37,19 @@ from mvest.imaging.detection.trained_model import (
 )
 from mvest.imaging.learning.accuracy import unlike_share
 from mvest.imaging.models import MODEL_FILE
-from mvest.imaging.valve_sequence import ANNULUS_LABELS, LANDMARKS, ValveSequence
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.quantities import BeatTime, Count, Pressure, Share, Thickness
 from mvest.reading.text import read_numbers
-from mvest.typing import FloatArray
+
+LEAFLETS = ("anterior", "posterior")
+"""Order of ``ImagedSettings.thickness_mm``."""
 
 IMAGES, CASE = "images", "case"
 """Folders of measures, surfaces and landmarks, and of the case."""
 
 STAND_IN_MMHG = 100.0
-"""Pressure of a case without one: it is checked, and neither written nor estimated."""
+"""Pressure of a case without one. It passes the checks and is neither written nor estimated."""
 
 NO_PRESSURE = (
     "No pressure is given, so no case is written; an estimate will need imaged.pressure_mmHg or "
@@ -56,34 +57,66 @@ NO_PRESSURE = (
 )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImagedSettings:
+    """What a case needs that the file of a volume does not state."""
+
+    model: str | None = None  #: file of the detection model; None: the package's, for ultrasound
+    modality: str | None = None  #: ultrasound, ct or mr, if the file does not state it
+    frame_interval_s: BeatTime | None = None  #: if the file states no times
+    time_unit: str | None = None  #: s or ms, if the file states times without a unit
+    open_frame: Count | None = None  #: None: the frame with the largest orifice
+    closed_frame: Count | None = None  #: None: the frame whose leaflets touch most
+    pressure_mmHg: Pressure | None = None  #: transmitral, in the closed frame
+    pressure_curve: str | None = None  #: .csv of time,pressure (s, mmHg) instead
+    thickness_mm: tuple[Thickness, ...] = ()  #: of the LEAFLETS; empty: generic
+    min_confidence: Share = MIN_CONFIDENCE  #: of the best frame, and of the frames that are chosen
+    error_samples: Count = (
+        200  # largest number taken from held-out volumes; mirrored ones are added
+    )
+    name: str | None = (
+        None  # None: made of the file's content, since files are named after patients
+    )
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False  #: the volume comes from a simulation
+
+    def __post_init__(self) -> None:
+        known = [modality.value for modality in Modality]
+        if self.modality is not None and self.modality not in known:
+            raise InputError(
+                f"imaged.modality = {self.modality!r}, expected one of {', '.join(known)}"
+            )
+        if self.thickness_mm and len(self.thickness_mm) != len(LEAFLETS):
+            raise InputError(
+                f"imaged.thickness_mm = {list(self.thickness_mm)}, expected one number for each of "
+                f"{', '.join(LEAFLETS)}, or none"
+            )
+        if self.pressure_mmHg is not None and self.pressure_curve is not None:
+            raise InputError(
+                "imaged.pressure_mmHg and imaged.pressure_curve are both given, expected one of "
+                "them, the transmitral pressure on the closed valve"
+            )
+
+    @property
+    def states_pressure(self) -> bool:
+        """Whether the pressure on the closed valve is given, so that a case can be estimated."""
+        return self.pressure_mmHg is not None or self.pressure_curve is not None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedValve:
-    """The valve that was detected in a volume, and the case that it makes.
-
-    Attributes
-    ----------
-    volume : VolumeSequence
-    valve : ValveSequence
-    rows : list of dict
-        Measures of every frame.
-    frames : CaseFrames
-        Those that the case is made of.
-    case : ValveCase
-        With a stand-in for the pressure if none is stated.
-    settings : ImagedSettings
-    model : DetectionModel
-    unlike : str
-        How the volume is unlike those of training; empty if it is not.
-    """
+    """The valve that was detected in a volume, and the case made of it."""
 
     volume: VolumeSequence
     valve: ValveSequence
-    rows: list[Row]
-    frames: CaseFrames
-    case: ValveCase
+    rows: list[Row]  #: measures of every frame
+    frames: CaseFrames  #: of the case
+    case: ValveCase  #: with a stand-in for the pressure if none is given
     settings: ImagedSettings
     model: DetectionModel
-    unlike: str
+    unlike: str  #: how the volume is unlike those of training; empty if it is not
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -111,7 +144,7 @@ class DetectedValve:
     ) -> dict[str, tuple[Mapping[str, Any], ...]]:
         """Details for a record (`mvest.personalisation.record`).
 
-        ``image_step`` has one row about volume, frames, model and files beside the report,
+        ``image_step`` has one row about volume, frames, model and the report's files,
         ``image_frames`` the measures of each frame, ``pictures`` the ``file`` and ``caption`` of
         each.
         """
@@ -136,18 +169,12 @@ class DetectedValve:
 
 
 def called(volume: VolumeSequence) -> str:
-    """A volume named by its content: files are often named after a patient."""
+    """A name made of a volume's content: files are often named after a patient."""
     return f"volume {volume.sha256[:12]}"
 
 
 def read_for_case(file: Path, settings: ImagedSettings) -> VolumeSequence:
-    """The volume in a file, which shows the valve open and closed.
-
-    Raises
-    ------
-    InputError
-        It cannot be read or has one frame only.
-    """
+    """Read a volume of two or more frames; InputError if it cannot be read or has only one."""
     volume = read_volume(
         file,
         modality=None if settings.modality is None else Modality(settings.modality),
@@ -168,27 +195,26 @@ def detect_in_volume(
     estimate: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> DetectedValve:
-    """The valve in a volume over time, and the case that it makes.
+    """Detect the valve in a volume over time and make a case of it.
 
     Parameters
     ----------
     file : Path
     settings : ImagedSettings, optional
     estimate : bool
-        Whether the case is to be estimated, so that a pressure must be given.
+        Whether the case will be estimated, so that a pressure is required.
     progress : callable, optional
-        (frames done, all frames) -> None.
+        Called with the number of finished frames and the number of all frames.
 
     Raises
     ------
     NoValveError
-        The volume shows no valve; the error has the best candidate that was not accepted.
+        The volume shows no valve; the error holds the best candidate.
     MvestError
         The volume cannot be read, or the valve in it makes no case.
     """
     settings = settings or ImagedSettings()
     # Settings are checked before anything that takes long.
-    landmarks, unplaced = _landmarks(settings)
     pressure: Any = settings.pressure_mmHg
     if settings.pressure_curve is not None:
         table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
@@ -200,14 +226,8 @@ def detect_in_volume(
         )
     volume = read_for_case(Path(file), settings)
     model, measured = _model(settings, volume.modality)
-    valve = detect_valve(
-        volume,
-        model,
-        min_confidence=settings.min_confidence,
-        landmarks=landmarks or None,
-        progress=progress,
-    )
-    thickness = settings.thickness
+    valve = detect_valve(volume, model, min_confidence=settings.min_confidence, progress=progress)
+    thickness = dict(zip(LEAFLETS, settings.thickness_mm, strict=False)) or None
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
     frames = choose_frames(
         valve,
@@ -236,24 +256,32 @@ def detect_in_volume(
         error_samples=samples_in_world(corrected, frames, errors[chosen]),
     )
     off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
-    less = (
-        "leaflets and tips: less the error that is expected of the detectors where they find such "
-        f"a valve, by simulated volumes ({off.mean():.2f} mm in the closed frame)"
+    correction = (
+        "leaflets and tips: corrected for the error that simulated volumes predict for the "
+        f"detectors where they find such a valve ({off.mean():.2f} mm in the closed frame)"
     )
+    unlike = ""
+    if valve.confidence < accuracy.like_from:
+        unlike = (
+            f"the volume is unlike those that the detectors were trained on: confidence "
+            f"{valve.confidence:.2f} in the median frame, expected at least "
+            f"{accuracy.like_from:.2f}, below which {100 * unlike_share(len(accuracy.samples)):.2g}"
+            " % of volumes like those are expected"
+        )
     return DetectedValve(
         volume=volume,
         valve=valve,
         rows=with_bands(valve, rows, accuracy),
         frames=frames,
-        case=replace(case, derived=(*case.derived, less, *unplaced)),
+        case=replace(case, derived=(*case.derived, correction)),
         settings=settings,
         model=model,
-        unlike=_unlike(valve.confidence, accuracy),
+        unlike=unlike,
     )
 
 
 def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
-    """Write measures, surfaces, landmarks and, if its pressure is stated, the case.
+    """Write measures, surfaces, landmarks and, if its pressure is given, the case.
 
     The folders ``images`` and ``case`` within the given one are emptied before. Returns the main
     files, relative to it.
@@ -286,49 +314,6 @@ def _model(
     if model.accuracy is None:
         raise InputError(
             f"{settings.model or MODEL_FILE}: its accuracy was never measured, expected a model "
-            "whose was"
-        )
-    found = model.shape.layout.region_names
-    if settings.thickness is not None and set(found) != set(LEAFLETS):
-        raise InputError(
-            f"imaged.thickness_mm is of {', '.join(LEAFLETS)}; the model finds the leaflets "
-            f"{', '.join(found)}"
+            "with a measured accuracy"
         )
     return model, model.accuracy
-
-
-def _unlike(confidence: float, accuracy: DetectionAccuracy) -> str:
-    """How a volume is unlike those of training; empty if it is not."""
-    if confidence >= accuracy.like_from:
-        return ""
-    share = unlike_share(len(accuracy.samples))
-    return (
-        f"the volume is unlike those that the detectors were trained on: confidence "
-        f"{confidence:.2f} in the median frame, expected at least {accuracy.like_from:.2f}, below "
-        f"which {100 * share:.2g} % of volumes like those are expected"
-    )
-
-
-def _landmarks(settings: ImagedSettings) -> tuple[dict[int, dict[str, FloatArray]], list[str]]:
-    """Frame -> name -> position (mm) of the files in the settings; sentences on unplaced ones."""
-    landmarks: dict[int, dict[str, FloatArray]] = {}
-    unplaced = []
-    for frame, file in settings.landmarks:
-        lists = read_markups(Path(file))
-        mine = [
-            item
-            for name, item in lists.items()
-            if item.kind == "Fiducial" and name != ANNULUS_LABELS
-        ]
-        points = dict(pair for item in mine for pair in zip(item.labels, item.points, strict=True))
-        strange = sorted(set(points) - set(LANDMARKS))
-        if strange or not points or len(points) < sum(len(item.labels) for item in mine):
-            raise InputError(
-                f"{file}: points {', '.join(strange) or 'none'}, expected some of "
-                f"{', '.join(LANDMARKS)}, each once (lists {', '.join(lists)})"
-            )
-        landmarks[frame] = points
-        missing = [label for item in mine for label in item.unplaced]
-        if missing:
-            unplaced.append(f"landmarks of frame {frame}: {', '.join(missing)} not placed")
-    return landmarks, unplaced

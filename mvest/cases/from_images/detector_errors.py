@@ -1,15 +1,15 @@
-"""Errors of detectors on other valves: what is expected of them, and what they make of a case.
+"""Expected errors of the detectors, and samples of the remaining error for a case.
 
 Detectors are biased towards the valves that they were trained on. So their error depends on how far
-a valve is from these, and on the shape that they find. The errors of S valves are regressed
-linearly on the shapes that were found (ridge regression: Hoerl and Kennard, Technometrics 12,
+a valve is from these, and on the shape that they find. The errors of S held-out valves are
+regressed linearly on the detected shapes (ridge regression: Hoerl and Kennard, Technometrics 12,
 1970). The penalty is chosen by leaving each valve out; the error of prediction is then r / (1 - h)
 (Allen, Technometrics 16, 1974). As a Gaussian process with a linear kernel (Rasmussen and Williams,
-Gaussian Processes for Machine Learning, 2006, sec. 2.1) it also states how much wider the error of
-one more valve varies about its expectation.
+Gaussian Processes for Machine Learning, 2006, sec. 2.1) the regression also gives the variance of
+one more valve's error about its expectation.
 
 Valves and detectors are nearly symmetric about the middle of the leaflets. So the even and the odd
-part of errors and shapes are regressed apart: neither tells of the other.
+part of errors and shapes are regressed separately.
 """
 
 from __future__ import annotations
@@ -33,21 +33,17 @@ from mvest.typing import FloatArray
 from mvest.valve.measure.clinical import annulus_and_tips
 
 PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
-"""Those tried, over the mean variance of the shapes; at infinity the shape has no effect."""
-
+"""Penalties that are tried, over the mean variance of the shapes; at infinity the shape has no
+effect."""
 
 BANDED = (
-    "ap_diameter_mm",
-    "commissural_diameter_mm",
-    "annulus_height_mm",
-    "annulus_area_mm2",
-    "tip_depth_mm",
-    "tip_separation_mm",
-)
+    "ap_diameter_mm", "commissural_diameter_mm", "annulus_height_mm", "annulus_area_mm2",
+    "tip_depth_mm", "tip_separation_mm",
+)  # fmt: skip
 """Measures that get a band: those of annulus and tips, which need no fine detail of leaflets.
 
-Detected leaflets are smoother than true ones, and differences between the two rougher than either:
-areas of leaflets that are moved by them would measure the roughness rather than the area.
+Detected leaflets are smoother than true ones, and differences between the two rougher than either.
+Areas of leaflets that are moved by them would measure the roughness rather than the area.
 """
 
 
@@ -58,12 +54,12 @@ def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
 
 
 def _points(sequence: ValveSequence, frame: int) -> FloatArray:
-    """Leaflets and, after them, tips ``(n + 2, 3)`` mm."""
+    """Leaflets, then tips ``(n + 2, 3)`` mm."""
     return np.concatenate([sequence.vertices[frame], sequence.tips[frame]])
 
 
 def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
-    """Errors of leaflets and, after them, tips ``(S, 2, n + 2, 3)`` mm of two valves or more."""
+    """Errors of leaflets, then tips ``(S, 2, n + 2, 3)`` mm of S >= 2 valves."""
     count, n = len(accuracy.samples), layout.size
     if count < 2:
         raise InputError(f"errors of {count} valves, expected two samples or more")
@@ -79,23 +75,16 @@ def _errors_of(layout: ValveLayout, accuracy: DetectionAccuracy) -> FloatArray:
 def samples_in_world(
     sequence: ValveSequence, frames: CaseFrames, errors: FloatArray
 ) -> ErrorSamples:
-    """Errors measured on other valves, as displacements in the frames of a case.
+    """Displacements in the frames of a case, from errors measured on other valves.
 
-    Each error is used a second time as its mirror image: valves, and errors of detecting them, are
-    nearly symmetric about the middle of their leaflets. The two samples share a source, because
-    they are not independent.
-
-    Parameters
-    ----------
-    sequence : ValveSequence
-    frames : CaseFrames
-    errors : (K, 2, n + 2, 3) mm
-        As from `without_expected_error`, in the axes of each valve, in its open and closed frame.
+    ``errors (K, 2, n + 2, 3)`` mm are those of `without_expected_error`, in the axes of each valve,
+    in its open and its closed frame. Each is used a second time as its mirror image (see above).
+    The two samples share a source, because they are not independent.
     """
     moves = np.concatenate([errors, in_mirror(sequence.layout, errors)])
     which = [int(number != frames.open) for number in frames.in_order]
     axes = np.stack([valve_axes(sequence, number) for number in frames.in_order])
-    # Where it may have been is where it was found less the error.
+    # The true position is the detected one minus the error.
     moves = -np.einsum("fij,kfnj->kfni", axes, moves[:, which])
     return ErrorSamples(moves[:, :, :-2], moves[:, :, -2:], np.tile(np.arange(len(errors)), 2))
 
@@ -103,21 +92,11 @@ def samples_in_world(
 def without_expected_error(
     sequence: ValveSequence, frames: CaseFrames, accuracy: DetectionAccuracy
 ) -> tuple[ValveSequence, FloatArray]:
-    """The valve less its expected error, and errors of other valves about their expected ones.
+    """Subtract the expected error from a valve, in the two frames of the case.
 
-    Only the two frames of the case are changed.
-
-    Returns
-    -------
-    sequence : ValveSequence
-    errors : (K, 2, n + 2, 3) mm
-        Of leaflets and, after them, tips: found less true. They are as wide as is stated of a
-        volume of this confidence.
-
-    Raises
-    ------
-    InputError
-        The errors are not of this layout, or of fewer than two valves.
+    Also returns errors ``(K, 2, n + 2, 3)`` mm (detected minus true) of leaflets, then tips, of
+    other valves about their expectations. Their size is that stated for a volume of this
+    confidence. InputError if the errors belong to another layout, or to fewer than two valves.
     """
     numbers = frames.open, frames.closed
     axes = [valve_axes(sequence, number) for number in numbers]
@@ -140,31 +119,17 @@ def without_expected_error(
 def with_bands(
     sequence: ValveSequence, rows: Sequence[Row], accuracy: DetectionAccuracy
 ) -> list[Row]:
-    """Measures of every frame with the bounds between which 95 % of true ones are expected.
+    """Add the bounds between which 95 % of true measures are expected to the measures of frames.
 
     The valve of each frame is moved back by every error of the detectors on another valve, and
     measured again. The band is where one more of these values is expected (Student's bounds for one
-    further normal number). It contains the correction of the mean error, so it need not lie about
-    what was measured. Frames take the errors of open or of closed ones by their orifice
-    (`OPEN_SHARE`).
+    further normal number). It includes the correction of the mean error, so it need not be centred
+    on the measured value. Frames use the errors of open or closed valves by their orifice
+    (`OPEN_SHARE`). The accuracy is that in a volume of this confidence.
 
-    Parameters
-    ----------
-    sequence : ValveSequence
-    rows : sequence of dict
-        Its measures, from `mvest.cases.from_images.measures.measure_sequence`.
-    accuracy : DetectionAccuracy
-        Of the detectors in a volume of this confidence.
-
-    Returns
-    -------
-    list of dict
-        The rows with ``NAME_low`` and ``NAME_high`` of each of `BANDED`; None where the measure is.
-
-    Raises
-    ------
-    InputError
-        The errors are of fewer than two valves, or not of this layout.
+    Returns the rows of `measure_sequence` with ``NAME_low`` and ``NAME_high`` of each of `BANDED`,
+    None where the measure is. InputError if the errors belong to fewer than two valves, or to
+    another layout.
     """
     errors, annulus = _errors_of(sequence.layout, accuracy), sequence.layout.annulus
     count = len(errors)
@@ -195,16 +160,16 @@ def coverage(
     shapes: FloatArray,
     confidence: FloatArray,
 ) -> list[dict[str, float]]:
-    """How well the stated errors hold for valves that were not among the samples.
+    """How well the stated errors hold for valves that are not among the samples.
 
     Parameters
     ----------
     layout : ValveLayout
     accuracy : DetectionAccuracy
     errors : (S, 2, n, 3) mm
-        Found less true, in the open and the closed frame.
+        Detected minus true, in the open and the closed frame.
     shapes : (S, 2, n + 2, 3) mm
-        Leaflets and, after them, tips, as they were found, in the valve's axes.
+        Detected leaflets, then tips, in the valve's axes.
     confidence : (S,)
         Of each volume.
 
@@ -212,8 +177,8 @@ def coverage(
     -------
     list of dict
         For each frame ``within_95`` (% of coordinates within 1.96 of the stated deviations),
-        ``rms`` and ``stated`` (mm, the actual and the stated root mean square); and the same
-        ``..._handed_on``, less the error that is expected of such a shape.
+        ``rms`` and ``stated`` (mm, the actual and the stated root mean square). The same with the
+        suffix ``_handed_on`` after the expected error of such a shape is subtracted.
     """
     n = layout.size
     factors = np.array([accuracy.factor(one) for one in confidence])[:, None, None, None]
@@ -255,24 +220,23 @@ def _expected_error(
 def error_at_shape(
     layout: ValveLayout, errors: FloatArray, shapes: FloatArray, shape: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The error that is expected where a valve is found so, and how it may vary about that.
+    """Expected error of a valve that is detected with some shape, and samples about it.
 
     Parameters
     ----------
     layout : ValveLayout
-    errors : (S, F, n + 2, 3) mm
-        Of leaflets and, after them, papillary tips, of S >= 2 other valves in F frames.
-    shapes : (S, F, n + 2, 3) mm
-        Where these valves were found, in the axes of each; nothing is learned of equal ones.
+    errors, shapes : (S, F, n + 2, 3) mm
+        Errors of leaflets, then tips, of S >= 2 other valves in F frames, and their detected
+        shapes, each in its own axes. Equal shapes give the mean error.
     shape : (F, n + 2, 3) mm
-        Where the valve was found, in its own axes.
+        Detected shape of the valve, in its own axes.
 
     Returns
     -------
     expected : (F, n + 2, 3) mm
     samples : (S, F, n + 2, 3) mm
-        The other valves' errors about what is expected of each, as large as those of one more valve
-        of this shape: for equal shapes, sqrt((S + 1) / (S - 1)) times those about the mean.
+        The other valves' errors about their expectations, scaled to the error of one more valve of
+        this shape. For equal shapes the factor is sqrt((S + 1) / (S - 1)).
     """
     expected, samples = np.zeros_like(shape), np.zeros_like(errors)
     for sign in (1.0, -1.0):
@@ -286,7 +250,7 @@ def error_at_shape(
 
 
 def in_mirror(layout: ValveLayout, moves: FloatArray) -> FloatArray:
-    """Leaflets and tips ``(..., n + 2, 3)``, in a valve's axes, as they are in a mirror."""
+    """Mirror images of leaflets, then tips ``(..., n + 2, 3)`` in a valve's axes."""
     rows, columns = np.divmod(np.arange(layout.size), layout.columns)
     other = rows * layout.columns + np.mod(layout.columns // 2 - columns, layout.columns)
     swapped = np.append(other, [layout.size + 1, layout.size])
@@ -296,8 +260,8 @@ def in_mirror(layout: ValveLayout, moves: FloatArray) -> FloatArray:
 def _ridge(Z: FloatArray, E: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Expected error ``(m,)`` at features ``z (q,)``, and samples ``(S, m)`` about it.
 
-    ``Z (S, q)`` and ``E (S, m)`` are those of the other valves. With a constant that is not
-    penalised, the covariance of their residuals r is that of one error times 1 - h.
+    ``Z (S, q)`` and ``E (S, m)`` belong to the other valves. The constant is not penalised, so the
+    covariance of their residuals r is that of one error times 1 - h.
     """
     count = len(Z)
     Z_mean, E_mean = Z.mean(axis=0), E.mean(axis=0)

@@ -25,76 +25,61 @@ from mvest.valve.measure.clinical import clinical_measurements, clinical_names
 Row: TypeAlias = dict[str, float | None]
 
 OPEN_SHARE = 0.1
-"""Share of the annulus area from which on an orifice counts as that of an open valve.
+"""A valve counts as open if its orifice is at least this share of the annulus area.
 
 The orifice of severe regurgitation, 40 mm² (Zoghbi et al. 2017, J. Am. Soc. Echocardiogr. 30:303),
 is half of that in an annulus of 800 mm².
 """
 
 CLOSED_ONLY = ("tenting_", "prolapse_", "billow_")
-"""Beginnings of the names of measures that are defined for closed leaflets only."""
-
-
-def contact_distance(sequence: ValveSequence, thickness_mm: float) -> float:
-    """Distance (mm) of midsurfaces up to which leaflets from images count as touching.
-
-    Their thickness, plus the standard deviation of the distance of two points with the median
-    ``std_mm``; the thickness alone if that was never measured.
-
-    Raises
-    ------
-    InputError
-        The thickness is no positive number.
-    """
-    if not (np.isfinite(thickness_mm) and thickness_mm > 0):
-        raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")
-    known = sequence.std_mm[np.isfinite(sequence.std_mm)]
-    return float(thickness_mm + (np.sqrt(2.0) * np.median(known) if len(known) else 0.0))
+"""Prefixes of the measures that are defined for closed leaflets only."""
 
 
 def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
     """Measure a valve with leaflets of this thickness (mm) in every frame.
 
+    Leaflets touch if their midsurfaces are nearer than ``contact_distance_mm``: their thickness,
+    plus the standard deviation of the distance of two points with the median ``std_mm`` (nothing if
+    that was never measured).
+
     Returns
     -------
     list of dict
-        The same names for each frame: ``frame`` (from 0 on), ``time_s``, ``confidence`` (0 to 1),
+        The same names for each frame: ``frame`` (from 0), ``time_s``, ``confidence`` (0 to 1),
         ``vertex_confidence_mean``, ``contact_distance_mm`` and those of
-        `mvest.valve.measure.clinical`. None is what cannot be measured: everything in a frame
-        without a valve (confidence 0) or with points that are not finite, and tenting, prolapse
-        and billowing of an open valve (`OPEN_SHARE`).
+        `mvest.valve.measure.clinical`. None stands for what cannot be measured: everything in a
+        frame without a valve (confidence 0) or with points that are not finite, and tenting,
+        prolapse and billowing of an open valve (`OPEN_SHARE`).
 
     Raises
     ------
     InputError
-        The thickness is no positive number.
+        The thickness is not a positive number.
     """
-    reach = contact_distance(sequence, thickness_mm)
-    layout = sequence.layout
-    names = clinical_names(layout.region_names, TIPS)
+    if not (np.isfinite(thickness_mm) and thickness_mm > 0):
+        raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")
+    layout, std = sequence.layout, sequence.std_mm[np.isfinite(sequence.std_mm)]
+    reach = float(thickness_mm + (np.sqrt(2.0) * np.median(std) if len(std) else 0.0))
     rows = []
     for t, time in enumerate(sequence.times):
+        x, tips, confidence = sequence.vertices[t], sequence.tips[t], sequence.frame_confidence[t]
         row: Row = {
             "frame": t,
             "time_s": float(time),
-            "confidence": finite_or_none(sequence.frame_confidence[t]),
+            "confidence": finite_or_none(confidence),
             "vertex_confidence_mean": finite_or_none(sequence.vertex_confidence[t].mean()),
             "contact_distance_mm": reach,
         }
-        measured = _measured(sequence, t, reach)
-        rows.append(row | {name: finite_or_none(measured.get(name)) for name in names})
+        row |= dict.fromkeys(clinical_names(layout.region_names, TIPS))
+        if np.isfinite(x).all() and np.isfinite(tips).all() and confidence > 0:
+            annulus = x[layout.annulus]
+            measured = clinical_measurements(x, layout, annulus, tips, reach, tip_names=TIPS)
+            hidden = CLOSED_ONLY if is_open(measured) else ()
+            for name, value in measured.items():
+                if not name.startswith(hidden):
+                    row[name] = finite_or_none(value)
+        rows.append(row)
     return rows
-
-
-def _measured(sequence: ValveSequence, t: int, reach: float) -> Mapping[str, float | None]:
-    x, tips = sequence.vertices[t], sequence.tips[t]
-    if not (np.isfinite(x).all() and np.isfinite(tips).all() and sequence.frame_confidence[t] > 0):
-        return {}
-    layout = sequence.layout
-    measures = clinical_measurements(x, layout, x[layout.annulus], tips, reach, tip_names=TIPS)
-    if is_open(measures):
-        return {name: v for name, v in measures.items() if not name.startswith(CLOSED_ONLY)}
-    return measures
 
 
 def is_open(measures: Mapping[str, float | None]) -> bool:
@@ -104,7 +89,7 @@ def is_open(measures: Mapping[str, float | None]) -> bool:
 
 
 def finite_or_none(value: Any) -> float | None:
-    """A number, or None for what is none."""
+    """A finite number, otherwise None."""
     return float(value) if value is not None and np.isfinite(value) else None
 
 
@@ -123,18 +108,11 @@ def closed_frame(rows: Sequence[Row]) -> int | None:
 
 # -- files ----------------------------------------------------------------------------------------
 def write_measures(folder: Path, rows: Sequence[Row]) -> Path:
-    """Write ``measures.csv`` to an existing folder; returns its path.
+    """Write ``measures.csv`` to an existing folder and return its path.
 
-    It has one row per frame, with units in the names of its columns and an empty cell for what
-    could not be measured.
-
-    Raises
-    ------
-    InputError
-        No rows, or a file that cannot be written.
+    It has one row per frame, units in the names of its columns, and an empty cell for None.
+    InputError if the file cannot be written.
     """
-    if not rows:
-        raise InputError(f"{folder}: no frames to write, expected at least one")
     cells = [["" if row[key] is None else f"{row[key]:.7g}" for key in rows[0]] for row in rows]
     return write_atomically(
         folder / "measures.csv", lambda file: write_columns(file, list(rows[0]), cells)
@@ -145,12 +123,8 @@ def write_surfaces(folder: Path, sequence: ValveSequence) -> Path:
     """Write the valve of every frame for ParaView and 3D Slicer; returns the index ``valve.pvd``.
 
     ``valve_0000.vtp``, ... hold the midsurface in LPS mm with ``confidence`` and ``std_mm`` (NaN
-    where it was never measured) at its points and ``region`` in its triangles.
-
-    Raises
-    ------
-    InputError
-        A point that is not finite, or a file that cannot be written.
+    if it was never measured) at its points and ``region`` in its triangles. InputError if a point
+    is not finite or a file cannot be written.
     """
     layout, std = sequence.layout, sequence.std_mm
     cells = region_arrays(layout.region, layout.region_names)
@@ -164,14 +138,9 @@ def write_surfaces(folder: Path, sequence: ValveSequence) -> Path:
 def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:
     """Write the named points of one frame as markups of 3D Slicer (``.mrk.json``).
 
-    The lists are ``landmarks`` (see `mvest.imaging.layout`), ``annulus`` and ``free edge`` as
-    closed curves, which begin at phi = 0, and SlicerHeart's labels of the annulus.
-
-    Raises
-    ------
-    InputError
-        No such frame, a point that is not finite, another extension, or a file that cannot be
-        written.
+    The lists are ``landmarks`` (`mvest.imaging.valve_sequence`), ``annulus`` and ``free edge`` as
+    closed curves, which begin at phi = 0, and SlicerHeart's labels of the annulus. InputError if
+    there is no such frame, a point is not finite, or the file cannot be written.
     """
     named = landmarks(valve, frame)
     down = valve.tips[frame].mean(axis=0) - valve.annulus[frame].mean(axis=0)

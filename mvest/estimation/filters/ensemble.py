@@ -20,7 +20,7 @@ KINDS = ("square_root", "perturbed")
 
 @dataclass(frozen=True, slots=True)
 class EnsembleFilter(Filter):
-    """Conditions an ensemble on the observation, at once or in several smaller steps.
+    """Conditions an ensemble on the observation, in one step or in several smaller ones.
 
     N members xⱼ are drawn from the prior, which is N(0, I) in these coordinates. One step with the
     noise α R, in whitened observations (W R Wᵀ = I), is::
@@ -41,8 +41,8 @@ class EnsembleFilter(Filter):
 
     One step with α = 1 is the ensemble Kalman filter. k steps with α = k each are the ensemble
     smoother with multiple data assimilation (Emerick and Reynolds 2013, Comput. Geosci. 55:3): each
-    step takes a k-th of the observation's information, Σ 1/α = 1, and linearises a non-linear model
-    at the ensemble so far.
+    step uses a k-th of the observation's information, Σ 1/α = 1, and linearises the model at the
+    current ensemble.
 
     Members are drawn with exactly the prior's mean and covariance (second-order exact sampling,
     Pham 2001, Mon. Weather Rev. 129:1194). For a linear model and N > p the square root is then
@@ -163,7 +163,7 @@ def _halves(
 ) -> list[ApproximationCheck]:
     """Compare the updates of the prior by either half of the members.
 
-    A linear model has one slope, whichever members give it; that of a non-linear one varies.
+    The slope of a linear model is the same for all members; that of a non-linear one varies.
     """
     half = len(X) // 2
     if half < X.shape[1] + 2:
@@ -174,7 +174,7 @@ def _halves(
         e = run.y - predicted[part].mean(axis=0) + H @ run.L @ X[part].mean(axis=0)
         means.append(kalman_update(run.prior, e, H, run.noise).posterior.mean)
     apart = np.linalg.lstsq(posterior.factor, means[1] - means[0], rcond=None)[0]
-    # The error of the whole ensemble is about half the distance of its halves.
+    # The error of the whole ensemble is about half the distance between its halves.
     return [
         ApproximationCheck(
             "estimates by the two halves of the ensemble, half their distance in standard "

@@ -17,7 +17,7 @@ from mvest.estimation.run import Filter, FilterRun, by_filter
 from mvest.typing import FloatArray, IntArray
 
 K_HAT_LIMIT = 0.7
-"""Shape of the weights' tail above which their mean cannot be trusted (Vehtari et al. 2024)."""
+"""Largest shape of the weights' tail for a reliable mean (Vehtari et al. 2024)."""
 
 PRIOR_SHARE = 0.1
 """Share of each round's draws from the prior, so that no region of it is left out."""
@@ -26,7 +26,7 @@ EXPLORING = 3
 """Rounds before kernels are chosen by weight."""
 
 KERNELS = 24
-"""Largest number of runs about which the next are drawn."""
+"""Largest number of runs around which the next are drawn."""
 
 WIDTHS = (1.0, 0.5, 0.25, 0.1)
 """Candidate widths of these kernels, in parts of the posterior linearised at the run."""
@@ -35,7 +35,7 @@ FEWEST = 25
 """Smallest number of weights to which the tail is fitted."""
 
 NOTHING = 50.0
-"""Weights that are smaller than the largest by this logarithm are zero and not fitted."""
+"""Weights smaller than the largest by this logarithm are set to zero and not fitted."""
 
 DRAWS = 4000
 """Equally weighted draws in an estimate."""
@@ -49,8 +49,8 @@ class ImportanceFilter(Filter):
 
     1. The posterior's mode and its Gaussian N(x₀, P₀) come from ``start``.
     2. A round draws points from a mixture q and runs the model there. The first mixture is of
-       N(x₀, P₀), wider, and the prior. Later ones add kernels N(xᵢ, s² Pᵢ) about runs, chosen by
-       their weights, where Pᵢ = (I + Hᵢᵀ R⁻¹ Hᵢ)⁻¹ is the posterior linearised at xᵢ, so that they
+       N(x₀, P₀), wider, and the prior. Later ones add kernels N(xᵢ, s² Pᵢ) around runs with large
+       weights, where Pᵢ = (I + Hᵢᵀ R⁻¹ Hᵢ)⁻¹ is the posterior linearised at xᵢ, so that they
        follow a curved ridge (gradient adaptive population importance sampling, Elvira, Martino,
        Luengo and Corander 2015, IEEE ICASSP 4075). s gives the weighted draws so far the largest
        probability, each left out of its own kernel.
@@ -58,8 +58,8 @@ class ImportanceFilter(Filter):
        Mira and Robert 2012, Scand. J. Stat. 39:798), which the prior's share bounds.
 
     until there are enough effective draws, or runs. The weights are smoothed by a generalised
-    Pareto tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25:72); above a
-    shape k̂ of 0.7 they cannot be trusted.
+    Pareto tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25:72); they are
+    unreliable above a shape k̂ of 0.7.
 
     A model without derivatives has P₀ for every Pᵢ, and needs a ``start`` that takes such a model,
     for example `UnscentedFilter`.
@@ -71,7 +71,7 @@ class ImportanceFilter(Filter):
     batch : int
         Runs of each round.
     effective : float
-        Effective draws that are enough.
+        Sufficient number of effective draws.
     start : Filter
         Finds x₀ and P₀.
     seed : int
@@ -139,7 +139,7 @@ class _Draws:
     ----------
     points : (s, p)
     rounds : list of (int, list)
-        Number of draws, and their mixture: shares, means and covariances.
+        Number of draws, and their mixture (shares, means and covariances).
     slope : (n, p)
         dh/dx at the last run with derivatives; 0 without any.
     """

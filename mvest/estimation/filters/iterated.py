@@ -1,6 +1,7 @@
 """The extended Kalman filter, and iterated: Gauss-Newton on one maximum-a-posteriori problem."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,28 +22,28 @@ DAMPING_FACTOR = 10.0
 """Growth of the damping with each further rejection, and its fall after a good step."""
 
 NO_DAMPING = 1e-3
-"""Damping below which a step is as good as the full one, so that the next is the full one."""
+"""Damping below this counts as none, so that the next step is the full one."""
 
 SUFFICIENT_DECREASE = 1e-4
-"""Least decrease of the objective, as a part of the predicted one, that accepts a step (Nocedal
-and Wright, Numerical Optimization, 2nd ed. 2006, algorithm 4.1 and section 3.1)."""
+"""Smallest decrease of an accepted step, as a share of the predicted one (Nocedal and Wright,
+Numerical Optimization, 2nd ed. 2006, algorithm 4.1 and section 3.1)."""
 
 ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)
 """Relative decrease of the objective that cannot be distinguished from rounding."""
 
 GOOD_DECREASE = 0.5
-"""Part of the predicted decrease from which on the linearisation is trusted with less damping."""
+"""Share of the predicted decrease above which the next step is less damped."""
 
 POOR_DECREASE = 0.4
-"""Part of the predicted decrease below which a more damped step follows (as in Nocedal and Wright's
-algorithm 4.1, there 1/4): where the neglected second derivatives are large, full steps overshoot
-again and again, and lower the objective by a third or less of the prediction."""
+"""Share of the predicted decrease below which the next step is more damped (as in Nocedal and
+Wright's algorithm 4.1, there 1/4): if the neglected second derivatives are large, full steps
+overshoot again and again, and lower the objective by a third or less of the prediction."""
 
 NEGLIGIBLE_DECREASE = 1e-3
-"""Of J by a Newton step: 0.045 standard deviations away in any direction."""
+"""Decrease of J by a Newton step of 0.045 standard deviations in any direction."""
 
 LEAST_CURVATURE = 0.1
-"""Of J in units of the linearised one: intervals are at most three times as long."""
+"""Curvature of J over that of its linearisation; intervals are at most three times as long."""
 
 MAX_REJECTIONS = 8
 """Largest number of rejected steps in a row."""
@@ -52,7 +53,7 @@ MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 2, 6, 5
 
 @dataclass(frozen=True, slots=True)
 class ExtendedFilter(Filter):
-    """One Kalman update, each observation counted once, nothing iterated.
+    """One Kalman update.
 
     With the prior N(m, P) in filter coordinates (Jazwinski, Stochastic Processes and Filtering
     Theory, 1970, theorem 8.1)::
@@ -60,7 +61,7 @@ class ExtendedFilter(Filter):
         e = y − h(m),  H = dh/dz at m
         m⁺, P⁺ = update of m, P with e, H, R      see `kalman_update`
 
-    It is the first step of `IteratedFilter`, for comparison.
+    It is the first step of `IteratedFilter`.
     """
 
     def estimate(self, run: FilterRun) -> Estimate:
@@ -78,33 +79,33 @@ class ExtendedFilter(Filter):
 
 @dataclass(frozen=True, slots=True)
 class IteratedFilter(Filter):
-    """Posterior mode and its covariance, each observation counted once.
+    """Posterior mode and its covariance.
 
-    Minimises, in filter coordinates z with the prior N(m, P), the objective::
+    Minimises in filter coordinates z with the prior N(m, P) the objective::
 
         J(z) = ½ (y − h(z))ᵀ R⁻¹ (y − h(z)) + ½ (z − m)ᵀ P⁻¹ (z − m)
 
-    by the iterated extended Kalman filter (Bell and Cathey, IEEE Trans. Autom. Control 38 (1993)
-    294-297, who show that it is Gauss-Newton on J). At each iterate zᵢ, with H = dh/dz there::
+    by the iterated extended Kalman filter, which is Gauss-Newton on J (Bell and Cathey, IEEE Trans.
+    Autom. Control 38 (1993) 294-297). At each iterate zᵢ, with H = dh/dz there::
 
         e    = y − h(zᵢ) + H (zᵢ − m)             innovation of the prior, linearised at zᵢ
         z*, P* = update of m, P with e, H, R      see `kalman_update`
         zᵢ₊₁ = zᵢ + step
 
-    The update always starts from the prior, never from the last posterior. The step is z* − zᵢ if
-    that lowers J enough; otherwise Levenberg and Marquardt's
+    The update always starts from the prior, so that each observation counts once. The step is
+    z* − zᵢ if that lowers J enough; otherwise Levenberg and Marquardt's
     step = (B + λ diag B)⁻¹ B (z* − zᵢ), where B is the Hessian of the linearised J in coordinates
     in which the prior is N(0, I). λ grows until J decreases, and after a step that lowers it far
-    less than predicted. A step where the model fails is rejected in the same way. The covariance is
-    P* at the last iterate: that of Gauss-Newton, without the second derivatives of h.
+    less than predicted. A step at which the model fails is rejected in the same way. The covariance
+    is P* at the last iterate, without the second derivatives of h.
 
-    Where R is a `NoiseFamily`, it is learned at each iterate from the model linearised there,
-    without further runs: estimate and noise are the most probable ones for each other. The
-    uncertainty of the noise widens the covariance (see `mvest.estimation.evidence`). After
-    ``max_learned`` iterates the noise stays, so that the filter can converge.
+    If R is a `NoiseFamily`, it is learned at each iterate from the model linearised there, without
+    further runs. The uncertainty of the noise widens the covariance (see
+    `mvest.estimation.evidence`). After ``max_learned`` iterates the noise is fixed, so that the
+    filter can converge.
 
-    The filter stops where the next full step is below the tolerance, without taking it: the
-    reported prediction is that of the estimate.
+    The filter stops if the next full step is below the tolerance, without taking it: the reported
+    prediction is that of the estimate.
 
     Attributes
     ----------
@@ -121,8 +122,8 @@ class IteratedFilter(Filter):
     max_learned : int
         Iterates at which the noise of a `NoiseFamily` is learned.
     second_order : bool
-        Where Gauss-Newton does not converge, or the check of its posterior fails, find the mode and
-        its covariance with second derivatives from 2p further runs.
+        Whether mode and covariance are computed with second derivatives, from 2p further runs, if
+        Gauss-Newton does not converge or the check of its posterior fails.
     """
 
     tolerance: float = 1e-4
@@ -180,30 +181,21 @@ class IteratedFilter(Filter):
                 else:
                     reason = Reason.NO_DECREASE
             if reason is not None:
-                curvature: FloatArray | None = None
-                learned = None if evidence is None else evidence.learned(noise, L)
-                if self.second_order and reason is not Reason.MODEL_FAILED:
-                    check = run.check(point.prediction)
-                    if reason is not Reason.CONVERGED or not (check is None or check.holds):
-                        better = _with_second_derivatives(run, point, update.posterior)
-                        if better is not None:
-                            point, covariance = better
-                            innovation = run.y - point.prediction.y + point.H @ point.x
-                            update = kalman_update(run.unit, innovation, point.H, run.noise)
-                            P = L @ covariance @ L.T
-                            run.record(point.z, P, point.objective, update.log_likelihood)
-                            curvature = _left_out(run, point, covariance)
-                            reason = Reason.CONVERGED
-                            detail = f"{iterations} iterations, then with second derivatives"
-                return run.finish(
-                    reason,
-                    detail,
-                    point.prediction,
-                    innovation,
-                    update,
-                    learned=learned,
-                    curvature=curvature,
-                )
+                more: dict[str, Any] = {"learned": evidence and evidence.learned(noise, L)}
+                check = run.check(point.prediction) if self.second_order else None
+                trusted = reason is Reason.CONVERGED and (check is None or check.holds)
+                if self.second_order and not trusted and reason is not Reason.MODEL_FAILED:
+                    better = _with_second_derivatives(run, point, update.posterior)
+                    if better is not None:
+                        point, covariance = better
+                        innovation = run.y - point.prediction.y + point.H @ point.x
+                        update = kalman_update(run.unit, innovation, point.H, run.noise)
+                        P = L @ covariance @ L.T
+                        run.record(point.z, P, point.objective, update.log_likelihood)
+                        more["curvature"] = _left_out(run, point, covariance)
+                        reason = Reason.CONVERGED
+                        detail = f"{iterations} iterations, then with second derivatives"
+                return run.finish(reason, detail, point.prediction, innovation, update, **more)
 
     def _first(self, run: FilterRun) -> FloatArray:
         """Coordinates x of the first iterate."""
@@ -227,7 +219,7 @@ def _search(
 ) -> "tuple[_Point | None, float, str | None]":
     """The next iterate, which lowers the objective, and its damping.
 
-    None if there is no such step; then with the model's reason if it failed at the last one.
+    None if there is no such step, with the model's reason if it failed at the last one.
     """
     failure: str | None = None
     scale = np.diag(np.diagonal(B))
@@ -254,18 +246,17 @@ def _search(
 def _with_second_derivatives(
     run: FilterRun, point: "_Point", gaussian: Gaussian
 ) -> "tuple[_Point, FloatArray] | None":
-    """The minimum of J and the covariance that its own curvature gives, in coordinates x.
+    """The minimum of J and the covariance from its curvature, in coordinates x.
 
     Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``. With thousands of observations
     this may be as large as the rest, though the model is nearly linear over a standard deviation.
     Here the Hessian comes from differences of J's exact gradients over ± one standard deviation
     along conjugate directions of a Gaussian, first of Gauss-Newton's (Nocedal and Wright 2006,
     section 8.1); its inverse is the covariance (Laplace). The directions are the columns of
-    Cholesky's factor: the last ones change the last parameters alone. Newton steps with the Hessian
-    lead to the minimum. If that is more than a standard deviation away, the Hessian is found again
-    there.
+    Cholesky's factor. Newton steps with the Hessian lead to the minimum. If that is more than a
+    standard deviation away, the Hessian is computed again there.
 
-    Returns None where a run fails, J is not convex, or its minimum is not reached.
+    Returns None if a run fails, J is not convex, or its minimum is not reached.
     """
     covariance = gaussian.covariance
     for _ in range(MAX_HESSIANS):
@@ -339,7 +330,7 @@ class _Point:
     objective: float
 
     def slope(self, run: FilterRun) -> FloatArray:
-        """Derivative of J by x (p,), exact for the noise as it is now."""
+        """Derivative of J by x (p,), exact for the current noise."""
         e = run.noise.whiten(run.y - self.prediction.y)
         return np.asarray(self.x - run.noise.whiten(self.H).T @ e)
 
@@ -355,5 +346,5 @@ def _evaluate(run: FilterRun, x: FloatArray) -> _Point | Prediction:
 
 
 def _objective(run: FilterRun, x: FloatArray, prediction: Prediction) -> float:
-    """J with the noise as it is now."""
+    """J with the current noise."""
     return run.misfit(prediction) + 0.5 * float(x @ x)

@@ -16,7 +16,7 @@ from mvest.typing import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperFilter(Filter):
-    """Extended Kalman filter that cycles the same frames as new observations.
+    """Extended Kalman filter that reuses the same frames as new observations.
 
     Estimation of patient-specific material properties of the mitral valve using 4D transesophageal
     echocardiography (ISBI 2013). The parameters are a random walk, and in each round all frames
@@ -27,15 +27,14 @@ class PaperFilter(Filter):
         m, P = update of m⁻, P⁻ with e, H, R     see `kalman_update`
 
     until two consecutive rounds agree. Each round counts the observation again, so that P is not
-    the covariance of a posterior: with Q = 0 it shrinks like 1/rounds, with Q > 0 it settles at a
+    the covariance of a posterior: with Q = 0 it shrinks like 1/rounds, with Q > 0 it tends to a
     value set by Q and R. For a posterior use `IteratedFilter`. No step is shortened: the run ends
-    where the model fails.
+    if the model fails.
 
     Attributes
     ----------
     Q : float, (p,) or (p, p) in squared units of the parameters
-        Covariance added in each round. With a transform it is carried into filter coordinates at
-        the prior's mean.
+        Covariance added in each round; transformed into filter coordinates at the prior's mean.
     tolerance : float
         Stop when no parameter changed by more than this, relative to its size (or to its standard
         deviation if that is larger).
@@ -60,7 +59,18 @@ class PaperFilter(Filter):
         while True:
             prediction = run.predict(m)
             if not prediction.converged:
-                return run.fail(m, P, _with_way_out(run, m, prediction))
+                now, start = (run.transform.inverse(z) for z in (m, run.prior.mean))
+                left = [
+                    f"{run.names[i]} = {now[i]:.3g}"
+                    for i in np.flatnonzero((now <= 0.0) & (start > 0.0))
+                ]
+                if left:
+                    prediction = Prediction.failed(
+                        f"{prediction.reason}; the paper's filter does not shorten its steps, and "
+                        f"this one led to {' and '.join(left)}: in logarithms "
+                        f"(filter=iterated_log; IteratedFilter with Log) parameters stay positive"
+                    )
+                return run.fail(m, P, prediction)
             H = run.jacobian(m, prediction)
             innovation = run.y - prediction.y
             update = kalman_update(Gaussian(m, P + Q), innovation, H, run.noise)
@@ -78,16 +88,3 @@ class PaperFilter(Filter):
             m, P = update.posterior.mean, update.posterior.covariance
             converged = run.negligible(change, m, P, self.tolerance)
             rounds += 1
-
-
-def _with_way_out(run: FilterRun, z: FloatArray, failed: Prediction) -> Prediction:
-    """The failed prediction at z, with advice where a step made a parameter negative."""
-    m, start = run.transform.inverse(z), run.transform.inverse(run.prior.mean)
-    left = [f"{run.names[i]} = {m[i]:.3g}" for i in np.flatnonzero((m <= 0.0) & (start > 0.0))]
-    if not left:
-        return failed
-    return Prediction.failed(
-        f"{failed.reason}; the paper's filter takes its steps whole, and this one led to "
-        f"{' and '.join(left)}: in logarithms (filter=iterated_log; IteratedFilter with Log) every "
-        f"step stays positive"
-    )

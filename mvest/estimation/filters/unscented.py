@@ -16,7 +16,7 @@ from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 MAX_REJECTIONS = 6
-"""How often the points are drawn together in one round."""
+"""How often the points may be contracted in one round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +35,14 @@ class UnscentedFilter(Filter):
     The first round, about the prior, is the reduced-order unscented Kalman filter of Moireau and
     Chapelle (2011), ESAIM: Control, Optimisation and Calculus of Variations 17:380-405, for
     constant parameters (there L = dθ/dx, U = I + Gᵀ R⁻¹ G, θ⁺ = θ + L U⁻¹ Gᵀ R⁻¹ (y − ȳ)).
-    Further rounds place the points about the posterior so far, N(x⁺, P⁺), and update the prior
-    again, so that each observation is counted once (García-Fernández, Svensson, Morelande and
+    Further rounds place the points around the posterior so far, N(x⁺, P⁺), and update the prior
+    again, so that each observation counts once (García-Fernández, Svensson, Morelande and
     Särkkä 2015, IEEE Trans. Signal Process. 63:5561). At the fixed point H is the mean slope over
-    the posterior. The predictions of p + 1 points lie on a plane, so that the linearisation leaves
-    no error to be added to R.
+    the posterior. The predictions of p + 1 points lie on a plane, so that there is no error of
+    linearisation to be added to R.
 
-    Where a point has no prediction, its round is repeated with the points at half the distance, and
-    half way to the mean before. A round that moves the mean no less than the last one is halved.
+    If a point has no prediction, its round is repeated with the points at half the distance, half
+    way back to the previous mean. A step that is no smaller than the last one is halved.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class UnscentedFilter(Filter):
     max_iterations : int
         Rounds. 1 is the filter of Moireau and Chapelle.
     spread : float
-        Distance of the points from their mean, in parts of the simplex whose covariance is P.
+        Distance of the points from their mean; at 1 their covariance is P.
     """
 
     tolerance: float = 1e-3
@@ -98,7 +98,7 @@ class UnscentedFilter(Filter):
     def _linearise(
         self, run: FilterRun, at: Gaussian, before: FloatArray
     ) -> tuple[Gaussian, FloatArray, FloatArray] | Prediction:
-        """Where all points have predictions, with their mean and the slope dh/dx (n, p)."""
+        """Center and spread with all predictions, their mean and the slope dh/dx (n, p)."""
         C, x, spread = at.factor, at.mean, self.spread
         for _ in range(MAX_REJECTIONS + 1):
             points = simplex_points(at.mean.size)

@@ -31,7 +31,7 @@ from mvest.reading.text import named, one_line, refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
-from mvest.valve.mesh.remesh import Remeshed, remesh
+from mvest.valve.mesh.remesh import remesh
 
 TOLERANCE_MM = 1e-3
 """Frames are stored in single precision, whose rounding at 30 mm is 2e-6 mm."""
@@ -69,32 +69,14 @@ class Recording:
     pressure: float
     pressure_share: FloatArray
 
-    def positions(self, triangle: IntArray, weights: FloatArray, frame: int) -> FloatArray:
-        """Recorded positions ``(k, 3)`` mm in one frame of material points of the midsurface.
-
-        Parameters
-        ----------
-        triangle, weights : ndarray
-            ``(k,)`` and ``(k, 3)``: triangles and barycentric weights, as those of
-            :class:`mvest.valve.mesh.remesh.Remeshed`.
-        frame : int
-            0 is the reference; -1 the last, closed one.
-        """
-        corner = self.frames[frame][self.valve.surface.triangles[triangle]]
-        return np.einsum("ij,ijk->ik", weights, corner)
-
-    def remeshed(self, count: int) -> tuple[Remeshed, Valve]:
-        """The midsurface with so many vertices, and the valve on it."""
+    def remeshed(self, count: int) -> tuple[IntArray, Valve]:
+        """Vertices ``(count,)`` of the midsurface, and the valve with these vertices alone."""
         fine = self.valve
         coarse = remesh(fine.surface, fine.annulus, fine.free_edge, count)
-        own = coarse.annulus
-        step = np.zeros((len(self.times), *fine.surface.vertices.shape))
-        step[:, fine.annulus] = fine.motion.annulus - fine.surface.vertices[fine.annulus]
-        corners = step[:, fine.surface.triangles[coarse.triangle[own]]]
-        moved = np.einsum("ij,fijk->fik", coarse.weights[own], corners)
-        motion = replace(fine.motion, annulus=coarse.surface.vertices[own] + moved)
+        on_annulus = np.isin(fine.annulus, coarse.kept)
+        motion = replace(fine.motion, annulus=fine.motion.annulus[:, on_annulus])
         surface = {name: getattr(coarse, name) for name in ("surface", "annulus", "free_edge")}
-        return coarse, replace(fine, **surface, motion=motion)
+        return coarse.kept, replace(fine, **surface, motion=motion)
 
 
 def recording_files(folder: Path) -> list[Path]:

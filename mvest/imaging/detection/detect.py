@@ -14,31 +14,26 @@ from mvest.imaging.detection.pose_search import MODES, refined, search_poses, st
 from mvest.imaging.detection.shape_model import Pulls, fit_shape, relax
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import LANDMARKS, ValveSequence, landmark_vertices
-from mvest.typing import FloatArray, IntArray
+from mvest.imaging.valve_sequence import ValveSequence, landmark_vertices
+from mvest.typing import FloatArray
 
 LANDMARK_STD_MM, RIM_STD_MM = 1.2, 0.8
-"""mm, least standard deviation of a landmark's and a rim's pull; the spread of votes adds to it."""
-
-HAND_STD_MM = (0.2, 0.03)
-"""mm, standard deviation of landmarks placed by hand, in the fit of the shape and in the free
-displacement at the end."""
+"""mm, smallest standard deviation of the pull of a landmark and a rim; votes add their spread."""
 
 ROUNDS = ((14, 6.0), (25, 4.0), (40, 3.0))
-"""Largest number of modes in each round of the fit, and the distance (mm) along normals within
-which leaflets are looked for."""
+"""Largest number of modes in each round of the fit, and the search distance (mm) along normals."""
 
 CORRELATED = 8.0
 """Divides the number of vertices in the fit, as errors of neighbouring vertices are correlated."""
 
 STIFFNESS, HOLD = 4.0, 0.3
-"""Of the free displacement at the end, see :func:`mvest.imaging.detection.shape_model.relax`."""
+"""Of the free displacement at the end (:func:`mvest.imaging.detection.shape_model.relax`)."""
 
 CANDIDATES = 40
 """Poses that a search returns, many of them similar."""
 
 SURE, TRIED = 0.6, 14
-"""If the best rating is lower, so many poses are tried. Fewer often miss the right one."""
+"""If the best rating is below SURE, TRIED poses are fitted. Fewer often miss the right one."""
 
 RATING_SHARE = 0.3
 """Weight of a pose's rating in the confidence. In simulated volumes unlike those of training, the
@@ -53,10 +48,7 @@ front to back, a shape has a distance of 1.5 to 4."""
 class NoValveError(InputError):
     """A volume shows no valve of sufficient confidence.
 
-    Attributes
-    ----------
-    candidate : ValveSequence or None
-        The best one, which was not accepted; None without a field of view.
+    ``candidate`` is the best one, which was not accepted; None without a field of view.
     """
 
     def __init__(self, message: str, candidate: ValveSequence | None = None) -> None:
@@ -66,34 +58,21 @@ class NoValveError(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameValve:
-    """A valve in one frame; positions in world mm.
+    """A valve in one frame; positions in world mm."""
 
-    Attributes
-    ----------
-    pose : Poses
-        One.
-    coefficients : (K,)
-        Of the shape model.
-    vertices : (n, 3)
-    tips : (2, 3)
-    confidence : float
-        0 (no valve) to 1.
-    vertex_confidence : (n,)
-    """
-
-    pose: Poses
-    coefficients: FloatArray
-    vertices: FloatArray
-    tips: FloatArray
-    confidence: float
-    vertex_confidence: FloatArray
+    pose: Poses  #: one
+    coefficients: FloatArray  #: (K,) of the shape model
+    vertices: FloatArray  #: (n, 3)
+    tips: FloatArray  #: (2, 3)
+    confidence: float  #: 0 (no valve) to 1
+    vertex_confidence: FloatArray  #: (n,)
 
 
 def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
     """Search one frame and fit the valve in it; NoValveError without a field of view."""
     poses, rating = search_poses(frame, model.boosters, CANDIDATES)
     if not len(poses):
-        raise NoValveError("no place to look for a valve at: no field of view")
+        raise NoValveError("no valve found: no field of view")
     if rating[0] < SURE:
         poses = poses[poses.apart(rating, TRIED)]
         best = int(np.argmax(merits(frame, model, poses)))
@@ -102,28 +81,25 @@ def find_frame(frame: StandardFrame, model: DetectionModel) -> FrameValve:
 
 
 def merits(frame: StandardFrame, model: DetectionModel, poses: Poses) -> FloatArray:
-    """Confidence ``(P,)`` in valves at some poses, fitted roughly to every second row and column.
+    """Confidence ``(P,)`` of valves at some poses, fitted roughly to every second row and column.
 
-    In images unlike those of training a wrong pose may be rated best. Its leaflets then lie off the
-    detected boundary, or have an unusual shape.
+    In images unlike those of training a wrong pose may be rated best. Its leaflets are then away
+    from the detected boundary, or have an unusual shape.
     """
-    return np.array([_merit(frame, model, poses[k : k + 1]) for k in range(len(poses))])
-
-
-def _merit(frame: StandardFrame, model: DetectionModel, pose: Poses) -> float:
-    shape, layout = model.shape, model.shape.layout
+    shape, layout, trees = model.shape, model.shape.layout, model.boosters
     some = np.arange(layout.size).reshape(layout.rows, -1)[::2, ::2]
     coarse = ValveLayout(some.shape[1], some.shape[0])
-    start, _ = starting_shape(frame, model.boosters, pose, shape)
-    b = np.zeros(min(ROUNDS[0][0], len(shape.std)))
-    b[:MODES] = start[0]
-    seen = np.zeros(0)
     wide = np.sqrt(max(1.0, CORRELATED * coarse.size / layout.size))
-    for _, reach in (ROUNDS[0], ROUNDS[-1]):
-        vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
-        normals, offset, std, seen = find_boundary(frame, model.boosters, vertices, coarse, reach)
-        pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
-    return _confidence(frame, model, pose, b, seen)
+    found = []
+    for k in range(len(poses)):
+        pose, b = poses[k : k + 1], np.zeros(min(ROUNDS[0][0], len(shape.std)))
+        b[:MODES] = starting_shape(frame, trees, pose, shape)[0][0]
+        for _, reach in (ROUNDS[0], ROUNDS[-1]):
+            vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
+            normals, offset, std, seen = find_boundary(frame, trees, vertices, coarse, reach)
+            pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
+        found.append(_confidence(frame, model, pose, b, seen))
+    return np.array(found)
 
 
 def _confidence(
@@ -131,8 +107,8 @@ def _confidence(
 ) -> float:
     """Confidence that there is a valve, 0 to 1, by its leaflets, pose and shape.
 
-    In volumes with walls and no valve, leaflets (on a wall) may look right where the pose does not,
-    or the other way round, and the shape is mostly unusual.
+    In volumes of walls without a valve, either the leaflets (on a wall) or the pose may look right,
+    but rarely both, and the shape is mostly unusual.
     """
     rating = float(np.clip(refined(frame, model.boosters, pose)[1][0], 0.0, 1.0))
     strange = max(0.0, float(((b / model.shape.std[: len(b)]) ** 2).mean()) - 1.0)
@@ -146,16 +122,11 @@ def fit_frame(
     *,
     coefficients: FloatArray | None = None,
     tips: FloatArray | None = None,
-    fixed: FloatArray | None = None,
 ) -> FrameValve:
     """Fit the valve from a pose (one).
 
-    Parameters
-    ----------
-    coefficients, tips : (K,), (2, 3) mm, optional
-        To start from; otherwise regressed at the pose.
-    fixed : (L, 3) mm, optional
-        World positions of landmarks placed by hand, which stay; NaN where none was.
+    The fit starts from ``coefficients (K,)`` and ``tips (2, 3)`` mm, or from those regressed at the
+    pose.
     """
     shape, layout = model.shape, model.shape.layout
     start, found_tips = starting_shape(frame, model.boosters, pose, shape)
@@ -164,45 +135,25 @@ def fit_frame(
     tips = found_tips[0] if tips is None else tips
     vertices = pose.world(shape.shape(b[None]))[0]
     at = np.array(list(landmark_vertices(layout).values()))
-    points, spread = np.concatenate([vertices[at], tips]), np.zeros(len(LANDMARKS))
-    by_hand = np.zeros(len(points), dtype=np.bool_)
-    if fixed is not None:
-        by_hand = np.isfinite(fixed[:, 0])
-        points[by_hand] = fixed[by_hand]
-    free = np.flatnonzero(~by_hand)
-    points[free], spread[free] = find_landmarks(frame, model.boosters, pose, points[free], free)
-    on_leaflets, tips = points[: len(at)], points[len(at) :]
-    manual = np.flatnonzero(by_hand[: len(at)])
-    std = np.full(len(at), LANDMARK_STD_MM)
-    std[manual] = HAND_STD_MM[0]
-    std = np.hypot(std, spread[: len(at)])
-    pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], on_leaflets, std))
-    hand = at[manual], on_leaflets[manual]
+    points = np.concatenate([vertices[at], tips])
+    points, spread = find_landmarks(frame, model.boosters, pose, points)
+    std = np.hypot(LANDMARK_STD_MM, spread[: len(at)])
+    pulls = Pulls.to_points(at, vertices[at], points[: len(at)], std)
+    pose, b = fit_shape(shape, pose, b, pulls)
     for modes, reach in ROUNDS:
         b = np.concatenate([b, np.zeros(max(0, min(modes, len(shape.std)) - len(b)))])
-        _, pulls, _ = _seen(frame, model, pose, b, reach, hand, HAND_STD_MM[0])
-        pose, b = fit_shape(shape, pose, b, pulls)
-    vertices, pulls, confidence = _seen(frame, model, pose, b, reach, hand, HAND_STD_MM[1])
+        pose, b = fit_shape(shape, pose, b, _seen(frame, model, pose, b, reach)[1])
+    vertices, pulls, confidence = _seen(frame, model, pose, b, reach)
     vertices = relax(vertices, layout, pulls, STIFFNESS, HOLD)
     sure = _confidence(frame, model, pose, b, confidence)
-    return FrameValve(pose, b, vertices, tips, sure, confidence)
+    return FrameValve(pose, b, vertices, points[len(at) :], sure, confidence)
 
 
 def _seen(
-    frame: StandardFrame,
-    model: DetectionModel,
-    pose: Poses,
-    b: FloatArray,
-    reach: float,
-    by_hand: tuple[IntArray, FloatArray],
-    hand_std: float,
+    frame: StandardFrame, model: DetectionModel, pose: Poses, b: FloatArray, reach: float
 ) -> tuple[FloatArray, Pulls, FloatArray]:
-    """A shape ``(n, 3)`` mm, the pulls on it, and each vertex' confidence ``(n,)``.
-
-    Leaflets and rims pull, and vertices placed ``by_hand``: their numbers and positions, with the
-    standard deviation ``hand_std``.
-    """
-    layout, boosters, (hand, points) = model.shape.layout, model.boosters, by_hand
+    """A shape ``(n, 3)`` mm, the pulls of leaflets and rims, and vertex confidences ``(n,)``."""
+    layout, boosters = model.shape.layout, model.boosters
     vertices = pose.world(model.shape.shape(b[None]))[0]
     normals, offset, std, confidence = find_boundary(frame, boosters, vertices, layout, reach)
     parts = [Pulls(np.arange(layout.size), normals, offset, np.sqrt(CORRELATED) * std)]
@@ -213,5 +164,4 @@ def _seen(
         # Errors of neighbouring columns are correlated as those of rows are.
         wide = np.sqrt(np.sqrt(CORRELATED)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
-    parts.append(Pulls.to_points(hand, vertices[hand], points, np.full(len(hand), hand_std)))
     return vertices, Pulls.joined(parts), confidence

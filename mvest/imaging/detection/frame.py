@@ -1,4 +1,4 @@
-"""One frame of a volume as detectors see it: ranks instead of grey values, at several scales.
+"""One frame of a volume as input of the detectors: ranks of grey values at several scales.
 
 Features are ranks at points that turn and scale with a hypothesis, and their differences: the
 steerable features of Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008), with means over cubes
@@ -26,43 +26,30 @@ LEVELS = 4
 """Scales: cubes of 1, 2, 4 and 8 voxels."""
 
 SPARSE = 25
-"""Of 255: least share of voxels with an echo in a cell of 4 x 4 x 4 voxels that has an echo."""
+"""Of 255: a cell of 4 x 4 x 4 voxels has an echo if a larger share of its voxels has one."""
 
 MIN_CELLS, MIN_GREY_VALUES = 20, 8
-"""Least number of cells with an echo, and of different grey values, in an image."""
+"""Smallest number of cells with an echo, and of different grey values, in an image."""
 
 MAX_LEVELS = 65536
-"""Largest range of whole grey values of which each is counted."""
+"""Largest range of integer grey values for which each value is counted."""
 
 MAX_COMPARED = 200_000
-"""Largest number of voxels among which floating-point grey values are ranked."""
+"""Largest number of voxels used to rank floating-point grey values."""
 
 
 class StandardFrame(NamedTuple):
     """Means over cubes of 1, 2, 4, ... voxels of the ranks of one frame's grey values.
 
-    A rank is the share of darker voxels within the field of view, which no gain, dynamic range or
-    other monotone map of grey values changes.
-
-    Attributes
-    ----------
-    data : (N,) uint8
-        Ranks of all levels one after another, 255 the brightest; 0 outside the field of view.
-    starts : (L,)
-        Where each level begins.
-    shapes : (L, 3)
-        Voxels of each level.
-    to_index : (3, 3)
-        From mm in world axes to voxels of the first level.
-    origin : (3,) mm
-        World position of the first level's voxel (0, 0, 0).
+    A rank is the share of darker voxels within the field of view. It does not change with gain,
+    dynamic range or any other monotone map of grey values.
     """
 
-    data: NDArray[np.uint8]
-    starts: IntArray
-    shapes: IntArray
-    to_index: FloatArray
-    origin: FloatArray
+    data: NDArray[np.uint8]  #: (N,) ranks of all levels, 255 the brightest; 0 outside the view
+    starts: IntArray  #: (L,) beginning of each level
+    shapes: IntArray  #: (L, 3) voxels of each level
+    to_index: FloatArray  #: (3, 3) from mm in world axes to voxels of the first level
+    origin: FloatArray  #: (3,) mm, world position of the first level's voxel (0, 0, 0)
 
     def level(self, number: int) -> NDArray[np.uint8]:
         """Ranks of one level ``(I, J, K)``."""
@@ -81,7 +68,7 @@ class StandardFrame(NamedTuple):
 
 
 def standard_frame(volume: VolumeSequence, frame: int) -> StandardFrame:
-    """Prepare one frame of a volume; InputError if it has hardly any different values."""
+    """Prepare one frame of a volume; InputError if it is not an image."""
     ranks = _ranks(np.asarray(volume.frames[frame]), volume.source, frame)
     spacing = np.asarray(volume.spacing, dtype=np.float64)
     origin = np.asarray(volume.origin, dtype=np.float64)
@@ -170,27 +157,17 @@ def _halved(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 class SamplePattern(NamedTuple):
-    """Points and scales at which ranks are sampled about a hypothesis.
+    """Points and scales at which ranks are sampled about a hypothesis."""
 
-    Attributes
-    ----------
-    offsets : (F, 3)
-        mm in the axes of the hypothesis.
-    levels : (F,)
-        Scale of each sample.
-    pairs : (D, 2)
-        Samples whose difference is a feature.
-    """
-
-    offsets: FloatArray
-    levels: IntArray
-    pairs: IntArray
+    offsets: FloatArray  #: (F, 3) mm in the axes of the hypothesis
+    levels: IntArray  #: (F,) scale of each sample
+    pairs: IntArray  #: (D, 2) samples whose difference is a feature
 
     @classmethod
     def paired(
         cls, offsets: FloatArray, levels: IntArray, differences: int, seed: int
     ) -> SamplePattern:
-        """Samples with differences of random pairs, more often of near ones."""
+        """Samples with differences of random pairs, mostly of near ones."""
         rng = np.random.default_rng(seed)
         n = len(offsets)
         first = rng.integers(n, size=differences)
@@ -219,8 +196,8 @@ def features(
 ) -> NDArray[np.float32]:
     """Features ``(P, size)`` of hypotheses, ranks from 0 to 255.
 
-    Hypotheses lie at ``points (P, 3)`` mm in the world; the columns of ``axes (P, 3, 3)`` are their
-    axes there, scale included.
+    Hypotheses are at ``points (P, 3)`` mm in the world. The columns of ``axes (P, 3, 3)`` are their
+    axes, with scale.
     """
     values = np.empty((len(points), len(pattern.offsets)), dtype=np.float32)
     points, axes = (np.ascontiguousarray(x, dtype=np.float64) for x in (points, axes))
@@ -256,7 +233,7 @@ def _sample(
             y = (y + 0.5) * scale - 0.5
             z = (z + 0.5) * scale - 0.5
             nx, ny, nz = shapes[level, 0], shapes[level, 1], shapes[level, 2]
-            # In this form NaN is outside.
+            # With NaN, this form is True.
             if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5 and -0.5 <= z <= nz - 0.5):
                 out[p, f] = 0.0
                 continue

@@ -1,8 +1,8 @@
 """Detectors of landmarks, rims and leaflets, which start from a shape nearby.
 
-Candidates about a guess vote for a landmark or a rim: trees predict where it lies from each. The
-candidates of a rim lie in the plane perpendicular to it. Leaflets are found by the probability of
-the midsurface along their normals.
+Candidates around a guess vote for a landmark or a rim: trees predict its position relative to each.
+The candidates of a rim are in the plane perpendicular to it. Leaflets are found by the probability
+of the midsurface along their normals. Rims are the annulus and the free edge.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ ROUNDS = 4
 
 
 def consensus(votes: FloatArray, width_mm: float = 1.5) -> tuple[FloatArray, FloatArray]:
-    """Points ``(P, d)`` mm on which votes ``(P, V, d)`` agree, and their spread ``(P,)`` mm.
+    """Robust means ``(P, d)`` mm of votes ``(P, V, d)``, and their spread ``(P,)`` mm.
 
-    Votes farther than ``width_mm`` from the consensus have little weight (Cauchy). The spread is
-    the weighted root mean square distance of the votes.
+    Votes farther than ``width_mm`` from the mean have little weight (Cauchy). The spread is the
+    weighted root mean square distance of the votes.
     """
     centre = np.median(votes, axis=1)
     for _ in range(ROUNDS):
@@ -38,7 +38,7 @@ def consensus(votes: FloatArray, width_mm: float = 1.5) -> tuple[FloatArray, Flo
 
 
 def _cloud(seed: int, spreads: tuple[float, ...], counts: list[int], pairs: int) -> SamplePattern:
-    """Samples about a candidate, at scale k normal with a standard deviation of ``spreads[k]``."""
+    """Samples about a candidate: normal, with the standard deviation ``spreads[k]`` at scale k."""
     rng = np.random.default_rng(seed)
     offsets = rng.standard_normal((sum(counts), 3)) * np.repeat(spreads, counts)[:, None]
     return SamplePattern.paired(offsets, np.repeat([0, 1, 2], counts), pairs, seed)
@@ -72,12 +72,12 @@ LANDMARK_PATTERN = _cloud(4, (3.0, 7.0, 12.0), [50, 50, 30], 70)
 
 
 def landmark_points(vertices: FloatArray, tips: FloatArray, layout: ValveLayout) -> FloatArray:
-    """``(L, 3)`` mm, in the order of :data:`mvest.imaging.valve_sequence.LANDMARKS`."""
+    """Points ``(L, 3)`` mm in the order of :data:`mvest.imaging.valve_sequence.LANDMARKS`."""
     return np.concatenate([vertices[list(landmark_vertices(layout).values())], tips])
 
 
 def landmark_samples(seen: LabelledFrame, which: int, count: int) -> Examples:
-    """Candidates about one landmark, and where it lies from them ``(P, 3)`` in their axes."""
+    """Candidates about one landmark, and its position relative to them ``(P, 3)`` in their axes."""
     poses = seen.missed_poses(LANDMARK_MISSES, count)
     point = landmark_points(seen.vertices, seen.tips, seen.model.layout)[which]
     candidates = point + seen.rng.standard_normal((count, 3)) * LANDMARK_START_MM
@@ -86,24 +86,22 @@ def landmark_samples(seen: LabelledFrame, which: int, count: int) -> Examples:
 
 
 def find_landmarks(
-    frame: StandardFrame, boosters: Trees, pose: Poses, points: FloatArray, which: IntArray
+    frame: StandardFrame, boosters: Trees, pose: Poses, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Landmarks ``(L, 3)`` mm of numbers ``which (L,)``, and the spread of their votes ``(L,)`` mm.
+    """All landmarks ``(L, 3)`` mm and the spread of their votes ``(L,)`` mm.
 
-    They are looked for about guesses ``points (L, 3)``. The three outputs of the trees say where a
-    landmark lies from a candidate, mm in the axes of the ``pose`` (one).
+    The search starts at ``points (L, 3)``. The three outputs of the trees are the position of a
+    landmark relative to a candidate, mm in the axes of the ``pose`` (one).
     """
     refined, spread = np.array(points), np.zeros(len(points))
     for step in LANDMARK_STEPS_MM:
         grid = _candidates(step, 3)
         axes = np.broadcast_to(pose.axes, (len(grid), 3, 3))
-        for k, number in enumerate(which):
+        for k in range(len(points)):
             candidates = refined[k] + grid @ pose.rotation[0].T
             values = features(frame, LANDMARK_PATTERN, candidates, axes)
-            gap = boosters[f"landmark_{number}"](values)
-            votes = candidates + gap @ pose.rotation[0].T
-            point, width = consensus(votes[None])
-            refined[k], spread[k] = point[0], width[0]
+            votes = candidates + boosters[f"landmark_{k}"](values) @ pose.rotation[0].T
+            (refined[k],), (spread[k],) = consensus(votes[None])
     return refined, spread
 
 
@@ -112,7 +110,7 @@ RIMS = {"annulus": 0, "free_edge": -1}
 """Row of each rim."""
 
 GUESSES = 6
-"""Shapes about which training candidates of one frame are taken."""
+"""Number of shapes around which the training candidates of one frame are taken."""
 
 RIM_MISSES = Misses(1.5, 4.0, 0.04, 0.5)
 RIM_STEPS_MM = (1.6, 0.9)
@@ -122,7 +120,7 @@ RIM_PATTERN = _cloud(5, (2.2, 5.0, 10.0), [50, 45, 25], 80)
 
 
 def rim_axes(vertices: FloatArray, layout: ValveLayout, row: int) -> FloatArray:
-    """``(columns, 3, 3)``: at every column along the rim, away from the leaflet, and across it."""
+    """Axes ``(columns, 3, 3)``: along the rim, away from the leaflet, and across it."""
     grid = vertices.reshape(layout.rows, layout.columns, 3)
     inner = 2 if row == 0 else layout.rows - 3
     along = np.roll(grid[row], -1, 0) - np.roll(grid[row], 1, 0)
@@ -134,7 +132,7 @@ def rim_axes(vertices: FloatArray, layout: ValveLayout, row: int) -> FloatArray:
 
 
 def rim_samples(seen: LabelledFrame, which: str, count: int) -> Examples:
-    """Candidates about one of `RIMS`, and where it lies from them ``(P, 2)`` mm."""
+    """Candidates about one of `RIMS`, and its position relative to them ``(P, 2)`` mm."""
     layout, rng = seen.model.layout, seen.rng
     row = RIMS[which] % layout.rows
     target = seen.vertices.reshape(layout.rows, layout.columns, 3)[row]
@@ -161,17 +159,17 @@ def find_rim(
     layout: ValveLayout,
     log_scale: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Detect one of `RIMS` about that of a shape ``(n, 3)`` mm.
+    """Detect one of `RIMS` near that of a shape ``(n, 3)`` mm.
 
-    The two outputs of the trees say how far away from the leaflet, and across it, the rim lies from
-    a candidate.
+    The two outputs of the trees are the distances of the rim from a candidate, away from the
+    leaflet and across it.
 
     Returns
     -------
     axes : (columns, 3, 3)
         See :func:`rim_axes`.
     offset : (columns, 2) mm
-        Of the rim from the shape's, away from the leaflet and across it.
+        From the shape's rim to the detected one, away from the leaflet and across it.
     spread : (columns,) mm
         Of the votes.
     """
@@ -194,13 +192,13 @@ def find_rim(
 # -- leaflets -------------------------------------------------------------------------------------
 BOUNDARY_MISSES = Misses(1.2, 3.0, 0.03, 0.4)
 BOUNDARY_STEP_MM = 0.5
-"""mm between places along a normal."""
+"""mm between samples along a normal."""
 
 BOUNDARY_WIDTH_MM = 0.6
 """mm, standard deviation of the label about the midsurface: exp(-d^2 / (2 WIDTH^2))."""
 
 REACH = (3, 2)
-"""Columns and rows about a vertex in which the nearest true vertex is looked for."""
+"""Columns and rows around a vertex among which the nearest true vertex is searched."""
 
 
 def _boundary_pattern() -> SamplePattern:
@@ -218,7 +216,7 @@ BOUNDARY_PATTERN = _boundary_pattern()
 
 
 def leaflet_axes(vertices: FloatArray, layout: ValveLayout) -> FloatArray:
-    """``(n, 3, 3)``: at every vertex around the valve, along the leaflet, and normal to it."""
+    """Axes ``(n, 3, 3)`` at the vertices: around the valve, along the leaflet, and normal to it."""
     grid = vertices.reshape(layout.rows, layout.columns, 3)
     around = np.roll(grid, -1, 1) - np.roll(grid, 1, 1)
     along: FloatArray = np.asarray(np.gradient(grid, axis=0))
@@ -232,7 +230,7 @@ def leaflet_axes(vertices: FloatArray, layout: ValveLayout) -> FloatArray:
 def _gap(
     points: FloatArray, normals: FloatArray, which: IntArray, true: FloatArray, layout: ValveLayout
 ) -> FloatArray:
-    """``(P,)`` mm along the normals from points to the leaflet ``true (n, 3)`` near vertices."""
+    """Distances ``(P,)`` mm along normals from points to the leaflet ``true (n, 3)``."""
     shape = (layout.rows, layout.columns, 3)
     grid: FloatArray = true.reshape(shape)
     true_normals = leaflet_axes(true, layout)[:, :, 2].reshape(shape)
@@ -253,7 +251,7 @@ def _gap(
 
 
 def boundary_samples(seen: LabelledFrame, count: int) -> Examples:
-    """Points along normals of shapes about the true one, with the label of each ``(P, 1)``."""
+    """Points along normals of shapes about the true one, and their labels ``(P, 1)``."""
     layout, rng = seen.model.layout, seen.rng
     xs, ys = [], []
     for guess in seen.missed_shapes(BOUNDARY_MISSES, GUESSES):
@@ -282,7 +280,7 @@ def find_boundary(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Detect the leaflets within ``reach_mm`` along the normals of a shape ``(n, 3)`` mm.
 
-    The output of the trees is the probability of a point on the midsurface; the prior of its
+    The output of the trees is the probability that a point is on the midsurface. The prior of its
     distance is normal, with a standard deviation of half the reach.
 
     Returns

@@ -15,20 +15,13 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 class Poses:
     """Poses of P hypotheses (or frames).
 
-    Attributes
-    ----------
-    centre : (P, 3) mm
-        World position of the annulus' centre.
-    rotation : (P, 3, 3)
-        Columns are the valve's axes in world coordinates: x to the line between the leaflets at
-        phi = 0, y to the anterior side, z to the atrium.
-    log_scale : (P,)
-        Logarithm of the size over that of the mean valve.
+    The valve's axes: x to the line between the leaflets at phi = 0, y to the anterior side, z to
+    the atrium.
     """
 
-    centre: FloatArray
-    rotation: FloatArray
-    log_scale: FloatArray
+    centre: FloatArray  #: (P, 3) mm, world position of the annulus' centre
+    rotation: FloatArray  #: (P, 3, 3), its columns are the valve's axes in the world
+    log_scale: FloatArray  #: (P,), logarithm of the size over that of the mean valve
 
     def __len__(self) -> int:
         return len(self.centre)
@@ -38,20 +31,20 @@ class Poses:
 
     @property
     def axes(self) -> FloatArray:
-        """``(P, 3, 3)`` axes with the scale."""
+        """Axes ``(P, 3, 3)`` with the scale."""
         return np.asarray(self.rotation * np.exp(self.log_scale)[:, None, None])
 
     def world(self, points: FloatArray) -> FloatArray:
-        """World positions ``(P, m, 3)`` mm of points ``(m, 3)`` or ``(P, m, 3)`` in own axes."""
+        """World positions ``(P, m, 3)`` mm of points ``(m, 3)`` or ``(P, m, 3)`` in valve axes."""
         return np.asarray(self.centre[:, None] + points @ np.swapaxes(self.axes, 1, 2))
 
     def local(self, points: FloatArray) -> FloatArray:
-        """Inverse of :meth:`world`: ``(P, m, 3)`` in the valve's axes, scale taken off."""
+        """Inverse of :meth:`world`: ``(P, m, 3)`` in valve axes, without scale."""
         scale = np.exp(-self.log_scale)[:, None, None]
         return np.asarray((points - self.centre[:, None]) @ self.rotation * scale)
 
     def moved(self, by: FloatArray) -> Poses:
-        """Changed by ``(P, 7)``: shift (mm) and turn (rotation vector) in own axes, log scale."""
+        """Moved by ``(P, 7)``: shift (mm) and turn (rotation vector) in valve axes, log scale."""
         turn = Rotation.from_rotvec(by[:, 3:6]).as_matrix()
         return Poses(
             self.centre + np.einsum("pij,pj->pi", self.rotation, by[:, :3]),
@@ -60,7 +53,7 @@ class Poses:
         )
 
     def towards(self, other: Poses) -> FloatArray:
-        """``(P, 7)`` by which these poses are moved to become ``other``."""
+        """The ``(P, 7)`` that move these poses to ``other``."""
         shift = np.einsum("pij,pi->pj", self.rotation, other.centre - self.centre)
         turn = Rotation.from_matrix(np.swapaxes(self.rotation, 1, 2) @ other.rotation).as_rotvec()
         scale = other.log_scale - self.log_scale
@@ -73,7 +66,7 @@ class Poses:
         )
 
     def apart(self, ratings: FloatArray, count: int) -> IntArray:
-        """The best rated poses, without those within 4 mm and 15 degrees of a better one."""
+        """The best rated poses, none within 4 mm and 15 degrees of a better one."""
         kept: list[int] = []
         for k in np.argsort(-ratings, kind="stable"):
             turn = Rotation.from_matrix(np.swapaxes(self.rotation[kept], 1, 2) @ self.rotation[k])
@@ -86,7 +79,7 @@ class Poses:
 
     @staticmethod
     def joined(parts: list[Poses]) -> Poses:
-        """All poses of several."""
+        """The poses of all parts."""
         names = ("centre", "rotation", "log_scale")
         return Poses(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
@@ -96,8 +89,8 @@ def pose_of(
 ) -> Poses:
     """The pose of one valve, from its vertices ``(n, 3)`` and tips ``(2, 3)`` mm.
 
-    z is along the annulus' normal away from the tips, and x points to phi = 0, perpendicular to z.
-    ``size_mm`` is the mean valve's root mean square distance of the annulus from its centre.
+    z is the annulus' normal away from the tips; x points to phi = 0, perpendicular to z.
+    ``size_mm`` is the root mean square distance of the mean valve's annulus from its centre.
     """
     annulus = vertices[layout.annulus]
     centre = annulus.mean(axis=0)
@@ -113,7 +106,7 @@ def pose_of(
 
 
 def rotation_grid(count: int) -> FloatArray:
-    """``(count, 3, 3)`` rotations, each the farthest of random candidates from those before."""
+    """Rotations ``(count, 3, 3)``, each the random candidate farthest from those before."""
     candidates = Rotation.random(4 * count, rng=np.random.default_rng(0)).as_quat()
     nearness = np.abs(candidates @ candidates[0])
     chosen = [0]

@@ -1,6 +1,6 @@
-"""Search of the pose of a valve in a volume.
+"""Search for the pose of a valve in a volume.
 
-First every position is rated, whatever the orientation. Then orientations are rated at the best
+First every position is rated without an orientation. Then orientations are rated at the best
 positions, and the best poses are refined. At a pose, regressions give the leading modes of the
 shape and the papillary tips, from which the fit starts.
 
@@ -25,7 +25,7 @@ PLACES = 24
 """Positions at which orientations are tried."""
 
 SHELLS = {3.0: 1, 7.0: 1, 11.0: 1, 15.0: 2, 19.0: 2, 24.0: 2, 30.0: 3, 38.0: 3}
-"""Radius (mm) of the shells about a position, and the scale at which each is sampled."""
+"""Radius (mm) of the shells around a position, and the scale at which each is sampled."""
 
 DIRECTIONS = 20
 """Samples of a shell."""
@@ -34,7 +34,7 @@ GRID_LEVEL = 2
 """Positions are the voxels of this level, every second one along each axis."""
 
 NEAR_MM = 6.0
-"""mm over which the rating of a position falls off: exp(-d^2 / (2 NEAR^2))."""
+"""mm, width of the rating of a position: exp(-d^2 / (2 NEAR^2))."""
 
 PATTERN = SamplePattern(
     np.concatenate([radius * directions(DIRECTIONS) for radius in SHELLS]),
@@ -44,18 +44,12 @@ PATTERN = SamplePattern(
 
 
 def _shell_features(frame: StandardFrame, points: FloatArray) -> NDArray[np.float32]:
-    """Mean, spread and extremes over each shell ``(P, 5 * shells)``, without orientation."""
+    """Mean, spread, extremes and median over each shell ``(P, 5 * shells)``."""
     axes = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     values = features(frame, PATTERN, points, axes).reshape(len(points), -1, DIRECTIONS)
     ordered = np.sort(values, axis=2)
-    parts = [
-        values.mean(axis=2),
-        values.std(axis=2),
-        ordered[..., 1],
-        ordered[..., DIRECTIONS // 2],
-        ordered[..., -2],
-    ]
-    return np.concatenate(parts, axis=1)
+    ranked = [ordered[..., k] for k in (1, DIRECTIONS // 2, -2)]
+    return np.concatenate([values.mean(axis=2), values.std(axis=2), *ranked], axis=1)
 
 
 def position_samples(seen: LabelledFrame, count: int) -> Examples:
@@ -70,7 +64,7 @@ def position_samples(seen: LabelledFrame, count: int) -> Examples:
 
 
 def _places(frame: StandardFrame) -> FloatArray:
-    """``(P, 3)`` mm within the field of view."""
+    """Positions ``(P, 3)`` mm within the field of view."""
     level = frame.level(GRID_LEVEL)
     every = np.zeros(level.shape, dtype=np.bool_)
     every[::2, ::2, ::2] = True
@@ -113,7 +107,7 @@ REFINEMENTS = (Misses(7.0, 22.0, 0.12), Misses(4.0, 12.0, 0.08), Misses(2.2, 7.0
 """Errors that each step of the cascade is trained to correct."""
 
 SCALE_MM = 6.0
-"""mm over which the rating of a pose falls off: exp(-error / SCALE)."""
+"""mm, width of the rating of a pose: exp(-error / SCALE)."""
 
 
 def _pose_pattern(count: int, near: float, seed: int, reach: float = 1.0) -> SamplePattern:
@@ -129,18 +123,18 @@ def _pose_pattern(count: int, near: float, seed: int, reach: float = 1.0) -> Sam
 COARSE = _pose_pattern(140, 0.3, 1)
 FINE = _pose_pattern(220, 1.0, 2)
 WIDE = _pose_pattern(280, 0.8, 7, 1.5)
-"""Of the final rating: it includes what distinguishes the anterior from the posterior side."""
+"""For the final rating; it reaches the surroundings that distinguish front and back."""
 
 
 def pose_error(poses: Poses, true: Poses, model: ShapeModel) -> FloatArray:
-    """``(P,)`` mm: mean distance of the mean valve's annulus and tips from the true ones."""
+    """Mean distances ``(P,)`` mm of the mean valve's annulus and tips from the true ones."""
     points = np.concatenate([model.mean[model.layout.annulus[::4]], model.tips])
     gap = poses.world(points) - true.world(points)
     return np.asarray(np.linalg.norm(gap, axis=2).mean(axis=1))
 
 
 def coarse_samples(seen: LabelledFrame, count: int) -> Examples:
-    """Poses such as a grid of orientations at likely positions gives, with ratings ``(P, 1)``."""
+    """Poses like those of an orientation grid at likely positions, with ratings ``(P, 1)``."""
     rng, grid = seen.rng, rotation_grid(ORIENTATIONS)
     kinds = (Misses(3.0, 10.0, 0.1), Misses(5.0, 22.0, 0.1))
     parts = [seen.missed_poses(misses, count // 4) for misses in kinds]
@@ -151,10 +145,10 @@ def coarse_samples(seen: LabelledFrame, count: int) -> Examples:
 
 
 def fine_samples(seen: LabelledFrame, count: int, mistaken: Poses | None = None) -> Examples:
-    """Poses such as remain after refinement, with ratings ``(P, 1)``.
+    """Poses like those after refinement, with ratings ``(P, 1)``.
 
-    Half of them are about right; the others are turned about the valve's axis (mostly front to
-    back), tilted, or anywhere. ``mistaken`` poses of a search without this rating are added.
+    Half of them are nearly right; the others are turned about the valve's axis (mostly front to
+    back), tilted, or anywhere. Wrong poses of a search without this rating are added (`mistaken`).
     """
     rng = seen.rng
     kinds = (Misses(1.0, 3.0, 0.03), Misses(2.5, 8.0, 0.06), Misses(6.0, 25.0, 0.12))
@@ -177,7 +171,7 @@ def _rated(seen: LabelledFrame, pattern: SamplePattern, poses: Poses) -> Example
 
 
 def _strayed(poses: Poses, rng: np.random.Generator, share: float = 0.1) -> Poses:
-    """Poses of which a share is moved away from the valve."""
+    """Poses, a share of which is moved away from the valve."""
     stray = rng.random(len(poses)) < share
     centre = poses.centre + stray[:, None] * rng.standard_normal((len(poses), 3)) * 25.0
     return Poses(centre, poses.rotation, poses.log_scale)
@@ -193,8 +187,8 @@ def refinement_samples(seen: LabelledFrame, step: int, count: int) -> Examples:
 def search_poses(frame: StandardFrame, boosters: Trees, count: int) -> tuple[Poses, FloatArray]:
     """The best ``count`` poses in a frame and their ratings (0 to 1), best first.
 
-    ``pose_coarse`` and ``pose_fine`` of the trees have one output, the rating; each step of
-    ``pose_refine`` has seven, the correction.
+    The trees ``pose_coarse`` and ``pose_fine`` have one output, the rating; each ``pose_refine``
+    has seven, the correction.
     """
     places, grid = likely_places(frame, boosters, PLACES), rotation_grid(ORIENTATIONS)
     every = Poses(
@@ -219,7 +213,7 @@ def _sorted(poses: Poses, rating: FloatArray) -> tuple[Poses, FloatArray]:
 
 
 def refined(frame: StandardFrame, boosters: Trees, poses: Poses) -> tuple[Poses, FloatArray]:
-    """All poses refined, in their order, and their ratings."""
+    """Refine poses; returns them in their order, and their ratings."""
     for k in range(len(REFINEMENTS)):
         values = features(frame, FINE, poses.centre, poses.axes)
         poses = poses.moved(boosters[f"pose_refine_{k}"](values))

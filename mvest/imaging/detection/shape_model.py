@@ -1,12 +1,12 @@
 """A mean valve and its principal modes without pose, and the fit of a shape.
 
-Papillary tips have a mean only. They are detected by themselves, as a shape fitted to the leaflets
-says nothing of them.
+Papillary tips have a mean only. They are detected separately, because a shape fitted to the
+leaflets does not determine them.
 
-Everything detected is a pull: a vertex is to move by a distance along a direction, with a standard
+Every detection is a pull: a vertex should move by a distance along a direction, with a standard
 deviation. Pose and coefficients follow from a linear least-squares problem with the shape model's
 prior (maximum a posteriori), repeated with small weights for outliers. A smooth displacement of the
-vertices then follows what the model cannot represent.
+vertices then represents what the modes cannot.
 """
 
 from __future__ import annotations
@@ -31,28 +31,14 @@ from mvest.typing import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeModel:
-    """Shapes in pose-free axes (see :class:`Poses`), mm at the size of the mean valve.
-
-    Attributes
-    ----------
-    layout : ValveLayout
-    size_mm : float
-        Root mean square distance of the mean valve's annulus from its centre.
-    mean : (n, 3)
-    modes : (K, n, 3)
-        Orthonormal.
-    std : (K,)
-        mm, standard deviation of each mode's coefficient, decreasing.
-    tips : (2, 3)
-        Mean papillary tips.
-    """
+    """Shapes in valve axes (see :class:`Poses`), mm at the size of the mean valve."""
 
     layout: ValveLayout
-    size_mm: float
-    mean: FloatArray
-    modes: FloatArray
-    std: FloatArray
-    tips: FloatArray
+    size_mm: float  #: root mean square distance of the mean valve's annulus from its centre
+    mean: FloatArray  #: (n, 3)
+    modes: FloatArray  #: (K, n, 3), orthonormal
+    std: FloatArray  #: (K,) mm, of each mode's coefficient, decreasing
+    tips: FloatArray  #: (2, 3), mean papillary tips
 
     def shape(self, coefficients: FloatArray) -> FloatArray:
         """Shapes ``(P, n, 3)`` of coefficients ``(P, k)`` of the first k modes."""
@@ -60,7 +46,7 @@ class ShapeModel:
         return np.asarray(self.mean + np.tensordot(coefficients, self.modes[:k], axes=(1, 0)))
 
     def coefficients(self, local: FloatArray) -> FloatArray:
-        """``(P, K)`` of shapes ``(P, n, 3)`` without pose."""
+        """Coefficients ``(P, K)`` of shapes ``(P, n, 3)`` in valve axes."""
         return np.asarray(np.tensordot(local - self.mean, self.modes, axes=([1, 2], [1, 2])))
 
 
@@ -79,7 +65,7 @@ def fit_shape_model(valves: Sequence[MovingValve], modes: int) -> ShapeModel:
     ]
     if len(shapes) <= modes:
         raise InputError(f"shape model: {len(shapes)} shapes, expected more than {modes} modes")
-    # Every valve has the same weight, whatever its number of frames.
+    # Every valve has the same weight.
     weight = np.concatenate([np.full(len(v.vertices), 1 / len(v.vertices)) for v in valves])
     weight /= weight.sum()
     size = float(np.exp(weight @ [pose_of(v, t, layout).log_scale[0] for v, t in shapes]))
@@ -107,30 +93,20 @@ TAIL = 2.5
 """Standard deviations beyond which a pull loses weight (Cauchy)."""
 
 POSE_STD = np.array([4.0, 4.0, 4.0, 0.25, 0.25, 0.25, 0.12])
-"""mm, radians and log scale: how far one fit may move the pose; wide."""
+"""mm, radians and log scale: wide prior of the motion of the pose in one fit."""
 
 
 class Pulls(NamedTuple):
-    """Displacements that were detected at some vertices.
+    """Displacements detected at some vertices."""
 
-    Attributes
-    ----------
-    vertex : (m,)
-    direction : (m, 3)
-        Unit vectors.
-    offset : (m,) mm
-        Along the direction.
-    std : (m,) mm
-    """
-
-    vertex: IntArray
-    direction: FloatArray
-    offset: FloatArray
-    std: FloatArray
+    vertex: IntArray  #: (m,)
+    direction: FloatArray  #: (m, 3) unit vectors
+    offset: FloatArray  #: (m,) mm along the direction
+    std: FloatArray  #: (m,) mm
 
     @classmethod
     def joined(cls, parts: Sequence[Pulls]) -> Pulls:
-        """All pulls of several."""
+        """The pulls of all parts."""
         return cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
     @classmethod
@@ -149,7 +125,7 @@ class Pulls(NamedTuple):
 def fit_shape(
     model: ShapeModel, pose: Poses, coefficients: FloatArray, pulls: Pulls
 ) -> tuple[Poses, FloatArray]:
-    """Pose (one) and coefficients ``(K,)`` that agree best with pulls on their shape."""
+    """Pose (one) and coefficients ``(K,)`` that fit the pulls on their shape best."""
     k = len(coefficients)
     local = model.shape(coefficients[None])[0][pulls.vertex] * np.exp(pose.log_scale[0])
     along = pulls.direction @ pose.rotation[0]
@@ -213,31 +189,20 @@ def _bending(layout: ValveLayout) -> sparse.csr_array:
 
 # -- training examples ----------------------------------------------------------------------------
 class LabelledFrame(NamedTuple):
-    """A training frame, with the true valve in it.
-
-    Attributes
-    ----------
-    frame : StandardFrame
-    vertices : (n, 3) mm
-        In the world.
-    tips : (2, 3) mm
-    pose : Poses
-        One.
-    model : ShapeModel
-    rng : numpy Generator
-        Draws the examples.
-    """
+    """A training frame, with the true valve in it."""
 
     frame: StandardFrame
-    vertices: FloatArray
-    tips: FloatArray
-    pose: Poses
+    vertices: FloatArray  #: (n, 3) mm, in the world
+    tips: FloatArray  #: (2, 3) mm
+    pose: Poses  #: one
     model: ShapeModel
-    rng: np.random.Generator
+    rng: np.random.Generator  #: draws the examples
 
     def missed_poses(self, misses: Misses, count: int) -> Poses:
         """``count`` poses about the true one."""
-        return missed_poses(self.pose, misses, count, self.rng)
+        shift, turn, scale, _ = misses
+        std = [shift] * 3 + [np.deg2rad(turn)] * 3 + [scale]
+        return self.pose.repeated(count).moved(self.rng.standard_normal((count, 7)) * std)
 
     def missed_shapes(self, misses: Misses, count: int) -> FloatArray:
         """``count`` shapes ``(count, n, 3)`` mm about the true one."""
@@ -252,18 +217,9 @@ Examples: TypeAlias = tuple[NDArray[np.float32], FloatArray]
 
 
 class Misses(NamedTuple):
-    """Standard deviations of guesses from a true pose (shift, turn, size) and shape.
-
-    That of the shape is of each coefficient, over its standard deviation among valves.
-    """
+    """Standard deviations of guesses about a true pose and shape."""
 
     shift_mm: float
     turn_degrees: float
     log_scale: float
-    shape: float = 0.0
-
-
-def missed_poses(true: Poses, misses: Misses, count: int, rng: np.random.Generator) -> Poses:
-    """``count`` guesses of one pose."""
-    std = [misses.shift_mm] * 3 + [np.deg2rad(misses.turn_degrees)] * 3 + [misses.log_scale]
-    return true.repeated(count).moved(rng.standard_normal((count, 7)) * std)
+    shape: float = 0.0  #: of each coefficient, over its standard deviation among valves

@@ -8,17 +8,13 @@ closure itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvest.errors import InputError
 from mvest.imaging.detection.detect import (
     CANDIDATES,
-    HAND_STD_MM,
-    HOLD,
-    STIFFNESS,
     SURE,
     TRIED,
     FrameValve,
@@ -29,11 +25,87 @@ from mvest.imaging.detection.detect import (
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import refined, search_poses
-from mvest.imaging.detection.shape_model import Pulls, relax
 from mvest.imaging.detection.trained_model import DetectionModel
-from mvest.imaging.valve_sequence import LANDMARKS, MIN_CONFIDENCE, ValveSequence, landmark_vertices
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.typing import BoolArray, FloatArray
+from mvest.typing import FloatArray
+
+HYPOTHESES, SHARED = 3, 3
+"""Poses from each frame's own search, and best poses of all frames, which every frame tries."""
+
+SPEED_MM_S, STILL_MM = 60.0, 2.0
+"""Standard deviations of the speed of the annulus, and of its error in each frame."""
+
+SMOOTHING_S = (0.06, 0.015, 0.06)
+"""s over which annulus, free edge and papillary tips are smoothed; 0: not at all."""
+
+LOST_BY = 0.2
+"""A frame is searched again, starting from its neighbours, if its confidence is this much below the
+best frame's."""
+
+Rated = tuple[Poses, FloatArray]
+"""Hypotheses of a frame, with their ratings."""
+
+
+def detect_valve(
+    volume: VolumeSequence,
+    model: DetectionModel,
+    *,
+    min_confidence: float = MIN_CONFIDENCE,
+    progress: Callable[[int, int], None] | None = None,
+) -> ValveSequence:
+    """Find the valve in every frame of a volume.
+
+    Parameters
+    ----------
+    volume : VolumeSequence
+    model : DetectionModel
+    min_confidence : float
+        The best frame must reach it.
+    progress : callable, optional
+        Called with the number of finished frames and the number of all frames.
+
+    Raises
+    ------
+    NoValveError
+        No frame shows a valve with this confidence. The error holds the best candidate.
+    InputError
+        A frame holds no image.
+    """
+    times = np.asarray(volume.times)
+    frames = [standard_frame(volume, k) for k in range(len(times))]
+    poses = _trajectory(frames, times, model)
+    valves: list[FrameValve] = []
+    for k, frame in enumerate(frames):
+        valves.append(fit_frame(frame, model, poses[k : k + 1]))
+        if progress is not None:
+            progress(k + 1, len(frames))
+    _refit_lost_frames(frames, valves, model)
+    confidence = np.array([valve.confidence for valve in valves])
+    seen = np.stack([valve.vertex_confidence for valve in valves])
+    at_annulus, at_edge, at_tips = SMOOTHING_S
+    layout, s = model.shape.layout, model.shape.layout.s
+    smooth = smooth_in_time(
+        times,
+        np.stack([np.concatenate([valve.vertices, valve.tips]) for valve in valves]),
+        np.concatenate([seen, np.ones((len(valves), 2))], axis=1) * confidence[:, None],
+        np.append((1 - s) * at_annulus + s * at_edge, [at_tips] * 2),
+    )
+    std, length = np.full(layout.size, np.nan), np.nan
+    if model.accuracy is not None:
+        accuracy = model.accuracy.at(float(np.median(confidence)))
+        std, length = accuracy.std_mm, accuracy.correlation_length_mm
+    valve = ValveSequence(
+        layout, times, smooth[:, :-2], smooth[:, -2:], confidence, seen, std, length
+    )
+    if confidence.max() < min_confidence:
+        raise NoValveError(
+            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
+            f"of {confidence.max():.2f}, expected at least {min_confidence:g} (a mitral valve "
+            "completely within the field of view)",
+            valve,
+        )
+    return valve
 
 
 def smooth_in_time(
@@ -61,245 +133,64 @@ def smooth_in_time(
     return np.asarray(np.swapaxes(np.linalg.solve(matrix, right), 0, 1))
 
 
-Landmarks = Mapping[int, Mapping[str, FloatArray]]
-"""Placed by hand: frame -> name -> world position (3,) mm."""
-
-POSE_LANDMARKS = 4
-"""Landmarks by hand that give the pose of a frame."""
-
-LINE_MM = 2.0
-"""mm, root sum of squares about the best line. Below it landmarks determine no pose."""
-
-HYPOTHESES, SHARED = 3, 3
-"""Poses from each frame's own search, and best poses of all frames, which every frame tries."""
-
-SPEED_MM_S, STILL_MM = 60.0, 2.0
-"""Standard deviations of the speed of the annulus, and of its error in each frame."""
-
-SMOOTHING_S = (0.06, 0.015, 0.06)
-"""s over which annulus, free edge and papillary tips are smoothed; 0: not at all."""
-
-LOST_BY = 0.2
-"""A frame is searched again, starting from its neighbours, if its confidence is this much below the
-best frame's."""
-
-
-def detect_valve(
-    volume: VolumeSequence,
-    model: DetectionModel,
-    *,
-    min_confidence: float = MIN_CONFIDENCE,
-    landmarks: Landmarks | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> ValveSequence:
-    """Find the valve in every frame of a volume.
-
-    Parameters
-    ----------
-    volume : VolumeSequence
-    model : DetectionModel
-    min_confidence : float
-        Of the best frame; below it there is no valve.
-    landmarks : mapping, optional
-        Placed by hand where the detectors fail; they stay where they are.
-    progress : callable, optional
-        Called with the numbers of frames done and of all frames.
-
-    Raises
-    ------
-    NoValveError
-        If no frame shows a valve with this confidence; it holds the best candidate.
-    InputError
-        If a frame holds no image, or a landmark's frame or name does not exist.
-    """
-    by_hand = _checked(landmarks or {}, len(volume.times))
-    frames = [standard_frame(volume, k) for k in range(len(volume.times))]
-    poses = _trajectory(frames, np.asarray(volume.times), model, by_hand)
-    valves: list[FrameValve] = []
-    for k, frame in enumerate(frames):
-        valves.append(fit_frame(frame, model, poses[k : k + 1], fixed=by_hand[k]))
-        if progress is not None:
-            progress(k + 1, len(frames))
-    valves = _found_again(frames, valves, model, by_hand)
-    confidence = np.array([valve.confidence for valve in valves])
-    sure = np.stack([valve.vertex_confidence for valve in valves])
-    at_annulus, at_edge, at_tips = SMOOTHING_S
-    layout, s = model.shape.layout, model.shape.layout.s
-    smooth = smooth_in_time(
-        np.asarray(volume.times),
-        np.stack([np.concatenate([valve.vertices, valve.tips]) for valve in valves]),
-        np.concatenate([sure, np.ones((len(valves), 2))], axis=1) * confidence[:, None],
-        np.append((1 - s) * at_annulus + s * at_edge, [at_tips] * 2),
-    )
-    vertices, tips = smooth[:, :-2], smooth[:, -2:]
-    for k in _with_hands(by_hand):
-        vertices[k], tips[k] = _held(vertices[k], tips[k], by_hand[k], model)
-    accuracy = model.accuracy
-    if accuracy is not None:
-        accuracy = accuracy.at(float(np.median(confidence)))
-    valve = ValveSequence(
-        layout,
-        np.asarray(volume.times),
-        vertices,
-        tips,
-        confidence,
-        sure,
-        np.full(layout.size, np.nan) if accuracy is None else accuracy.std_mm,
-        np.nan if accuracy is None else accuracy.correlation_length_mm,
-    )
-    by_eye = np.isfinite(by_hand[:, :, 0]).sum(axis=1) >= POSE_LANDMARKS
-    if confidence.max() < min_confidence and not by_eye.any():
-        raise NoValveError(
-            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
-            f"of {confidence.max():.2f}, expected at least {min_confidence:g} (a mitral "
-            "valve whole within the field of view, or landmarks placed by hand)",
-            valve,
-        )
-    return valve
-
-
-def _found_again(
-    frames: list[StandardFrame],
-    valves: list[FrameValve],
-    model: DetectionModel,
-    by_hand: FloatArray,
-) -> list[FrameValve]:
-    """Search lost frames again, see `LOST_BY`, beside the most confident ones first.
-
-    A new valve replaces the old one if its confidence is higher.
-    """
-    again = list(valves)
+def _refit_lost_frames(
+    frames: list[StandardFrame], valves: list[FrameValve], model: DetectionModel
+) -> None:
+    """Fit lost frames (`LOST_BY`) again in place, those next to the most confident ones first."""
     best = max(valve.confidence for valve in valves)
-    lost = {k for k, v in enumerate(valves) if v.confidence < best - LOST_BY}
-    lost -= set(_with_hands(by_hand))
-    while lost:
-        beside = {k: max(_beside(k, again, lost), default=None) for k in lost}
-        surest = {k: pair for k, pair in beside.items() if pair is not None}
-        if not surest:
-            break
-        k = max(surest, key=lambda k: surest[k])
-        near = again[surest[k][1]]
-        lost.remove(k)
-        other = fit_frame(
-            frames[k], model, near.pose, coefficients=near.coefficients, tips=near.tips
+    lost = {k for k, valve in enumerate(valves) if valve.confidence < best - LOST_BY}
+    while lost and len(lost) < len(valves):
+        k, start = max(
+            (
+                (k, valves[j])
+                for k in lost
+                for j in (k - 1, k + 1)
+                if 0 <= j < len(valves) and j not in lost
+            ),
+            key=lambda pair: pair[1].confidence,
         )
-        if other.confidence > again[k].confidence:
-            again[k] = other
-    return again
+        lost.remove(k)
+        again = fit_frame(
+            frames[k], model, start.pose, coefficients=start.coefficients, tips=start.tips
+        )
+        if again.confidence > valves[k].confidence:
+            valves[k] = again
 
 
-def _beside(k: int, valves: list[FrameValve], lost: set[int]) -> list[tuple[float, int]]:
-    """Confidence and number of the frames beside one that are not lost."""
-    return [
-        (valves[j].confidence, j) for j in (k - 1, k + 1) if 0 <= j < len(valves) and j not in lost
-    ]
-
-
-def _held(
-    vertices: FloatArray, tips: FloatArray, points: FloatArray, model: DetectionModel
-) -> tuple[FloatArray, FloatArray]:
-    """One frame with its landmarks where they were placed; leaflets nearby follow."""
-    placed = np.isfinite(points[:, 0])
-    tips = np.where(placed[-2:, None], points[-2:], tips)
-    on = np.flatnonzero(placed[:-2])
-    if len(on):
-        at = np.array(list(landmark_vertices(model.shape.layout).values()))[on]
-        std = np.full(len(on), HAND_STD_MM[1])
-        pulls = Pulls.to_points(at, vertices[at], points[on], std)
-        vertices = relax(vertices, model.shape.layout, pulls, STIFFNESS, HOLD)
-    return vertices, tips
-
-
-def _checked(landmarks: Landmarks, frames: int) -> FloatArray:
-    """Positions ``(frames, L, 3)`` of landmarks placed by hand, NaN where none was."""
-    placed = np.full((frames, len(LANDMARKS), 3), np.nan)
-    for frame, points in landmarks.items():
-        if not 0 <= frame < frames:
-            raise InputError(f"landmarks of frame {frame}; the volume has frames 0 to {frames - 1}")
-        if strange := [name for name in points if name not in LANDMARKS]:
-            raise InputError(
-                f"landmarks of frame {frame}: {', '.join(strange)}; expected some of "
-                f"{', '.join(LANDMARKS)}"
-            )
-        for name, point in points.items():
-            if np.shape(point) != (3,) or not np.isfinite(point).all():
-                raise InputError(
-                    f"landmarks of frame {frame}, {name}: {np.asarray(point).tolist()}, expected "
-                    "three finite coordinates"
-                )
-            placed[frame, LANDMARKS.index(name)] = point
-        if len(points) >= POSE_LANDMARKS:
-            about = np.stack(list(points.values()))
-            size = np.linalg.svd(about - about.mean(axis=0), compute_uv=False)
-            if size[1] < LINE_MM:
-                raise InputError(
-                    f"landmarks of frame {frame} lie within {size[1]:.2g} mm of one line, expected "
-                    "them about the valve"
-                )
-    return placed
-
-
-def _with_hands(placed: FloatArray) -> list[int]:
-    """Frames in which landmarks were placed."""
-    return [k for k, points in enumerate(placed) if np.isfinite(points).any()]
-
-
-Rated = tuple[Poses, FloatArray]
-"""Hypotheses of a frame, with their ratings."""
-
-
-def _trajectory(
-    frames: list[StandardFrame], times: FloatArray, model: DetectionModel, by_hand: FloatArray
-) -> Poses:
+def _trajectory(frames: list[StandardFrame], times: FloatArray, model: DetectionModel) -> Poses:
     """One pose for every frame."""
-    placed = [_pose_by_hand(points, model) for points in by_hand]
     own: list[Rated] = []
-    for frame, pose in zip(frames, placed, strict=True):
-        if pose is None:
-            poses, rating = search_poses(frame, model.boosters, CANDIDATES)
-            few = poses.apart(rating, HYPOTHESES)
-            own.append((poses[few], rating[few]))
-        else:
-            own.append((pose, np.ones(1)))
+    for frame in frames:
+        poses, rating = search_poses(frame, model.boosters, CANDIDATES)
+        few = poses.apart(rating, HYPOTHESES)
+        own.append((poses[few], rating[few]))
     pool, ratings = _joined(own)
     if not len(pool):
         raise NoValveError("no valve found; no frame has a field of view")
     best = pool[pool.apart(ratings, SHARED)]
-    first = [rating[0] for _, rating in own if len(rating)]
-    if np.isnan(by_hand).all() and np.median(first) < SURE:
+    if np.median([rating[0] for _, rating in own if len(rating)]) < SURE:
+        # Take the pose with the highest confidence in a few frames, and hypotheses within 60
+        # degrees of it.
         tried = pool[pool.apart(ratings, TRIED)]
-        likeliest = _likeliest_in_all(frames, model, tried)
-        best = tried[likeliest : likeliest + 1]
-        own = [(poses[_like(poses, best)], rating[_like(poses, best)]) for poses, rating in own]
+        seen = np.zeros(len(tried))
+        for k in sorted({0, len(frames) // 2, len(frames) - 1}):
+            seen += merits(frames[k], model, refined(frames[k], model.boosters, tried)[0])
+        best = tried[[int(np.argmax(seen))]]
+        for k, (poses, rating) in enumerate(own):
+            turn = Rotation.from_matrix(np.swapaxes(best.rotation, 1, 2) @ poses.rotation)
+            near = np.asarray(turn.magnitude() < np.deg2rad(60.0))
+            own[k] = poses[near], rating[near]
     candidates = [
-        rated if pose is not None else _joined([rated, refined(frame, model.boosters, best)])
-        for frame, pose, rated in zip(frames, placed, own, strict=True)
+        _joined([rated, refined(frame, model.boosters, best)])
+        for frame, rated in zip(frames, own, strict=True)
     ]
     path = _best_path(candidates, times, model)
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
 
 
 def _joined(parts: list[Rated]) -> Rated:
-    """All hypotheses of several lists."""
-    return (
-        Poses.joined([poses for poses, _ in parts]),
-        np.concatenate([rating for _, rating in parts]),
-    )
-
-
-def _likeliest_in_all(frames: list[StandardFrame], model: DetectionModel, tried: Poses) -> int:
-    """The pose at which the valve has the highest confidence in a few frames."""
-    seen = np.zeros(len(tried))
-    for k in sorted({0, len(frames) // 2, len(frames) - 1}):
-        poses, _ = refined(frames[k], model.boosters, tried)
-        seen += merits(frames[k], model, poses)
-    return int(np.argmax(seen))
-
-
-def _like(poses: Poses, best: Poses) -> BoolArray:
-    """Which poses ``(P,)`` have the orientation of one within 60 degrees."""
-    turn = Rotation.from_matrix(np.swapaxes(best.rotation[:1], 1, 2) @ poses.rotation)
-    return np.asarray(turn.magnitude() < np.deg2rad(60.0))
+    poses, ratings = zip(*parts, strict=True)
+    return Poses.joined(list(poses)), np.concatenate(ratings)
 
 
 def _best_path(candidates: list[Rated], times: FloatArray, model: DetectionModel) -> list[int]:
@@ -320,19 +211,3 @@ def _best_path(candidates: list[Rated], times: FloatArray, model: DetectionModel
     for pointer in reversed(back):
         path.append(int(pointer[path[-1]]))
     return path[::-1]
-
-
-def _pose_by_hand(points: FloatArray, model: DetectionModel) -> Poses | None:
-    """The pose that fits the mean valve to landmarks ``(L, 3)``, if there are four or more."""
-    placed = np.isfinite(points[:, 0])
-    if placed.sum() < POSE_LANDMARKS:
-        return None
-    shape, to = model.shape, points[placed]
-    at = list(landmark_vertices(shape.layout).values())
-    from_ = np.concatenate([shape.mean[at], shape.tips])[placed]
-    a, b = from_ - from_.mean(axis=0), to - to.mean(axis=0)
-    turn, _ = Rotation.align_vectors(b, a)
-    rotation = turn.as_matrix()
-    scale = float((b * (a @ rotation.T)).sum() / (a * a).sum())
-    centre = to.mean(axis=0) - scale * rotation @ from_.mean(axis=0)
-    return Poses(centre[None], rotation[None], np.log([max(scale, 0.3)]))

@@ -45,48 +45,33 @@ STAGES: Final = tuple(OUTPUTS)
 """Names of all sets of trees."""
 
 MAX_FILE_SIZE = 2**28
-"""Bytes; the model of the package has some 10 million."""
+"""Largest number of bytes; the model of the package has some 10 million."""
 
 MAX_REASON = 120
-"""Characters of another library's message that an error quotes."""
+"""Largest number of characters that an error quotes from another library."""
 
 UNLIKE_SHARE = 0.02
-"""Share of volumes drawn as in training that are expected to count as unlike them."""
+"""Share of volumes like those of training that are expected to count as unlike them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionAccuracy:
-    """Errors of the detectors on held-out simulated volumes.
+    """Errors of the detectors on held-out simulated volumes: S sequences in F frames.
 
-    Attributes
-    ----------
-    std_mm : (n,)
-        Standard deviation of each coordinate of each vertex.
-    correlation_length_mm : float
-    samples : (S, F, n, 3)
-        Errors in the valve's axes, mm: of S sequences, in the open and in the closed frame.
-    tip_samples : (S, F, 2, 3)
-    widening : (float, float)
-        Factor on the errors of a volume of confidence 1, and the exponent by which it grows for
-        each unit less.
-    like_from : float
-        Confidence below which a volume is unlike those of training, see `UNLIKE_SHARE`.
-    shapes : (S, F, n, 3) mm or None
-        Detected valves of these sequences, each frame in its own axes (`pose_of`).
-    tip_shapes : (S, F, 2, 3) mm or None
+    F is 2: the open and the closed frame. Errors are measured in the valve's axes.
     """
 
-    std_mm: FloatArray
+    std_mm: FloatArray  #: (n,), of each coordinate of each vertex
     correlation_length_mm: float
-    samples: FloatArray
-    tip_samples: FloatArray
-    widening: tuple[float, float] = (1.0, 0.0)
-    like_from: float = 0.0
-    shapes: FloatArray | None = None
-    tip_shapes: FloatArray | None = None
+    samples: FloatArray  #: (S, F, n, 3) mm
+    tip_samples: FloatArray  #: (S, F, 2, 3) mm
+    widening: tuple[float, float] = (1.0, 0.0)  #: start and slope of `factor`
+    like_from: float = 0.0  #: confidence below which a volume is unlike those of training
+    shapes: FloatArray | None = None  #: (S, F, n, 3) mm, detected valves, each in its own axes
+    tip_shapes: FloatArray | None = None  #: (S, F, 2, 3) mm
 
     def at(self, confidence: float) -> DetectionAccuracy:
-        """Errors in a volume of some confidence: wider about their mean the lower it is."""
+        """Errors in a volume of some confidence: the lower, the wider about their mean."""
         factor = self.factor(confidence)
         mean, tip_mean = self.samples.mean(axis=0), self.tip_samples.mean(axis=0)
         return replace(
@@ -98,7 +83,7 @@ class DetectionAccuracy:
         )
 
     def factor(self, confidence: float) -> float:
-        """On the errors of a volume of some confidence (`ValveSequence.confidence`)."""
+        """Factor on the errors in a volume of some confidence (`ValveSequence.confidence`)."""
         start, slope = self.widening
         return float(start * np.exp(slope * (1.0 - confidence)))
 
@@ -118,7 +103,7 @@ ARRAYS: Final[Mapping[str, tuple[int | str, ...]]] = {
     "accuracy.shapes": ("S", "F", "n", 3),
     "accuracy.tip_shapes": ("S", "F", 2, 3),
 }
-"""Attributes of shapes and accuracy in a file, and their lengths."""
+"""Attributes of shape model and accuracy in a file, and their shapes."""
 
 HALVED: Final = ("n", "S")
 """Arrays with such a length and more axes are stored in single precision."""
@@ -126,26 +111,13 @@ HALVED: Final = ("n", "S")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionModel:
-    """Trained detectors and their shape model.
-
-    Attributes
-    ----------
-    shape : ShapeModel
-    boosters : mapping
-        One for each of :data:`STAGES`.
-    trained_on : mapping
-        Provenance: configuration, seeds, numbers of valves and volumes, versions.
-    accuracy : DetectionAccuracy, optional
-        None for a model that was never tested.
-    sha256 : str
-        Of the file it was read from.
-    """
+    """Trained detectors and their shape model."""
 
     shape: ShapeModel
-    boosters: Trees
-    trained_on: Mapping[str, Any]
-    accuracy: DetectionAccuracy | None = None
-    sha256: str = ""
+    boosters: Trees  #: one for each of `STAGES`
+    trained_on: Mapping[str, Any]  #: configuration, seeds, numbers of valves, versions
+    accuracy: DetectionAccuracy | None = None  #: None if it was never measured
+    sha256: str = ""  #: of the file it was read from
 
 
 def save_model(path: Path | str, model: DetectionModel) -> None:
@@ -176,7 +148,7 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
 def load_model(path: Path | str) -> DetectionModel:
     """Read a model; nothing in the file is executed or unpickled.
 
-    InputError if the file is missing, incomplete, or no model of this version.
+    InputError if the file is missing, incomplete, or not a model of this version.
     """
     source = Path(path)
     raw = read_bytes(source, MAX_FILE_SIZE)
@@ -204,7 +176,7 @@ def default_model() -> DetectionModel:
 def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> DetectionModel:
     about = parse_json(_text(stored["about"]), "about")
     if not isinstance(about, dict):
-        raise ValueError("says nothing about itself")
+        raise ValueError("about is not a mapping")
     if about.get("format") != FORMAT or about.get("version") != VERSION:
         raise InputError(
             f"{source}: format {about.get('format')!r}, version {about.get('version')!r}; expected "
@@ -212,7 +184,7 @@ def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> Det
         )
     for key, kind in (("columns", int), ("rows", int), ("trained_on", dict)):
         if not isinstance(about[key], kind):
-            raise ValueError(f"{key} is no {kind.__name__}")
+            raise ValueError(f"{key} is not of type {kind.__name__}")
     layout = ValveLayout(about["columns"], about["rows"])
     sizes = {"n": layout.size, "K": len(stored["shape.std"])}
     parts: dict[str, dict[str, Any]] = {"shape": {}, "accuracy": {}}
@@ -242,5 +214,5 @@ def _bytes(text: str) -> NDArray[np.uint8]:
 
 def _text(array: Any) -> str:
     if not isinstance(array, np.ndarray) or array.dtype != np.uint8:
-        raise ValueError("no text where there should be one")
+        raise ValueError("an array is not text")
     return array.tobytes().decode()

@@ -1,4 +1,4 @@
-"""Errors of the detectors in held-out volumes, and over which distance they are correlated."""
+"""Errors of the detectors in held-out volumes, and their correlation length."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccurac
 from mvest.typing import FloatArray
 
 BIN_MM = 1.0
-"""mm, width of the bins of distances."""
+"""mm, bin width of distances."""
 
 FARTHEST_MM = 30.0
 """mm, largest distance of pairs from which the correlation length is fitted."""
@@ -22,7 +22,7 @@ LENGTHS_MM = (0.5, 60.0)
 """mm, range of the correlation length."""
 
 NORMAL_95 = 1.959963984540054
-"""Standard deviations on either side that hold 95 % of a normal distribution."""
+"""Half width, in standard deviations, of the central 95 % of a normal distribution."""
 
 
 def matern(distance: FloatArray, length: float) -> FloatArray:
@@ -69,19 +69,14 @@ def fitted_length(distance: FloatArray, correlation: FloatArray) -> float:
 def measure_accuracy(
     samples: FloatArray, tip_samples: FloatArray, rest: FloatArray
 ) -> DetectionAccuracy:
-    """Errors of the detectors from held-out sequences.
+    """Errors of the detectors from S held-out sequences in F frames.
 
     The standard deviation of a vertex is the root mean square over sequences, frames and
     coordinates of its errors about their mean over the sequences (in each frame and coordinate, so
     that S - 1 of S are free). InputError if it is zero or not finite.
 
-    Parameters
-    ----------
-    samples : (S, F, n, 3) mm
-        Found minus true in the valve's axes, of S sequences in F frames.
-    tip_samples : (S, F, 2, 3) mm
-    rest : (n, 3) mm
-        The mean valve at rest.
+    ``samples (S, F, n, 3)`` and ``tip_samples (S, F, 2, 3)`` mm are detected minus true in the
+    valve's axes, ``rest (n, 3)`` mm is the mean valve at rest.
     """
     count, frames, n = samples.shape[:3]
     about = samples - samples.mean(axis=0)
@@ -96,29 +91,23 @@ def widened(
     wide: FloatArray,
     wide_confidence: FloatArray,
 ) -> DetectionAccuracy:
-    """The errors with `DetectionAccuracy.widening` and `like_from`, by the confidence of volumes.
+    """Fit `DetectionAccuracy.widening` and `like_from` to the confidence of volumes.
 
     The factor on errors is exponential in the missing confidence. Its exponent is fitted to the
-    size of the errors (least squares over volumes); with its start 95 % of all coordinates of all
-    volumes lie within 1.96 standard deviations. A volume is unlike the sequences if its confidence
-    is below the k-th smallest of theirs: one more of S is there in k of S + 1 cases, whatever the
-    distribution (David and Nagaraja, Order Statistics, 2003, sec. 7.3), which is at most
-    `UNLIKE_SHARE`, if S allows (`unlike_share`).
+    size of the errors (least squares over volumes). Its start puts 95 % of all coordinates of all
+    volumes within 1.96 standard deviations. A volume is unlike the sequences if its confidence is
+    below the k-th smallest of theirs. For one more volume that happens in k of S + 1 cases,
+    whatever the distribution (David and Nagaraja, Order Statistics, 2003, sec. 7.3), which is at
+    most `UNLIKE_SHARE` if S is large enough (`unlike_share`).
 
-    Parameters
-    ----------
-    accuracy : DetectionAccuracy
-        Each of its S sequences is compared with the others.
-    confidence : (S,)
-        Of these sequences.
-    wide : (W, F, n, 3) mm
-        Errors of further sequences, of other valves and over wider acquisitions.
-    wide_confidence : (W,)
+    Each of the S sequences of ``accuracy``, of ``confidence (S,)``, is compared with the others.
+    ``wide (W, F, n, 3)`` mm are errors of further sequences, of other valves and over wider
+    acquisitions, of ``wide_confidence (W,)``.
     """
     samples, std = accuracy.samples, accuracy.std_mm
     count, frames = samples.shape[:2]
     mean = samples.mean(axis=0)
-    compared = samples if count > 2 else samples[:0]  # one other has no spread
+    compared = samples if count > 2 else samples[:0]  # a single other has no spread
     off = []
     for k, own in enumerate(compared):
         others = np.delete(samples, k, axis=0)

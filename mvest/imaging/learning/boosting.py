@@ -1,8 +1,8 @@
 """Gradient-boosted trees (LightGBM) for several outputs, stored as plain text.
 
-LightGBM grows trees and writes them (``Booster.model_to_string``, "version=v4"). Its own reader
-trusts the text: an index out of range reads foreign memory, and a malformed number ends the
-process. Here the text becomes plain arrays, checked once, whose outputs are the same bit for bit.
+LightGBM grows the trees and writes them (``Booster.model_to_string``, "version=v4"). Its own reader
+trusts the text: a text that is cut off makes it print foreign memory and abort the process. Here
+the text becomes plain arrays, checked once, whose outputs are the same bit for bit.
 """
 
 from __future__ import annotations
@@ -25,31 +25,20 @@ from mvest.typing import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class BoostSettings:
-    """How trees are grown.
-
-    Attributes
-    ----------
-    trees, leaves : int
-    rate : float
-        Learning rate.
-    min_leaf_samples : int
-        Least samples of a leaf.
-    share_features : float
-        Of the features, drawn for every tree.
-    """
+    """How trees are grown."""
 
     trees: Count = 80
     leaves: Count = 24
-    rate: Share = 0.12
+    rate: Share = 0.12  #: learning rate
     min_leaf_samples: Count = 40
-    share_features: Share = 0.25
+    share_features: Share = 0.25  #: share of the features drawn for every tree
 
 
 SHARE_ROWS = 0.7
-"""Of the samples, drawn for every tree."""
+"""Share of the samples drawn for every tree."""
 
 END: Final = "end of trees\n"
-WRITTEN: Final = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1"}
+HEAD: Final = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1"}
 """Required entries of the head."""
 
 OF_NODES: Final = ("split_feature", "threshold", "left_child", "right_child", "decision_type")
@@ -66,32 +55,20 @@ IS_PROBABILITY: Final = {"regression": False, "cross_entropy": True}
 
 
 class _Trees(NamedTuple):
-    """Trees of one output.
+    """Trees of one output: T trees with N nodes and L leaves in all."""
 
-    Attributes
-    ----------
-    roots : (T,)
-        Node at which each tree begins.
-    feature, threshold : (N,)
-        Of each node.
-    children : (N, 2)
-        Next if the feature is at most the threshold, and otherwise: a node, or leaf k as -1 - k.
-    values : (L,)
-        Of all leaves.
-    """
-
-    roots: IntArray
-    feature: IntArray
-    threshold: FloatArray
-    children: IntArray
-    values: FloatArray
+    roots: IntArray  #: (T,), node at which each tree begins
+    feature: IntArray  #: (N,)
+    threshold: FloatArray  #: (N,)
+    children: IntArray  #: (N, 2), for features up to the threshold and above; leaf k is -1 - k
+    values: FloatArray  #: (L,)
 
 
 class Boosters:
     """Trees for each of several outputs of the same features, from the texts of LightGBM.
 
-    InputError, which names the ``source``, if there is no text, one is malformed, or their numbers
-    of features differ.
+    Raises InputError, which names the ``source``, if there is no text, one is malformed, or their
+    numbers of features differ.
     """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
@@ -108,19 +85,14 @@ class Boosters:
         self.features = counts.pop()
         self._trees = [(trees, is_probability) for _, is_probability, trees in read]
 
-    @property
-    def outputs(self) -> int:
-        """Number of outputs."""
-        return len(self.texts)
-
     def __call__(self, x: NDArray[np.float32]) -> FloatArray:
         """Outputs ``(P, outputs)`` for features ``(P, F)``."""
         if x.shape[1] != self.features:
             raise InputError(
-                f"{self._source}: trees look at {self.features} features, found {x.shape[1]}; the "
-                "model is of another version"
+                f"{self._source}: the trees expect {self.features} features, found {x.shape[1]}; "
+                "the model is of another version"
             )
-        answers = np.empty((len(x), self.outputs))
+        answers = np.empty((len(x), len(self.texts)))
         for k, (trees, is_probability) in enumerate(self._trees):
             total = _sums(x, trees)
             answers[:, k] = expit(total) if is_probability else total
@@ -154,7 +126,7 @@ def _read(text: str) -> tuple[int, bool, _Trees]:
     whole, end, _ = text.partition(END)
     head, _, body = whole.partition("\nTree=")
     about = dict(line.split("=", 1) for line in head.split("\n")[1:] if line)
-    if not end or {key: about[key] for key in WRITTEN} != WRITTEN:
+    if not end or {key: about[key] for key in HEAD} != HEAD:
         raise ValueError("cut off, or of another version")
     trees = len(about["tree_sizes"].split())
     lines = {key: re.findall(f"^{key}=(.*)$", body, re.MULTILINE) for key in FIELDS}
@@ -188,10 +160,8 @@ def _read(text: str) -> tuple[int, bool, _Trees]:
         raise ValueError("a tree refers to what is not there")
     children = children + np.where(inner, first_node[tree], -first_leaf[tree])
     roots = np.where(nodes > 0, first_node, -1 - first_leaf)
-    trees_of_all = _Trees(
-        roots, read["split_feature"], read["threshold"], children, read["leaf_value"]
-    )
-    return features, IS_PROBABILITY[about["objective"]], trees_of_all
+    arrays = roots, read["split_feature"], read["threshold"], children, read["leaf_value"]
+    return features, IS_PROBABILITY[about["objective"]], _Trees(*arrays)
 
 
 def train_boosters(
@@ -206,8 +176,9 @@ def train_boosters(
     The objective is ``regression`` (least squares), or ``cross_entropy`` (probability; labels from
     0 to 1).
     """
-    import lightgbm  # here, as it takes a second, which detection does not need
+    import lightgbm  # takes a second, and only training needs it
 
+    binned = {"max_bin": 63, "verbosity": -1}
     parameters = {
         "objective": objective,
         "num_leaves": settings.leaves,
@@ -219,10 +190,10 @@ def train_boosters(
         "num_threads": 1,
         "deterministic": True,
         "force_row_wise": True,
+        **binned,
     }
-    binned = {"max_bin": 63, "verbosity": -1}
     data = lightgbm.Dataset(x, free_raw_data=False, params=binned)
-    parameters, texts = parameters | binned, []
+    texts = []
     for k in range(y.shape[1]):
         data.set_label(np.ascontiguousarray(y[:, k]))
         own = parameters | {"seed": seed + k}

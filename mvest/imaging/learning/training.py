@@ -1,11 +1,11 @@
 """Training of the detectors on simulated volumes with known valves.
 
 Every volume is simulated, sampled for all stages at once and discarded. Each stage makes its own
-hypotheses with errors of given size, so that no stage waits for the one before it.
+hypotheses with errors of a given size, so that no stage waits for the one before it.
 
-Half of the volumes are degraded at random, so that detectors do not depend on one scanner's image:
-by blur, noise that grows with the distance from one side, and a threshold, none of which is a
-setting of the simulator. Kinds and amounts are a choice.
+Half of the volumes are degraded at random, so that detectors do not depend on one scanner: by blur,
+noise that grows with the distance from one side, and a threshold, none of which is a setting of the
+simulator. Kinds and amounts are a choice.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
 
 SEARCH_STAGES = tuple(name for name in STAGES if name.startswith(("position", "pose_")))
-"""Stages of the search for poses, of which a draft is trained on the first volumes."""
+"""Stages of the pose search. A draft of them is trained on the first volumes."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampleCounts:
-    """Samples taken of one volume for each stage."""
+    """Number of samples from one volume for each stage."""
 
     position: Count = 160
     pose_rating: Count = 120
@@ -64,32 +64,18 @@ class SampleCounts:
 
 @dataclass(frozen=True, slots=True)
 class TrainingSettings:
-    """How detectors are trained.
+    """How detectors are trained."""
 
-    Attributes
-    ----------
-    modes : int
-        Of the shape model.
-    samples : SampleCounts
-    boosting : BoostSettings
-    many_trees : int
-        For the most important stages: the ratings of poses and the boundary.
-    volumes : int
-        Simulated: one frame each, of the valves in turn.
-    draft_volumes : int
-        The first volumes, which train a draft of the search for poses. The others also give samples
-        of the draft's mistakes.
-    acquisition : Acquisition
-        About which acquisitions are drawn.
-    """
-
-    modes: Annotated[int, within(MODES, 1000, "", "as many as are read off, or more")] = 40
+    #: Modes of the shape model.
+    modes: Annotated[int, within(MODES, 1000, "", "as many as are regressed, or more")] = 40
     samples: SampleCounts = field(default_factory=SampleCounts)
     boosting: BoostSettings = field(default_factory=BoostSettings)
-    many_trees: Count = 130
-    volumes: Count = 480
-    draft_volumes: Count = 60
-    acquisition: Acquisition = field(default_factory=Acquisition)
+    many_trees: Count = 130  #: for the ratings of poses and the boundary
+    volumes: Count = 480  #: one simulated frame each, of the valves in turn
+    draft_volumes: Count = (
+        60  #: the first volumes; others also give samples of the draft's mistakes
+    )
+    acquisition: Acquisition = field(default_factory=Acquisition)  #: others are drawn about it
 
 
 def draw_samples(
@@ -97,8 +83,8 @@ def draw_samples(
 ) -> Mapping[str, Examples]:
     """Samples of all stages from one frame, by the stage's name.
 
-    The final rating also gets poses that a draft's search finds: half of them the best rated, half
-    drawn from the others.
+    The final rating also gets poses that a draft finds: half of them the best rated, half drawn
+    from the others.
     """
     mistaken = None
     if draft is not None:
@@ -132,7 +118,7 @@ def render_frame(
 ) -> tuple[VolumeSequence, ValveSequence]:
     """A simulated volume of one frame of a valve, and the valve in it.
 
-    Acquisition and probe are drawn at random; the volume may be ``degraded``, see `degrade`.
+    Acquisition and probe are drawn at random; ``degraded`` applies `degrade`.
     """
     rng = np.random.default_rng(seed)
     acquisition = draw_acquisition(rng, base, spread)
@@ -151,9 +137,9 @@ def volume_samples(
 ) -> dict[str, NDArray[np.float32]]:
     """Simulate one training volume and sample it for all stages.
 
-    ``number`` of the volume and ``seed`` of the training determine it, whatever the number of
-    volumes. A ``draft`` of `SEARCH_STAGES` is given for all but the first volumes. Returns
-    ``STAGE.x`` and ``STAGE.y``, see `mvest.imaging.detection.shape_model.Examples`.
+    It depends on the ``number`` of the volume and the ``seed`` of the training, not on the number
+    of volumes. A ``draft`` of `SEARCH_STAGES` is given for all but the first volumes. Returns
+    ``STAGE.x`` and ``STAGE.y`` (`mvest.imaging.detection.shape_model.Examples`).
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
@@ -187,10 +173,10 @@ def train_stage(
 
 
 SHARE = 0.5
-"""Of the volumes that are degraded, and of each kind of degradation among those."""
+"""Share of the volumes that are degraded, and of each kind of degradation among those."""
 
 MAX_BLUR_VOXELS, MAX_NOISE, MAX_CUT = 1.3, 45.0, 70.0
-"""Largest blur, and in grey values of 255 the largest standard deviation and threshold."""
+"""Largest blur; largest standard deviation and threshold in grey values of 255."""
 
 
 def degrade(volume: VolumeSequence, rng: np.random.Generator) -> VolumeSequence:

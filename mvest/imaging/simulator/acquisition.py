@@ -47,97 +47,50 @@ BOUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
-    """One setting of the simulated scanner. Where no source is named, a value is a choice.
+    """One setting of the simulated scanner. A value without a source is a choice.
 
-    Attributes
-    ----------
-    frequency_mhz : float
-        Centre of the band; transoesophageal matrix probes work at 3 to 8 MHz.
-    axial_mm, lateral_deg, elevation_deg : float
-        Full width at half maximum of the amplitude of a point's image: along, and in the two
-        directions across the beam (these in degrees, so that they grow with depth).
-    side_lobe_db : float
-        First side lobes of the beam under its main lobe.
-    azimuth_deg, elevation_span_deg : float
-        Full opening of the pyramid.
-    depth_mm : (float, float)
-        Distance from the apex of the nearest and the farthest sample.
-    dynamic_range_db, gain_db : float
-        Grey levels 0 to 255 show ``-dynamic_range_db - gain_db`` to ``-gain_db``.
-    attenuation_db_per_cm_mhz, blood_attenuation_db_per_cm_mhz : float
-        One way, of tissue (0.5) and blood (0.15 to 0.2) (Duck, Physical Properties of Tissue,
-        1990).
-    compensation_db_per_cm_mhz : float
-        One way, of the time gain compensation, which also amplifies electronic noise.
-    shadow_db_per_cm : float
-        One way, added in dense tissue (parts of the annulus), which casts shadows.
-    angle_exponent, angle_floor_db : float
-        Walls and leaflets send the share ``floor + (1 - floor) |n . beam|^exponent`` of their echo.
-    dropout, dropout_db : float
-        Share of the leaflets in patches with hardly any echo, 0 to 0.6, and level of that echo
-        under the leaflets' own.
-    blood_db, electronics_db, haze_db : float
-        Noise: of blood (blurred as tissue is), of the electronics (at the nearest depth), and of
-        reverberations close to the probe.
-    haze_mm : float
-        Over which reverberations fade by a factor e.
-    contact_db : float
-        Standard deviation of the smooth variation of gain between directions.
-    wall_db, leaflet_db, annulus_db, chord_db, papillary_db, vessel_db : float
-        Echo strengths.
-    beats : int
-        Sub-sectors in azimuth, one per heart beat, from which the volume is stitched.
-    beat_shift_mm, beat_turn_deg : float
-        Standard deviation of each component of the scene's displacement and turn in a beat.
-    scatterers_per_cell : float
-        In a resolution cell at the depth of the valve; at least 10 give fully developed speckle
-        (Wagner et al., IEEE Trans. Sonics Ultrason. 30, 1983).
-    voxel_mm : float
-        Edge of the cubic voxels.
-    shape : (int, int, int)
-        Voxels along azimuth, elevation and depth.
-
-    Raises
-    ------
-    InputError
-        If a setting is not finite or out of range.
+    Echo strengths are those of wall, leaflet, annulus, chordae, papillary muscles and vessels.
+    Noise comes from blood (blurred as tissue is), the electronics (level at the nearest depth) and
+    reverberations close to the probe (haze). InputError if a setting is not finite or out of range.
     """
 
-    frequency_mhz: Frequency = 5.0
-    axial_mm: Length = 0.9
-    lateral_deg: Angle = 1.9
+    frequency_mhz: Frequency = 5.0  #: centre of the band; TEE matrix probes work at 3 to 8 MHz
+    axial_mm: Length = 0.9  #: full width at half maximum of a point's image along the beam
+    lateral_deg: Angle = 1.9  #: the same across it, in degrees, so that it grows with depth
     elevation_deg: Angle = 2.4
-    side_lobe_db: Decibel = -28.0
-    azimuth_deg: Angle = 84.0
+    side_lobe_db: Decibel = -28.0  #: first side lobes of the beam, below its main lobe
+    azimuth_deg: Angle = 84.0  #: full opening of the pyramid
     elevation_span_deg: Angle = 76.0
-    depth_mm: tuple[Length, Length] = (4.0, 116.0)
-    dynamic_range_db: Decibel = 50.0
+    depth_mm: tuple[Length, Length] = (4.0, 116.0)  #: nearest and farthest sample from the apex
+    dynamic_range_db: Decibel = 50.0  #: grey levels 0 to 255 show -range - gain to -gain
     gain_db: Decibel = 0.0
-    attenuation_db_per_cm_mhz: Decibel = 0.5
-    blood_attenuation_db_per_cm_mhz: Decibel = 0.15
-    compensation_db_per_cm_mhz: Decibel = 0.17
-    shadow_db_per_cm: Decibel = 20.0
-    angle_exponent: Factor = 1.5
+    attenuation_db_per_cm_mhz: Decibel = 0.5  #: one way, of tissue (Duck, Physical Properties of
+    #: Tissue, 1990)
+    blood_attenuation_db_per_cm_mhz: Decibel = 0.15  #: one way (Duck 1990: 0.15 to 0.2)
+    compensation_db_per_cm_mhz: Decibel = 0.17  #: one way; it also amplifies electronic noise
+    shadow_db_per_cm: Decibel = 20.0  #: one way, added in dense tissue (parts of the annulus)
+    angle_exponent: Factor = 1.5  #: walls and leaflets send floor + (1 - floor) |n . beam|^exponent
     angle_floor_db: Decibel = -22.0
-    dropout: Share = 0.1
-    dropout_db: Decibel = -20.0
+    dropout: Share = 0.1  #: share of the leaflets in patches with hardly any echo, 0 to 0.6
+    dropout_db: Decibel = -20.0  #: level of that echo relative to the leaflets' own
     blood_db: Decibel = -49.0
     electronics_db: Decibel = -63.0
     haze_db: Decibel = -22.0
-    haze_mm: Length = 7.0
-    contact_db: Decibel = 2.0
+    haze_mm: Length = 7.0  #: distance over which reverberations fade by a factor e
+    contact_db: Decibel = 2.0  #: standard deviation of the smooth variation of gain by direction
     wall_db: Decibel = -17.0
     leaflet_db: Decibel = -3.0
     annulus_db: Decibel = -3.0
     chord_db: Decibel = -9.0
     papillary_db: Decibel = -18.0
     vessel_db: Decibel = -10.0
-    beats: Count = 4
-    beat_shift_mm: Length = 0.4
-    beat_turn_deg: Angle = 0.5
-    scatterers_per_cell: Weight = 10.0
-    voxel_mm: Length = 0.7
-    shape: tuple[AxisCount, AxisCount, AxisCount] = (160, 128, 160)
+    beats: Count = 4  #: sub-sectors in azimuth, one per heart beat, of the stitched volume
+    beat_shift_mm: Length = 0.4  #: standard deviation of each component of a beat's displacement
+    beat_turn_deg: Angle = 0.5  #: the same of its turn
+    scatterers_per_cell: Weight = 10.0  #: in a resolution cell at the valve; >= 10 give fully
+    #: developed speckle (Wagner et al., IEEE Trans. Sonics Ultrason. 30, 1983)
+    voxel_mm: Length = 0.7  #: edge of the cubic voxels
+    shape: tuple[AxisCount, AxisCount, AxisCount] = (160, 128, 160)  #: azimuth, elevation, depth
 
     def __post_init__(self) -> None:
         require_numbers(
@@ -169,7 +122,7 @@ class Acquisition:
 
 
 Setting: TypeAlias = Literal["training", "wide", "shifted"]
-"""Ranges from which an acquisition is drawn, see `RANGES`."""
+"""Ranges from which an acquisition is drawn (`RANGES`)."""
 
 Interval: TypeAlias = tuple[float, float]
 
@@ -203,15 +156,15 @@ RANGES: dict[str, tuple[Literal["times", "plus"], Interval, tuple[Interval, ...]
 """Variation of each setting about the base: whether the draw multiplies it or is added to it, its
 interval in training, and the shifted ones.
 
-Shifted acquisitions are new to the detectors: apart from echo strengths and compensation, every
-range is disjoint from that of training, and mostly on the worse side. The widths are a choice.
+Apart from echo strengths and compensation, shifted ranges are disjoint from those of training, and
+mostly on the worse side. The widths are a choice.
 """
 
 
 def draw_acquisition(
     rng: np.random.Generator, base: Acquisition | None = None, spread: str = "training"
 ) -> Acquisition:
-    """An acquisition drawn about a base (default: the default one), each setting by itself.
+    """An acquisition drawn about a base, each setting independently.
 
     The ``spread`` is "training", "shifted", or "wide": each setting from one of all its `RANGES`.
     InputError if it is none of these, or a drawn value is out of range.
@@ -234,17 +187,10 @@ class Probe:
     """Pose of the valve relative to the probe, which scans from the world's origin along z.
 
     The axes of the world (LPS, mm) are azimuth, in which beats are stitched, elevation and beam.
-
-    Attributes
-    ----------
-    rotation : (3, 3)
-        Its columns are the x, y and z axes of the valve in the world; a proper rotation.
-    translation : (3,) mm
-        World position of the valve's origin.
     """
 
-    rotation: FloatArray
-    translation: FloatArray
+    rotation: FloatArray  #: (3, 3), its columns are the valve's axes in the world; proper
+    translation: FloatArray  #: (3,) mm, world position of the valve's origin
 
     def to_world(self, points: FloatArray) -> FloatArray:
         """Positions ``(..., 3)`` mm along azimuth, elevation and beam of points in valve axes."""
@@ -252,12 +198,12 @@ class Probe:
 
     @property
     def apex_in_valve(self) -> FloatArray:
-        """``(3,)`` mm, the apex of the pyramid in the valve's axes."""
+        """Apex of the pyramid ``(3,)`` mm in the valve's axes."""
         return np.asarray(-self.translation @ self.rotation)
 
 
 RADIUS_MM = 20.0
-"""mm, of the ball around the valve that lies in the pyramid."""
+"""mm, radius of the ball around the valve that is in the pyramid."""
 
 
 def draw_probe(
@@ -271,13 +217,13 @@ def draw_probe(
 
     Distance and tilt are uniform within their ranges, the roll and the direction of the tilt over
     the full circle. The valve's direction is uniform over those in which a ball around the valve
-    lies in the pyramid (straight ahead, if it fits nowhere). The ranges are a choice.
+    is in the pyramid of the acquisition (straight ahead, if it fits nowhere). The ranges are a
+    choice.
 
     Parameters
     ----------
     rng : numpy Generator
     acquisition : Acquisition, optional
-        Its pyramid holds the valve; the default one if none is given.
     distance_mm : (float, float)
         From the apex to the valve's origin, more than `RADIUS_MM`.
     tilt_deg : (float, float)

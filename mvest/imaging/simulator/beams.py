@@ -26,19 +26,11 @@ DECIBEL = np.log(10.0) / 20.0
 
 
 class Losses(NamedTuple):
-    """Attenuation on a coarse grid over the whole pyramid.
+    """Attenuation on a coarse grid over the whole pyramid."""
 
-    Attributes
-    ----------
-    decibel : (A, E, D) float32
-        Two-way, beyond that of blood.
-    start, step : (3,)
-        Of azimuth and elevation (rad) and distance (mm).
-    """
-
-    decibel: Float32Array
-    start: FloatArray
-    step: FloatArray
+    decibel: Float32Array  #: (A, E, D) two-way, beyond that of blood
+    start: FloatArray  #: (3,) of azimuth and elevation (rad) and distance (mm)
+    step: FloatArray  #: (3,)
 
 
 @nb.njit(cache=True)
@@ -197,26 +189,17 @@ def envelope(signal: Float32Array, along: Float32Array) -> Float32Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Axis:
-    """Samples along one coordinate of the beams, with the blur along it.
+    """Samples along one coordinate of the beams, with the blur along it; mm or rad.
 
-    Attributes
-    ----------
-    start, step : float
-        First sample and spacing, mm or rad.
-    count : int
-        Samples shown; the blur needs ``margin`` more at either end.
-    kernel : (2 margin + 1,) float32
-        Blur of the samples; with it a point spread over its two neighbours by linear weights has
-        the amplitude 1 and the right full width at half maximum.
-    energy : float
-        Integral of the squared amplitude of a point's image, mm or rad.
+    With the ``kernel`` a point that is spread over its two neighbours by linear weights has the
+    amplitude 1 and the set full width at half maximum.
     """
 
-    start: float
+    start: float  #: first sample
     step: float
-    count: int
-    kernel: Float32Array
-    energy: float
+    count: int  #: samples shown; the blur needs ``margin`` more at either end
+    kernel: Float32Array  #: (2 margin + 1,) blur of the samples
+    energy: float  #: integral of the squared amplitude of a point's image
 
     @property
     def margin(self) -> int:
@@ -256,19 +239,12 @@ def _axis(low: float, high: float, width: float, lobe_db: float, per_width: floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeamGrid:
-    """The samples of an acquisition.
-
-    Attributes
-    ----------
-    acquisition : Acquisition
-    azimuth, elevation, distance : Axis
-        rad, rad, mm.
-    """
+    """The samples of an acquisition."""
 
     acquisition: Acquisition
-    azimuth: Axis
-    elevation: Axis
-    distance: Axis
+    azimuth: Axis  #: rad
+    elevation: Axis  #: rad
+    distance: Axis  #: mm
 
     @classmethod
     def of(cls, a: Acquisition) -> BeamGrid:

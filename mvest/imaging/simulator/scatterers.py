@@ -1,6 +1,6 @@
 """Moving tissue as sheets and cords, with scatterers fixed to it.
 
-A scatterer keeps its material coordinates in all frames, so that speckle moves with the tissue.
+Scatterers have the same material coordinates in all frames, so that speckle moves with the tissue.
 """
 
 from __future__ import annotations
@@ -15,23 +15,12 @@ from mvest.typing import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Acoustic properties of tissue.
-
-    Attributes
-    ----------
-    name : str
-    echo_db : float
-        Echo strength, see :mod:`mvest.imaging.simulator.acquisition`.
-    specular : bool
-        Whether the echo depends on the angle between surface and beam.
-    fineness : float
-        Density of scatterers over that in walls, for thin tissue.
-    """
+    """Acoustic properties of tissue."""
 
     name: str
-    echo_db: float
-    specular: bool = True
-    fineness: float = 1.0
+    echo_db: float  #: echo strength (`mvest.imaging.simulator.acquisition`)
+    specular: bool = True  #: whether the echo depends on the angle between surface and beam
+    fineness: float = 1.0  #: density of scatterers over that in walls, for thin tissue
 
 
 Sowing: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
@@ -51,7 +40,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _sum(vectors: FloatArray) -> FloatArray:
-    """Of the components."""
+    """Sum of the three components."""
     return np.asarray(vectors[:, 0] + vectors[:, 1] + vectors[:, 2])
 
 
@@ -77,28 +66,14 @@ def normals(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TissueSheet:
-    """A layer over a grid of moving points, closed along its columns.
-
-    Attributes
-    ----------
-    material : Material
-    points : (T, R, C, 3) mm
-        In valve axes.
-    thickness : (R, C) mm
-    span : (float, float)
-        Of the layer along the normal (row direction x column direction), over thickness.
-    relative : (R, C)
-        Amplitude relative to the material's.
-    fade : float
-        The amplitude falls by ``exp(-fade)`` from the grid to one thickness away.
-    """
+    """A layer over a grid of moving points, closed along its columns; mm in valve axes."""
 
     material: Material
-    points: FloatArray
-    thickness: FloatArray
-    span: tuple[float, float]
-    relative: FloatArray
-    fade: float = 0.0
+    points: FloatArray  #: (T, R, C, 3)
+    thickness: FloatArray  #: (R, C)
+    span: tuple[float, float]  #: along the normal (row x column direction), over thickness
+    relative: FloatArray  #: (R, C) amplitude relative to the material's
+    fade: float = 0.0  #: the amplitude falls by exp(-fade) from the grid to one thickness away
 
     @property
     def _cells(self) -> FloatArray:
@@ -148,25 +123,13 @@ class TissueSheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cord:
-    """Tissue of round cross-section along a moving line.
-
-    Attributes
-    ----------
-    material : Material
-    line : (T, m, 3) mm
-        In valve axes.
-    radius : (m,) mm
-    closed : bool
-        Whether the last point is followed by the first.
-    dense : (m,)
-        Share of dense tissue, 0 to 1.
-    """
+    """Tissue of round cross-section along a moving line; mm in valve axes."""
 
     material: Material
-    line: FloatArray
-    radius: FloatArray
-    closed: bool
-    dense: FloatArray
+    line: FloatArray  #: (T, m, 3)
+    radius: FloatArray  #: (m,)
+    closed: bool  #: whether the first point follows the last
+    dense: FloatArray  #: (m,) share of dense tissue, 0 to 1
 
     def _ends(self, values: FloatArray) -> FloatArray:
         """Values at the points, the first repeated at the end of a closed line."""

@@ -25,24 +25,16 @@ ROWS = 33
 class Heart(NamedTuple):
     """Moving walls of the chambers and papillary muscles around a valve.
 
-    Attributes
-    ----------
-    ventricle, atrium, aorta : (T, R, C, 3) mm and (R, C) mm
-        Inner surface, whose rows lead away from the valve and whose columns run around, and
-        thickness of the wall.
-    muscles : tuple of (T, m, 3)
-        From each papillary tip to the ventricle's wall.
-    muscle_radius : (m,)
-    outflow : (C,)
-        Share of the outflow tract in the ventricle's base, 0 (at the back) to 1.
+    A wall is its inner surface ``(T, R, C, 3)`` mm, whose rows lead away from the valve and whose
+    columns run around, and its thickness ``(R, C)`` mm.
     """
 
     ventricle: tuple[FloatArray, FloatArray]
     atrium: tuple[FloatArray, FloatArray]
     aorta: tuple[FloatArray, FloatArray]
-    muscles: tuple[FloatArray, ...]
-    muscle_radius: FloatArray
-    outflow: FloatArray
+    muscles: tuple[FloatArray, ...]  #: (T, m, 3) each, from a papillary tip to the wall
+    muscle_radius: FloatArray  #: (m,)
+    outflow: FloatArray  #: (C,) share of the outflow tract in the ventricle's base, 0 (back) to 1
 
 
 def _step(x: FloatArray) -> FloatArray:
@@ -55,8 +47,8 @@ def waves(
 ) -> FloatArray:
     """A smooth random field ``(rows, columns)`` of mean 0 and standard deviation 1, closed around.
 
-    It has up to 4 ``fineness`` waves around and 3 ``fineness`` along, whose amplitudes ``fall``
-    with this power of their number.
+    It has up to 4 ``fineness`` waves around and 3 ``fineness`` along. Their amplitudes decrease as
+    their number to the power ``-fall``.
     """
     phi = 2 * np.pi * np.arange(columns) / columns
     u = np.linspace(0, np.pi, rows)[:, None]
@@ -70,7 +62,7 @@ def waves(
 
 
 def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -> Heart:
-    """A heart around a valve; the probe's ``apex (3,)`` mm lies behind the wall of the atrium."""
+    """A heart around a valve; the probe's ``apex (3,)`` mm is behind the wall of the atrium."""
     annulus = valve.vertices[:, valve.layout.annulus]
     phi = valve.layout.phi[valve.layout.annulus]
     u = np.linspace(0, 1, ROWS)[:, None]
@@ -186,7 +178,7 @@ def _atrium(
     reach = 1 / np.linalg.norm(direction / axes, axis=-1)
     reach += 1.3 * waves(rng, ROWS, len(angle))
     body = reach[..., None] * direction
-    # The side towards the probe reaches to the probe, nearly.
+    # The side towards the probe nearly reaches it.
     sight = apex - centre
     distance = float(np.linalg.norm(sight))
     sight = sight / distance
@@ -269,7 +261,7 @@ def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list
     ]
     points, thickness = heart.atrium
     atrium = points - thickness[..., None] * normals(points)
-    # Near the annulus the atrium's wall turns outward, and its normal into the ventricle.
+    # Near the annulus the normal of the atrium's wall points into the ventricle.
     for points, side in ((outside, 1.0), (atrium[:, 4:], -1.0)):
         thickness = np.tile(0.02 + SURROUNDINGS_MM * free, (points.shape[1], 1))
         span = (0.0, 1.0) if side > 0 else (-1.0, 0.0)
@@ -306,7 +298,7 @@ def _dense(columns: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _dropouts(grid: tuple[int, int], a: Acquisition, rng: np.random.Generator) -> FloatArray:
-    """Amplitude factor ``grid`` of the leaflets, low in smooth patches of the required share."""
+    """Amplitude factor ``grid`` of the leaflets, low in smooth patches of the set share."""
     field = waves(rng, *grid, 2, 0.7)
     if a.dropout == 0:
         return np.ones(grid)
@@ -316,40 +308,20 @@ def _dropouts(grid: tuple[int, int], a: Acquisition, rng: np.random.Generator) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Echoes:
-    """The scatterers of one frame.
+    """The scatterers of one frame."""
 
-    Attributes
-    ----------
-    points : (n, 3) mm
-        Along azimuth, elevation and beam from the apex.
-    amplitude : (n,)
-        With it tissue of 0 dB has mean power 1, up to the size of the resolution cell.
-    loss : (n,) dB mm^3 / cm
-        One way attenuation beyond that of blood, times the volume per scatterer.
-    """
-
-    points: FloatArray
-    amplitude: FloatArray
-    loss: FloatArray
+    points: FloatArray  #: (n, 3) mm along azimuth, elevation and beam from the apex
+    amplitude: FloatArray  #: (n,); tissue of 0 dB has mean power 1, up to the cell's size
+    loss: FloatArray  #: (n,) dB mm^3 / cm, one way beyond blood, times the volume per scatterer
 
 
 class Sown(NamedTuple):
-    """A part with its scatterers.
-
-    Attributes
-    ----------
-    part : TissuePart
-    seeds : (n, 3)
-        Material coordinates.
-    strength : (n,)
-        Amplitude of each scatterer without the factor of the angle.
-    loss : (n,)
-    """
+    """A part with its scatterers."""
 
     part: TissuePart
-    seeds: FloatArray
-    strength: FloatArray
-    loss: FloatArray
+    seeds: FloatArray  #: (n, 3) material coordinates
+    strength: FloatArray  #: (n,) amplitude without the factor of the angle
+    loss: FloatArray  #: (n,)
 
 
 def cell_volume(acquisition: Acquisition, distance_mm: float) -> float:

@@ -99,12 +99,8 @@ def simulate_volume(
     """A simulated volume ``(T, I, J, K)`` uint8 of a valve and the heart around it.
 
     The seed determines the heart, the scatterers, the stitching and the noise of each frame,
-    whichever ``frames`` (increasing; default: all) are simulated.
-
-    Raises
-    ------
-    InputError
-        If the seed is negative, the valve lies behind the probe, or a frame does not exist.
+    whichever ``frames`` (increasing; default: all) are simulated. InputError if the seed is
+    negative, the valve is behind the probe, or a frame does not exist.
     """
     chosen = _chosen(valve, frames)
     if seed < 0:

@@ -1,7 +1,7 @@
-"""Valves drawn flat on a page: shaded triangles and lines seen from one side, the farthest first.
+"""Valves drawn in two dimensions: shaded triangles and lines, the farthest first.
 
-A drawing is one collection in ordinary axes in millimetres, so that lines disappear behind leaflets
-and every panel can have the same scale.
+A drawing is one collection in ordinary axes in millimetres. Leaflets therefore hide lines behind
+them, and all panels can have the same scale.
 """
 
 from __future__ import annotations
@@ -21,26 +21,23 @@ from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import Gap, find_gap
 
-BLOOD = (0.70, 0.05, 0.10)
-"""Of a gap."""
-UNDER_MM = 0.5
-"""By which a gap is drawn wider than it is, beneath leaflets: it was looked for along the normal of
-the annulus, and not along the line of sight."""
-SMOOTHED_MM = 0.6
-"""Over which the depth of a gap is smoothed, which leaps between two leaflets."""
-NEGLIGIBLE = 1e-6
-TISSUE = (0.80, 0.76, 0.72)
-"""Of the slit between midsurfaces that touch, a thickness apart."""
+BLOOD, TISSUE = (0.70, 0.05, 0.10), (0.80, 0.76, 0.72)
+"""Colours of a gap, and of the slit between midsurfaces that touch, a thickness apart."""
 UNSEEN = np.array([0.75, 0.75, 0.75])
 LINE = np.array([0.10, 0.10, 0.10])
 CHORD = np.array([0.45, 0.42, 0.40])
 TIP = np.array([0.35, 0.22, 0.20])
+UNDER_MM = 0.5
+"""A gap is drawn this far beneath the leaflets: it is found along the normal of the annulus, and
+not along the line of sight."""
+SMOOTHED_MM = 0.6
+"""Smoothing of the depth of a gap, which jumps between two leaflets."""
+NEGLIGIBLE = 1e-6
 TIP_RADIUS_MM = 0.9
 LIFT_MM = 0.7
-"""By which lines are drawn nearer, so that the surface they lie on does not swallow them."""
-LARGEST_EDGE_MM = 1.2
-"""Triangles are drawn by the depth of their middles; below this, touching leaflets stay apart."""
-MAX_SPLITS = 2
+"""Lines are drawn nearer by this, so that their own surface does not hide them."""
+LARGEST_EDGE_MM, MAX_SPLITS = 1.2, 2
+"""Triangles are sorted by the depth of their centres; smaller ones keep touching leaflets apart."""
 LINE_PIECES = 6
 HIGH_QUANTILE = 0.99
 
@@ -54,7 +51,7 @@ def leaflet_colours(region: IntArray) -> FloatArray:
 
 
 def distance_top(*distances: FloatArray) -> float:
-    """Upper end in mm of a scale for several fields: a round number at or above nearly all."""
+    """Upper end of a scale for several fields: a round number above the 99 % quantile of each."""
     top = max(float(np.nanquantile(values, HIGH_QUANTILE)) for values in distances)
     if top <= 0:
         return 1e-3
@@ -63,10 +60,7 @@ def distance_top(*distances: FloatArray) -> float:
 
 
 def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
-    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
-
-    A triangle is grey where one of its corners has no value.
-    """
+    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``; grey if unknown."""
     known = np.isfinite(values)
     colours: FloatArray = scale.to_rgba(np.where(known, values, 0.0))[:, :3]
     whole = np.asarray(known[triangles].all(axis=1))
@@ -90,16 +84,16 @@ def draw_valve(
     axes : matplotlib Axes
     fields : CaseFields
     points : ndarray
-        ``(n, 3)`` mm; triangles with a vertex that is NaN are left out.
+        ``(n, 3)`` mm; triangles with a NaN are left out.
     colours : ndarray
-        ``(m, 3, 3)`` of the corners of the triangles before shading: triangle, corner, channel.
+        ``(m, 3, 3)`` of triangle, corner, channel before shading.
     view : View
     frame : int
-        Whose papillary tips are drawn; 0 is the reference frame.
+        Frame of the papillary tips; 0 is the reference frame.
     chords : bool
         Whether chordae and papillary tips are drawn.
     strength : float
-        How much darker a triangle on edge is than one that faces the light.
+        Darkening of a triangle on edge, relative to one that faces the light.
     """
     known = np.isfinite(points[fields.triangles]).all(axis=(1, 2))
     parts = [_surface(points, fields.triangles[known], colours[known], view, strength)]
@@ -131,8 +125,8 @@ def draw_valve(
 def _surface(
     points: FloatArray, triangles: IntArray, colours: FloatArray, view: View, strength: float
 ) -> Part:
-    """Shaded triangles, small enough to be distinguished in depth where leaflets touch."""
-    # A vertex of no triangle that is drawn has no normal, and none is asked for.
+    """Shaded triangles, split so that their depths differ where leaflets touch."""
+    # Vertices without a triangle have no normal and are not drawn.
     with np.errstate(invalid="ignore"):
         normals = vertex_normals(points, triangles)
     corner, normal = points[triangles], normals[triangles]
@@ -145,13 +139,13 @@ def _surface(
     direction = normal.mean(axis=1)
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
     light = view.axes @ np.array([-0.40, 0.45, 0.80])
-    # Both sides are lit alike.
+    # Both sides are equally lit.
     shade = 1.0 - strength * (1.0 - np.abs(direction @ light))
     return corner, np.clip(colours.mean(axis=1) * shade[:, None], 0, 1), 0.3
 
 
 def quartered(values: FloatArray) -> FloatArray:
-    """Values at the corners of four triangles for each: ``(m, 3, 3)`` to ``(4 m, 3, 3)``."""
+    """Values at the corners of triangles split into four: ``(m, 3, 3)`` to ``(4 m, 3, 3)``."""
     a, b, c = values[:, 0], values[:, 1], values[:, 2]
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
@@ -159,7 +153,7 @@ def quartered(values: FloatArray) -> FloatArray:
 
 
 def _lines(ends: FloatArray, view: View, colour: FloatArray, width: float) -> Part:
-    """Straight lines ``(k, 2, 3)`` in pieces, each a triangle without area; NaN are left out."""
+    """Straight lines ``(k, 2, 3)`` as pieces that are triangles without area; NaN are left out."""
     start, end = ends[np.isfinite(ends).all(axis=(1, 2))].swapaxes(0, 1)
     share = np.linspace(0, 1, LINE_PIECES + 1)[:, None, None]
     beads = start + share * (end - start) + LIFT_MM * view.axes[:, 2]
@@ -168,7 +162,7 @@ def _lines(ends: FloatArray, view: View, colour: FloatArray, width: float) -> Pa
 
 
 def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
-    """Discs that face the eye, of triangles around their centres."""
+    """Discs that face the eye."""
     angle = np.linspace(0, 2 * np.pi, 25)
     rim = TIP_RADIUS_MM * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ view.axes[:, :2].T
     disc = np.stack([0 * rim[:-1], rim[:-1], rim[1:]], axis=1)
@@ -177,11 +171,10 @@ def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
 
 
 def leak_of(fields: CaseFields, points: FloatArray, frame: int) -> tuple[Gap, FloatArray] | None:
-    """The gap of a valve at ``points (n, 3)`` mm, and where the corners of its pixels lie.
+    """The gap of a valve at ``points (n, 3)`` mm, and the corners of its pixels.
 
     Corners ``(rows + 1, columns + 1, 3)`` mm are about as deep as the nearest leaflets. Papillary
-    tips are those of the frame. None if it is not known within which distance leaflets touch, or
-    some of the points were not seen.
+    tips are those of ``frame``. None if the contact distance or some of the points are unknown.
     """
     if fields.reach_mm is None or not np.isfinite(points).all():
         return None
@@ -205,9 +198,9 @@ def leak_of(fields: CaseFields, points: FloatArray, frame: int) -> tuple[Gap, Fl
 
 
 def paint_leak(axes: Any, fields: CaseFields, points: FloatArray, frame: int) -> None:
-    """Draw what is open of a valve seen from the atrium, and the slit where leaflets touch.
+    """Draw the gap of a valve from the atrium, and the slit between touching leaflets.
 
-    Nothing is drawn where `leak_of` is not known; its parameters are the same.
+    Nothing is drawn if `leak_of`, which has the same parameters, is None.
     """
     leak = leak_of(fields, points, frame)
     if leak is None or not (between := leak[0].slit | leak[0].open).any():
@@ -221,24 +214,21 @@ def paint_leak(axes: Any, fields: CaseFields, points: FloatArray, frame: int) ->
 
 def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str]) -> None:
     """Write the names of the leaflets outside the annulus, seen from the atrium."""
-    ring = fields.rest[fields.annulus] @ ATRIUM.axes
-    middle = ring.mean(axis=0)[:2]
-    region = fields.vertex_region[fields.annulus]
+    ring = (fields.rest[fields.annulus] @ ATRIUM.axes)[:, :2]
+    middle, region = ring.mean(axis=0), fields.vertex_region[fields.annulus]
     for k, name in enumerate(names):
-        part = ring[region == k, :2]
-        if len(part):
-            direction = part.mean(axis=0) - middle
-            direction /= max(float(np.linalg.norm(direction)), 1e-12)
-            reach = float(((part - middle) @ direction).max()) + 2.0
-            x, y = middle + reach * direction
-            angle = {"ha": "center", "va": "bottom" if direction[1] > 0 else "top"}
-            if abs(direction[0]) > 0.7:
-                angle = {"ha": "left" if direction[0] > 0 else "right", "va": "center"}
-            axes.text(x, y, name, fontsize=9, color="0.25", **angle)
+        if not len(part := ring[region == k] - middle):
+            continue
+        direction = part.mean(axis=0) / max(float(np.linalg.norm(part.mean(axis=0))), 1e-12)
+        x, y = middle + (float((part @ direction).max()) + 2.0) * direction
+        angle = {"ha": "center", "va": "bottom" if direction[1] > 0 else "top"}
+        if abs(direction[0]) > 0.7:
+            angle = {"ha": "left" if direction[0] > 0 else "right", "va": "center"}
+        axes.text(x, y, name, fontsize=9, color="0.25", **angle)
 
 
 def same_scale(panels: Sequence[Any], shapes: Sequence[FloatArray], view: View) -> None:
-    """Give panels of one view the same limits in mm, and the first of them a scale bar."""
+    """Give panels of one view the same limits in mm, and the first one a scale bar."""
     seen = np.concatenate([shape.reshape(-1, 3) @ view.axes for shape in shapes])[:, :2]
     low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
     margin = 0.09 * float((high - low).max())

@@ -26,6 +26,8 @@ from mvest.reporting.case.drawing import (
     same_scale,
 )
 from mvest.reporting.figures import ATRIUM, COLOURS, DISTANCE_MAP, SIDE, TEXT, VIEWS
+from mvest.reporting.markup import number
+from mvest.reporting.skill import HALF
 from mvest.typing import FloatArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
@@ -33,15 +35,12 @@ if TYPE_CHECKING:
     from mvest.cases.case import ValveCase
 
 PRIOR, POSTERIOR, WITHOUT = "0.75", COLOURS[0], COLOURS[1]
-TWO_SIDED = 1.96
-"""Standard deviations within which 95 % of a normal distribution lie."""
 
 
 class _Shape(NamedTuple):
     """A valve at ``points (n, 3)`` mm with the papillary tips of a frame.
 
-    Where it has ``colours (m, 3, 3)`` of the corners of its triangles, neither chordae nor tips are
-    drawn, so that they are seen.
+    With ``colours (m, 3, 3)`` of the corners of its triangles it is drawn without chordae and tips.
     """
 
     title: str
@@ -53,22 +52,19 @@ class _Shape(NamedTuple):
 
 def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     """The valve at rest and in the closed frame (observed, personalised), from two sides."""
-    k, model = fields.closed, "generic" if fields.fitted is None else "personalised"
-    closed = {
-        "closed, observed": fields.observed,
-        f"closed, {model} model": fields.generic if fields.fitted is None else fields.fitted,
-    }
+    k, fitted = fields.closed, fields.fitted is not None
+    model = ("personalised", fields.fitted) if fitted else ("generic", fields.generic)
     shapes = [_Shape("open (reference)", fields, fields.rest, 0)]
-    for title, points in closed.items():
+    for title, points in (("observed", fields.observed), (f"{model[0]} model", model[1])):
         if points is not None:
-            shapes.append(_Shape(title, fields, points[k], k + 1))
+            shapes.append(_Shape(f"closed, {title}", fields, points[k], k + 1))
     return _views_figure(shapes, names, (3.0 * len(shapes), 5.9), 1.15)[0]
 
 
 def _views_figure(
     shapes: Sequence[_Shape], names: Sequence[str], size: tuple[float, float], lower: float
 ) -> tuple[Figure, Any]:
-    """Shapes of valves from two sides, the lower row so many times as high as the upper one."""
+    """Shapes of valves from two sides; ``lower`` is the lower row's height over the upper one's."""
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(2, len(shapes), squeeze=False, height_ratios=[1.0, lower])
     for row, view in zip(grid, VIEWS, strict=True):
@@ -79,7 +75,7 @@ def _views_figure(
             if colours is not None:
                 draw_valve(axes, fields, points, colours, view, frame, strength=0.3)
             else:
-                # Seen from the atrium, a closed valve hides its chordae and tips.
+                # A closed valve hides its chordae and tips from the atrium.
                 own = leaflet_colours(fields.region)
                 draw_valve(axes, fields, points, own, view, frame, chords=not shut)
                 reach += [fields.tips[frame]] if view is SIDE else []
@@ -97,24 +93,24 @@ def _views_figure(
 
 
 def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
-    """The frames of a case as they were given, from two sides.
+    """The frames of a case as given, from two sides.
 
     Parameters
     ----------
     case : ValveCase
     reach_mm : float
-        Distance of midsurfaces within which leaflets touch: the gap of the closed frame is drawn.
+        Distance of midsurfaces within which leaflets touch. The closed frame shows its gap.
     """
-    surface, chordae = case.surface, case.chordae
-    # Imports what reads cases, which figures of a synthetic valve do not need.
+    # Figures of a synthetic valve do not need what this imports.
     from mvest.cases.case import Role
 
+    surface, chordae = case.surface, case.chordae
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
+    ends = np.asarray(cKDTree(surface.vertices).query(chordae.insertion)[1], dtype=np.int64)
     shapes = []
-    insertion = (chordae.insertion - middle) @ axes
     for frame in case.frames:
-        at_rest, shut = frame.role is Role.REFERENCE, frame.role is Role.CLOSED
+        shut = frame.role is Role.CLOSED
         vertices, annulus = ((x - middle) @ axes for x in (frame.vertices, frame.annulus))
         ring = cKDTree(annulus)
         loops = boundary_loops(frame.triangles)
@@ -131,26 +127,26 @@ def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
             observed_points={},
             reach_mm=reach_mm if shut else None,
         )
-        if at_rest:
-            ends = np.asarray(cKDTree(vertices).query(insertion)[1], dtype=np.int64)
+        if frame.corresponds:
+            # Elsewhere the insertions of the chordae are not known.
             fields = replace(fields, chord_tip=chordae.tip, chord_insertion=ends)
-        title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
-        # Of a closed one the gap is drawn, as of a frame that is not the reference.
-        shapes.append(_Shape(title, fields, vertices, int(shut)))
+        role = "held out" if frame.role is Role.HELD_OUT else frame.role.value
+        about = f"{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
+        shapes.append(_Shape(f"{frame.name} ({role})\n{about}", fields, vertices, int(shut)))
     return _views_figure(shapes, surface.region_names, (3.0 * len(shapes), 5.9), 1.15)[0]
 
 
 def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
-    """The closed valve coloured by pointwise distance from the observed one, on one scale.
+    """The fitted valve coloured by pointwise distance (mm) from the observed one.
 
-    The generic valve, if there is one, is beside the personalised one.
+    A generic valve is drawn next to it on the same scale.
 
     Parameters
     ----------
     fields : CaseFields or Path
         A path is read by `mvest.problem.fields.case_fields`.
     names : sequence of str
-        Of the leaflets, written beside them.
+        Of the leaflets, written next to them.
 
     Raises
     ------
@@ -164,39 +160,28 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     models = {"personalised": (fields.fitted[k], fields.distance_fitted[k])}
     if fields.generic is not None and fields.distance_generic is not None:
         models = {"generic": (fields.generic[k], fields.distance_generic[k]), **models}
-    largest = max(float(np.nanmax(distance)) for _, distance in models.values())
-    # In the unit in which the largest is a number above 0.1.
-    unit, factor = next(
-        ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * largest >= 0.1), ("nm", 1e6)
-    )
-    top = distance_top(*(factor * distance for _, distance in models.values()))
+    distances = [distance for _, distance in models.values()]
+    top = distance_top(*distances)
     scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
-    shapes = [
-        _Shape(
-            f"{name} stiffness\n{Spread.of(factor * distance)} {unit}",
-            fields,
-            points,
-            k + 1,
-            corner_colours(scale, factor * distance, fields.triangles),
-        )
-        for name, (points, distance) in models.items()
-    ]
+    shapes = []
+    for name, (points, distance) in models.items():
+        spread = Spread.of(distance)
+        small = f"{number(spread.mean, 2)} ± {number(spread.std, 2)}"
+        title = f"{name} stiffness\n{spread if spread.mean >= 0.01 else small} mm"
+        colours = corner_colours(scale, distance, fields.triangles)
+        shapes.append(_Shape(title, fields, points, k + 1, colours))
     figure, grid = _views_figure(shapes, names, (4.3 * len(shapes), 6.6), 0.8)
-    beyond = "max" if factor * largest > top else "neither"
+    beyond = "max" if np.nanmax(distances) > top else "neither"
     bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.02, extend=beyond)
-    bar.set_label(f"distance from the observed closed valve [{unit}]")
+    bar.set_label("distance from the observed valve [mm]")
     return figure
 
 
 def estimates_figure(record: EstimateRecord) -> Figure:
-    """Each unknown with its 95 % intervals: prior, estimate, and the truth if it is known.
+    """Prior and estimate of each unknown with 95 % intervals, and the truth if it is known.
 
-    Moduli are in their units, nuisances in standard deviations of the prior from its mean.
-
-    Raises
-    ------
-    InputError
-        If there is no unknown.
+    Moduli are in their units, nuisances in prior standard deviations from the prior mean. A record
+    without unknowns is an InputError.
     """
     nuisances = [one for one in record.unknowns if one.kind == "nuisance"]
     groups = [group for group in (list(record.moduli), nuisances) if group]
@@ -234,7 +219,7 @@ def estimates_figure(record: EstimateRecord) -> Figure:
 def _draw_intervals(
     axes: Any, unknowns: Sequence[Unknown], without: Sequence[Unknown], in_sd: bool
 ) -> None:
-    """A row for each unknown; what is None is NaN, which matplotlib leaves out."""
+    """A row for each unknown; None becomes NaN, which matplotlib leaves out."""
 
     def values(source: Sequence[Unknown], name: str) -> FloatArray:
         return np.array([getattr(one, name) for one in source], dtype=float)
@@ -242,11 +227,11 @@ def _draw_intervals(
     rows = np.arange(len(unknowns))
     mean, std = (np.nan_to_num(values(unknowns, f"prior_{name}")) for name in ("mean", "std"))
     shift, scale = (mean, np.where(std > 0, std, 1.0)) if in_sd else (0.0, 1.0)
-    low, high = ((mean + side * TWO_SIDED * std - shift) / scale for side in (-1, 1))
+    low, high = ((mean + side * HALF * std - shift) / scale for side in (-1, 1))
     axes.hlines(rows, low, high, color=PRIOR, linewidth=11, label="prior, 95 %", zorder=2)
     for source, colour, offset, marker, label in (
         (unknowns, POSTERIOR, -0.09, "o", "estimate with its 95 % interval"),
-        (without, WITHOUT, 0.17, "s", "estimate if the nuisances were taken as known"),
+        (without, WITHOUT, 0.17, "s", "estimate with the nuisances taken as known"),
     ):
         low, place, high = (
             (values(source, n) - shift) / scale for n in ("low", "estimate", "high")

@@ -1,4 +1,4 @@
-"""The valve of one case to be turned by hand: a plotly scene, its script, and its buttons."""
+"""A turnable 3D view of the valve of one case: a plotly scene and its buttons."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray, IntArray
 
 DECIMALS = 2
-"""Positions are stored to 0.01 mm, a fiftieth of what is seen of a valve."""
+"""Positions are stored to 0.01 mm."""
 LINE, CHORD, TIP = "#1a1a1a", "#8a817c", "#59382f"
 GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
 
 PERSONALISED = "closed, personalised"
 """The state that is shown first, if there is an estimate."""
-
 CAMERAS: Mapping[str, Any] = {
     "obliquely": {"eye": {"x": 0.48, "y": -1.04, "z": 1.25}, "up": {"x": 0, "y": 0, "z": 1}},
     "from the atrium": {"eye": {"x": 0.0, "y": -0.01, "z": 1.75}, "up": {"x": 0, "y": 1, "z": 0}},
     "from the side": {"eye": {"x": 0.85, "y": -1.50, "z": 0.38}, "up": {"x": 0, "y": 0, "z": 1}},
 }
-"""In perspective: plotly lights no surface from the front in an orthographic scene."""
+"""Perspective ones: plotly does not light surfaces from the front in an orthographic scene."""
 
 
 def case_view(fields: CaseFields, names: Sequence[str]) -> tuple[Markup, list[dict[str, Any]]]:
-    """The valve open and closed, as observed and as models have it, one of them shown at a time.
+    """The open and closed valve, observed and modelled; one state is shown at a time.
 
     Parameters
     ----------
     fields : CaseFields
     names : sequence of str
-        Of the leaflets, for what is shown under the pointer.
+        Of the leaflets, shown under the pointer.
 
     Returns
     -------
     markup, buttons : Markup, list of mapping
-        The scene with plotly's script; and for each button its ``label``, which traces of the scene
-        it ``shows``, and whether it is ``pressed`` at first.
+        The scene with plotly's script; and for each button its ``label``, whether it ``shows`` each
+        trace of the scene, and whether it is ``pressed`` at first.
     """
     states = states_of(fields, names)
     start = PERSONALISED if PERSONALISED in states else next(iter(states))
+    traces = [
+        trace.update(visible=label == start) for label, parts in states.items() for trace in parts
+    ]
     owner = np.array([label for label, parts in states.items() for _ in parts])
-    scene = go.Figure([trace for parts in states.values() for trace in parts])
-    for trace, label in zip(scene.data, owner, strict=True):
-        trace.visible = bool(label == start)
+    scene = go.Figure(traces)
     axis = {"visible": False, "showbackground": False}
     scene.update_layout(
         template=None,
@@ -89,18 +89,18 @@ def states_of(fields: CaseFields, names: Sequence[str]) -> dict[str, list[Any]]:
         ghost = _mesh(fields.observed[k], fields.triangles, color=GHOST, hoverinfo="skip")
         seen = [ghost.update(opacity=0.45)]
         states["closed, observed"] = _anatomy(fields, fields.observed[k], frame, names)
-    models = (
+    distances = {}
+    for label, shape, off in (
         ("generic", fields.generic, fields.distance_generic),
         ("personalised", fields.fitted, fields.distance_fitted),
-    )
-    for label, shape, _ in models:
+    ):
         if shape is not None:
             states[f"closed, {label}"] = _anatomy(fields, shape[k], frame, names)
-    known = [off[k] for _, shape, off in models if shape is not None and off is not None]
-    for label, shape, off in models:
-        if shape is not None and off is not None:
-            top = distance_top(*known)
-            states[f"distance, {label}"] = _coloured(fields, shape[k], frame, off[k], top)
+            if off is not None:
+                distances[label] = shape[k], off[k]
+    top = distance_top(*(off for _, off in distances.values())) if distances else 0.0
+    for label, (points, off) in distances.items():
+        states[f"distance, {label}"] = _coloured(fields, points, frame, off, top)
     if fields.fitted is not None and seen:
         model = _anatomy(fields, fields.fitted[k], frame, names)
         states["observed (grey) over personalised"] = [*model, *seen]
@@ -113,13 +113,12 @@ def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence
     for r, name in enumerate(names):
         triangles = fields.triangles[fields.region == r]
         colour = to_hex(LEAFLET_COLOURS[r % len(LEAFLET_COLOURS)])
-        # plotly reads tags in its texts.
-        text = escape(shown_text(str(name)))
+        text = escape(shown_text(str(name)))  # plotly interprets tags
         parts.append(_mesh(points, triangles, color=colour, name=text, hoverinfo="name"))
     parts += [*_leak(fields, points, frame), *_rings(fields, points)]
     if len(fields.chord_tip):
         ends = fields.chords(points, frame)
-        # A gap after each chord, so that all of them are one line.
+        # All chordae are one line, interrupted after each.
         broken = np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1)
         parts.append(_line(broken.reshape(-1, 3), CHORD, 2))
     if fields.tips.shape[1]:
@@ -130,7 +129,7 @@ def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence
 def _coloured(
     fields: CaseFields, points: FloatArray, frame: int, distance: FloatArray, top: float
 ) -> list[Any]:
-    """A mesh coloured by distance, and grey where that is not known."""
+    """A mesh coloured by distance, grey where it is unknown."""
     known = np.isfinite(distance[fields.triangles]).all(axis=1)
     mesh = _mesh(
         points,
@@ -150,10 +149,9 @@ def _coloured(
 
 
 def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
-    """The gap of a closed valve, and the slit where leaflets touch, as high as what is nearest."""
+    """The gap of a closed valve and the slit between touching leaflets, every second pixel."""
     if not frame or (leak := leak_of(fields, points, frame)) is None:
         return []
-    # Of two pixels along both directions there is one.
     gap, corners = leak[0], leak[1][::2, ::2]
     parts = []
     for name, pixels, colour in (("touching", gap.slit, TISSUE), ("gap", gap.open, BLOOD)):
@@ -170,7 +168,7 @@ def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
 def _mesh(
     points: FloatArray, triangles: IntArray, values: FloatArray | None = None, **style: Any
 ) -> Any:
-    """A mesh of the triangles whose corners were all seen, of the vertices that they use."""
+    """A mesh of the triangles without a NaN, and of the vertices that they use."""
     known = np.isfinite(points[triangles]).all(axis=(1, 2))
     used, corner = np.unique(triangles[known], return_inverse=True)
     i, j, k = corner.reshape(-1, 3).T.astype(np.min_scalar_type(len(used)))
@@ -187,9 +185,7 @@ def _mesh(
 
 def _rings(fields: CaseFields, points: FloatArray) -> list[Any]:
     loops = ((fields.annulus, 6), (fields.free_edge, 2))
-    return [
-        _line(points[np.append(loop, loop[0])], LINE, width) for loop, width in loops if len(loop)
-    ]
+    return [_line(points[[*loop, loop[0]]], LINE, width) for loop, width in loops if len(loop)]
 
 
 def _line(points: FloatArray, colour: str, width: int) -> Any:
@@ -205,5 +201,5 @@ def _dots(points: FloatArray, colour: str, size: float, **style: Any) -> Any:
 
 
 def small(values: FloatArray) -> NDArray[np.float32]:
-    """Values as they are stored in a page: rounded, in single precision."""
+    """Values as stored in a page: rounded, in single precision."""
     return np.round(values, DECIMALS).astype(np.float32)

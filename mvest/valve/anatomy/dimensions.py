@@ -1,6 +1,6 @@
-"""Dimensions of the parametric valve, in the groups that :class:`Template` is drawn from.
+"""Dimensions of the parametric valve (:class:`mvest.valve.anatomy.template.Template`).
 
-Lengths are mm, angles degrees; axes are those of :mod:`mvest.valve.anatomy.template`.
+Lengths are mm and angles degrees. Axes are those of :mod:`mvest.valve.anatomy.template`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class AnnulusDimensions:
     saddle_height : float
         Extent along the valve's axis.
     anterior_flattening : float
-        Share by which the anterior half axis is shorter.
+        Relative shortening of the anterior half axis.
     commissure_angle : float
-        Parametric angle of the commissures above the x axis, degrees.
+        Parametric angle of the commissures above the x axis.
     commissural_contraction, anteroposterior_contraction : float
-        Shares by which the annulus shrinks until the valve is closed.
+        Relative shortening of the annulus until the valve is closed.
     """
 
     commissural_half_axis: Length = 18.0
@@ -55,7 +55,7 @@ class LeafletDimensions:
     thickness : float
         Of the half next to the annulus.
     length_exponent : float
-        Power of the sine with which the length falls off towards the commissures.
+        Exponent of the sine by which the length decreases towards the commissures.
     """
 
     length: Length
@@ -75,9 +75,9 @@ class LeafletPair:
     belly_depth : float
         Depth of a leaflet's belly over its length.
     edge_thinning : float
-        Thickness at the free edge over that of the half next to the annulus.
+        Thickness at the free edge over that next to the annulus.
     fibre_turn : float
-        Share of the anterior leaflet's angle at each commissure over which its fibres turn from
+        Share of the anterior leaflet's angle, at each commissure, over which its fibres turn from
         parallel to perpendicular to the annulus.
     """
 
@@ -91,16 +91,16 @@ class LeafletPair:
 
 @dataclass(frozen=True, slots=True)
 class FreeEdge:
-    """The free edge of the open valve, seen from above: two arcs that meet at the commissures.
+    """The free edge of the open valve from above: two arcs that meet at the commissures.
 
     Attributes
     ----------
     half_width : float
-        Half the distance between their ends.
+        Half the distance between the commissures.
     commissural_y : float
-        y of their ends.
+        y of the commissures.
     anterior_depth, posterior_depth : float
-        How far their middles lie beyond that, to either side.
+        Distance of the middles of the arcs from there along y.
     exponent : float
         1 gives half ellipses, 2 parabolas that meet at an angle.
     """
@@ -114,7 +114,7 @@ class FreeEdge:
 
 @dataclass(frozen=True, slots=True)
 class ClosedEdge:
-    """Where the free edges are to meet, from which the rest lengths of the chordae follow.
+    """Line on which the free edges are meant to meet; it defines the rest lengths of the chordae.
 
     The line is ``y = free_edge.commissural_y - sag (1 - u^2)``, ``z = middle_z - drop u^2`` with
     ``u = x / half_width``.
@@ -128,16 +128,15 @@ class ClosedEdge:
 
 @dataclass(frozen=True, slots=True)
 class PapillaryPlace:
-    """Where the papillary tips are.
+    """Positions of the papillary tips.
 
     Attributes
     ----------
     tip : (x, y, z)
-        Of the tip at positive x; the other is its mirror image.
+        The tip at positive x; the other one is its mirror image.
     displacement : (x, y, z)
-        By which this tip has moved since the chordae got their lengths, outward for positive x; the
-        other moves as its mirror image. The chordae do not follow, so they tether the leaflets;
-        they are only never taut in the open valve.
+        Displacement of this tip after the chordae got their lengths; the other tip moves as its
+        mirror image. The chordae tether the leaflets then, but are never taut in the open valve.
     """
 
     tip: tuple[Place, Place, Place] = (16.0, -0.24, -25.0)
@@ -146,7 +145,7 @@ class PapillaryPlace:
 
 @dataclass(frozen=True, slots=True)
 class ChordLayout:
-    """Where the chordae insert, in material coordinates of one half; the other half is mirrored.
+    """Insertions of the chordae in material coordinates of one half; the other half is mirrored.
 
     Attributes
     ----------
@@ -160,18 +159,18 @@ class ChordLayout:
     marginal_slack, basal_slack : float
         Rest length over the distance to the intended closed position.
     open_slack : float
-        Rest length over the open length, at least.
+        Least ratio of the rest length to the open length.
     toe_strain : float
     elongated : tuple of (float, float, float)
-        (from, to, factor): chordae that insert at these ``phi`` of the whole valve, in degrees, are
-        longer by the factor; where ranges overlap, by all of theirs. Nothing is mirrored.
+        (from, to, factor): chordae that insert in this range of ``phi`` of the whole valve (not
+        mirrored) are longer by the factor. The factors of overlapping ranges multiply.
     absent : tuple of (float, float)
-        (from, to): chordae that insert at these ``phi`` of the whole valve are missing.
+        (from, to): chordae that insert in this range of ``phi`` of the whole valve are missing.
 
     Raises
     ------
     InputError
-        If there is no chord, a place is incomplete, a range is empty or a factor not positive.
+        If there is no chord, an insertion is incomplete, a range empty or a factor not positive.
     """
 
     marginal_phi: tuple[Angle, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
@@ -224,8 +223,8 @@ class TemplateParameters:
     Raises
     ------
     InputError
-        If a length is not positive, a place has not three coordinates, or fibres do not turn within
-        half a leaflet.
+        If a length is not positive, a position has not three coordinates, or fibres do not turn
+        within half a leaflet.
     """
 
     annulus: AnnulusDimensions = AnnulusDimensions()
@@ -249,13 +248,7 @@ class TemplateParameters:
                 raise InputError(f"template {name} = {value}, expected > 0")
 
     def changed(self, values: Mapping[str, Any]) -> TemplateParameters:
-        """The same with other values under their dotted names, as ``annulus.saddle_height``.
-
-        Raises
-        ------
-        InputError
-            If there is no such name, or a value is inadmissible.
-        """
+        """Copy with other values by dotted names, such as ``annulus.saddle_height``; InputError."""
         return _changed(self, values)
 
 

@@ -1,4 +1,4 @@
-"""The parametric mitral valve: a smooth surface in material coordinates, and what hangs on it.
+"""The parametric mitral valve: a smooth surface in material coordinates, chordae and motion.
 
 Material coordinates
 --------------------
@@ -39,12 +39,12 @@ def _mirrored(point: tuple[float, float, float]) -> FloatArray:
 
 
 def _between(phi: FloatArray, start: float, end: float) -> BoolArray:
-    """Which angles ``(k,)`` in degrees lie in [start, end], whatever multiple of 360 they are."""
+    """Which angles ``(k,)`` in degrees lie in [start, end] modulo 360."""
     return np.asarray(np.mod(phi - start, 360.0) <= end - start)
 
 
 def vertex_region(phi: FloatArray) -> IntArray:
-    """The leaflet of vertices ``(k,)`` at angles in degrees; commissures are the posterior's."""
+    """Leaflet of vertices ``(k,)`` at angles in degrees; commissures belong to the posterior."""
     return np.where((phi > 0) & (phi < 180), ANTERIOR, POSTERIOR)
 
 
@@ -95,7 +95,7 @@ class Template:
         return edge + rise_a + rise_b
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
-        """Thickness ``(k,)``; blends between the leaflets over 20 degrees at each commissure."""
+        """Thickness ``(k,)``, blended over 20 degrees to each side of a commissure."""
         p = self.parameters.leaflets
         thick, other = p.anterior.thickness, p.posterior.thickness
         blend = smoothstep(0.5 + np.sin(np.deg2rad(phi)) / (2 * np.sin(np.deg2rad(20.0))))
@@ -104,7 +104,7 @@ class Template:
 
     @cached_property
     def _edge_table(self) -> tuple[FloatArray, FloatArray]:
-        """Edge angle over phi such that points are spread evenly along each leaflet's free edge."""
+        """Edge angle over phi for points at equal distances along each leaflet's free edge."""
         p = self.parameters.free_edge
         angle = np.linspace(0, 2 * np.pi, 2881)
         phi = np.empty_like(angle)
@@ -156,7 +156,7 @@ class Template:
             )
         drop = np.sqrt(length**2 - reach**2)
         span = np.concatenate([across, -drop[..., None]], axis=-1)
-        # The belly lies towards the lumen, perpendicular to the chord in its vertical plane.
+        # The belly bulges into the lumen, perpendicular to the chord in its vertical plane.
         inward = across / reach[..., None]
         belly = np.concatenate(
             [inward * (drop / length)[..., None], (reach / length)[..., None]], axis=-1
@@ -176,10 +176,10 @@ class Template:
         )
 
     def normal(self, phi: FloatArray, s: FloatArray) -> FloatArray:
-        """Unit normals ``(k, 3)`` towards the ventricle.
+        """Unit normals ``(k, 3)`` towards the ventricle, averaged over neighbouring directions.
 
-        Averaged over neighbouring directions: at the commissures the leaflets bend with a radius of
-        about the thickness, and raw normals would make thick elements overlap there.
+        At the commissures the leaflets bend with a radius of about the thickness; raw normals would
+        make thick elements overlap there.
         """
         total = np.zeros((*np.shape(phi), 3))
         for shift, weight in ((-8.0, 0.5), (-4.0, 0.8), (0.0, 1.0), (4.0, 0.8), (8.0, 0.5)):
@@ -194,7 +194,7 @@ class Template:
         return self.normal(grid.phi, grid.s)
 
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
-        """Unit fibre directions ``(k, 3)`` seen from the leaflet ``region``."""
+        """Unit fibre directions ``(k, 3)`` as seen from the leaflet ``region``."""
         t, r = self.tangents(phi, s)
         angle = self.fibre_angle(phi, region)
         normal = np.cross(r, t)
@@ -209,32 +209,21 @@ class Template:
         angle = 0.5 * np.pi * (1 - smoothstep(from_commissure / turn))
         return np.where(region == ANTERIOR, angle, 0.0)
 
-    # -- what hangs on it -------------------------------------------------------------------------
+    # -- chordae and motion -----------------------------------------------------------------------
     @property
     def papillary_tips(self) -> FloatArray:
-        """Where the tips are ``(2, 3)`` mm, displacement included."""
+        """Papillary tips ``(2, 3)`` mm, with their displacement."""
         return self._intended_tips + _mirrored(self.parameters.papillary.displacement)
 
     @property
     def _intended_tips(self) -> FloatArray:
-        """``(2, 3)`` mm: the tips for which the chordae have their lengths."""
+        """The tips ``(2, 3)`` mm that define the lengths of the chordae."""
         return _mirrored(self.parameters.papillary.tip)
 
     def chord_places(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
-        """Where the chordae of both halves insert, in their order and without the absent ones.
+        """``phi`` (degrees), ``s``, family (0 marginal, 1 basal) and tip ``(c,)`` of the chordae.
 
-        Returns
-        -------
-        phi : (c,) degrees
-        s : (c,)
-        family : (c,)
-            0 marginal, 1 basal.
-        tip : (c,)
-
-        Raises
-        ------
-        InputError
-            If all of them are absent.
+        Absent ones are left out; InputError if none is left.
         """
         layout = self.parameters.chordae
         marginal = [(phi, layout.marginal_s, 0) for phi in layout.marginal_phi]
@@ -252,13 +241,7 @@ class Template:
         return phi, s, family, tip
 
     def chordae(self) -> Chordae:
-        """The chordae of both halves, without the absent ones.
-
-        Raises
-        ------
-        InputError
-            If all of them are absent.
-        """
+        """The chordae of both halves without the absent ones; InputError if none is left."""
         layout = self.parameters.chordae
         phi, s, family, tip = self.chord_places()
         insertion = self.position(phi, s)

@@ -1,8 +1,7 @@
-"""Value objects of the anatomy: leaflets, chordae, motion of the boundary, and the valve they form.
+"""Value objects of the anatomy: leaflets, chordae, motion of the boundary, and the whole valve.
 
-All lengths are millimetres. Every object is frozen and checked on construction, so that a valve
-that exists is a valve that makes sense; the message of a failed check names the field and the
-entry.
+All lengths are millimetres. Every object is frozen and checked on construction; the message of a
+failed check names the field and the entry.
 """
 
 from __future__ import annotations
@@ -15,16 +14,17 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, areas
+
+MAX_CHORD_GAP_MM = 3.0
+"""From the insertion of a chord to the leaflets."""
 
 
 def checked_floats(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
-    """A read-only copy as float64, its shape (None: any length) and finiteness checked.
+    """A read-only copy as float64; InputError on a wrong shape or an entry that is not finite.
 
-    Raises
-    ------
-    InputError
-        Another shape, or an entry that is not finite.
+    None in the shape stands for any length.
     """
     result = np.array(array, dtype=np.float64, order="C")
     _check_shape(name, result.shape, shape)
@@ -38,13 +38,7 @@ def checked_floats(name: str, array: FloatArray, shape: tuple[int | None, ...]) 
 def checked_indices(
     name: str, array: IntArray, upper: int, shape: tuple[int | None, ...]
 ) -> IntArray:
-    """A read-only copy as int64, its shape and ``0 <= array < upper`` checked.
-
-    Raises
-    ------
-    InputError
-        Another shape or type, or an entry out of range.
-    """
+    """A read-only copy as int64; InputError on a wrong shape or type, or outside [0, upper)."""
     given = np.asarray(array)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"{name}: {given.dtype}, expected integers")
@@ -66,7 +60,7 @@ def _check_shape(name: str, shape: tuple[int, ...], expected: tuple[int | None, 
 
 
 class BandGrid(NamedTuple):
-    """A grid of two leaflets from annulus to free edge, in material coordinates.
+    """A grid of leaflets from annulus to free edge, in material coordinates.
 
     Attributes
     ----------
@@ -83,8 +77,8 @@ class BandGrid(NamedTuple):
     region: IntArray
 
 
-def band_grid(columns: int, rows: int) -> BandGrid:
-    """A grid of ``columns x rows`` vertices from the annulus to the free edge of two leaflets.
+def band_grid(columns: int, rows: int, leaflets: int = 2) -> BandGrid:
+    """A grid of ``columns x rows`` vertices from annulus to free edge, equal columns per leaflet.
 
     Vertex ``j * columns + i`` is column i, row j: the first row is the annulus, the last one the
     free edge. Normals of triangles point to the ventricle where phi runs as in the template.
@@ -98,7 +92,7 @@ def band_grid(columns: int, rows: int) -> BandGrid:
         phi=360.0 * i / columns,
         s=j / (rows - 1),
         triangles=np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]),
-        region=np.tile((2 * cell_i >= columns).astype(np.int64), 2),
+        region=np.tile(leaflets * cell_i // columns, 2),
     )
 
 
@@ -112,7 +106,7 @@ def vertex_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def lumped_areas(vertices: FloatArray, triangles: IntArray) -> FloatArray:
-    """Area ``(n,)`` in mm^2 that belongs to each vertex: a third of each adjacent triangle."""
+    """Area ``(n,)`` mm² of each vertex: a third of each adjacent triangle."""
     share = np.repeat(areas(vertices, triangles) / 3, 3)
     total = np.bincount(triangles.ravel(), share, minlength=len(vertices))
     return np.asarray(total, dtype=np.float64)
@@ -140,18 +134,18 @@ class LeafletSurface:
     triangles : ndarray
         ``(m, 3)``; their normals point to the ventricle.
     region : ndarray
-        ``(m,)`` index into ``region_names``: which leaflet a triangle belongs to.
+        ``(m,)`` leaflet of each triangle, an index into ``region_names``.
     region_names : tuple of str
     fibre : ndarray
-        ``(n, 3)`` unit vectors, the collagen direction at the vertices.
+        ``(n, 3)`` unit vectors, collagen direction at the vertices.
     thickness : ndarray
         ``(n,)`` mm, positive.
 
     Raises
     ------
     InputError, GeometryError
-        On wrong shapes, values that are not finite, unknown regions, thickness that is not
-        positive, fibres without direction.
+        Wrong shapes, values that are not finite, unknown regions, thickness that is not positive,
+        or fibres without direction.
     """
 
     vertices: FloatArray
@@ -198,7 +192,7 @@ class LeafletSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chordae:
-    """Chordae tendineae: one straight cable from a papillary tip to a point of the leaflets each.
+    """Chordae tendineae: straight cables from a papillary tip to a point of the leaflets.
 
     Attributes
     ----------
@@ -252,8 +246,8 @@ class Motion:
     Attributes
     ----------
     phase : ndarray
-        ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame); the loading
-        decides how phase runs in time.
+        ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame). The loading
+        defines the phase as a function of time.
     annulus : ndarray
         ``(f, n_annulus, 3)`` mm; entry 0 equals the reference positions.
     papillary_tips : ndarray
@@ -277,7 +271,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Valve:
-    """One valve: what the images show of it, in one resolution.
+    """One valve in one resolution.
 
     Attributes
     ----------
@@ -290,7 +284,7 @@ class Valve:
         ``(n_tips, 3)`` mm in the reference frame.
     chordae : Chordae
     motion : Motion
-        Of exactly the vertices ``annulus`` and of the tips.
+        Of the vertices ``annulus`` and of the tips.
     """
 
     surface: LeafletSurface
@@ -314,62 +308,46 @@ class Valve:
             raise InputError(
                 f"chord {i} starts at papillary tip {self.chordae.tip[i]}, but there are {n_tips}"
             )
-        if self.motion.annulus.shape[1] != len(self.annulus):
-            raise InputError(
-                f"motion moves {self.motion.annulus.shape[1]} annulus points, the valve has "
-                f"{len(self.annulus)}"
-            )
-        if self.motion.papillary_tips.shape[1] != n_tips:
-            raise InputError(
-                f"motion moves {self.motion.papillary_tips.shape[1]} papillary tips, the valve has "
-                f"{n_tips}"
-            )
-        self._check_chordae_connected()
-
-    def _check_chordae_connected(self) -> None:
-        """Raise unless every chord ends on the leaflets (within 3 mm of a vertex)."""
-        for i, point in enumerate(self.chordae.insertion):
-            gap = float(np.min(np.linalg.norm(self.surface.vertices - point, axis=1)))
-            if gap > 3.0:
+        for what, moved, own in (
+            ("annulus points", self.motion.annulus.shape[1], len(self.annulus)),
+            ("papillary tips", self.motion.papillary_tips.shape[1], n_tips),
+        ):
+            if moved != own:
+                raise InputError(f"motion moves {moved} {what}, the valve has {own}")
+        if len(self.chordae):
+            surface = self.surface.vertices, self.surface.triangles
+            gap = closest_points(self.chordae.insertion, *surface).distance
+            if np.max(gap) > MAX_CHORD_GAP_MM:
+                i = int(np.argmax(gap))
                 raise GeometryError(
-                    f"chord {i} is disconnected: its insertion is {gap:.1f} mm from the leaflets"
+                    f"chord {i} is disconnected: its insertion is {gap[i]:.1f} mm from the leaflets"
                 )
 
 
 class MaterialSurface(Protocol):
-    """A valve with two leaflets in material coordinates, as template and band are.
-
-    Attributes
-    ----------
-    region_names : tuple of str
-        The leaflet of phi in (0, 180) degrees, and that of (180, 360).
-    """
+    """A valve in material coordinates; leaflet k of n has phi from ``360 k / n`` degrees on."""
 
     @property
     def region_names(self) -> tuple[str, ...]:
-        """Names of the two leaflets."""
-        ...
+        """Names of the leaflets."""
 
     def position(
         self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
     ) -> FloatArray:
         """Reference positions ``(..., 3)`` mm of material points."""
-        ...
 
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""
-        ...
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Thickness ``(k,)`` mm."""
-        ...
 
 
 def sampled_valve(
     shape: MaterialSurface,
     columns: int,
     rows: int,
-    hung: Callable[[FloatArray], tuple[FloatArray, Chordae, Motion]],
+    attached: Callable[[FloatArray], tuple[FloatArray, Chordae, Motion]],
 ) -> Valve:
     """A valve on a grid of ``columns x rows`` vertices.
 
@@ -377,23 +355,25 @@ def sampled_valve(
     ----------
     shape : MaterialSurface
     columns, rows : int
-        Vertices around the valve, even and at least 8, and from annulus to free edge, at least 3.
-    hung : callable
+        Vertices around the valve, at least 8 and as many for each leaflet, and from annulus to free
+        edge, at least 3.
+    attached : callable
         Angles ``(columns,)`` of the annulus' vertices -> papillary tips ``(t, 3)`` mm, chordae, and
         the motion of annulus and tips.
 
     Raises
     ------
     InputError
-        If the numbers are too small or odd.
+        If the numbers are too small or do not divide among the leaflets.
     """
-    if columns < 8 or columns % 2 or rows < 3:
+    leaflets = len(shape.region_names)
+    if columns < 8 or columns % leaflets or rows < 3:
         raise InputError(
-            f"valve of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
+            f"valve of {columns} x {rows} vertices, expected a multiple of {leaflets} >= 8 x >= 3"
         )
-    phi, s, triangles, region = band_grid(columns, rows)
-    # Vertices between the leaflets are the second one's.
-    of_vertex = np.where((phi > 0) & (phi < 180), 0, 1)
+    phi, s, triangles, region = band_grid(columns, rows, leaflets)
+    # A vertex between two leaflets belongs to the later one, at phi = 0 to the last one.
+    of_vertex = np.where(phi > 0, (phi * leaflets / 360.0).astype(np.int64), leaflets - 1)
     surface = LeafletSurface(
         shape.position(phi, s),
         triangles,
@@ -403,5 +383,4 @@ def sampled_valve(
         shape.thickness(phi, s),
     )
     annulus = np.arange(columns)
-    free_edge = annulus + (rows - 1) * columns
-    return Valve(surface, annulus, free_edge, *hung(phi[:columns]))
+    return Valve(surface, annulus, annulus + (rows - 1) * columns, *attached(phi[:columns]))

@@ -1,19 +1,19 @@
-"""Random anatomies around a given one, for a population of simulated valves.
+"""Random anatomies around a given one, for populations of simulated valves.
 
-A size common to the whole valve, and what differs from valve to valve beyond it, are drawn as
-normal deviates z, none beyond two standard deviations. In the logarithms of the parameters:
+The overall size and the other deviations are normal deviates z, truncated at two standard
+deviations. In the logarithms of the parameters,
 
-* the annulus, and the free edge that hangs from it, take the size and a share of their own along
-  each direction, so that a valve that is wide is wide at its edge too;
-* leaflets take half of both and a share of their own: they vary less than annuli do;
-* papillary tips take the size and a shift of their own;
-* thickness (both leaflets alike), saddle and contraction go their own ways.
+* annulus and free edge have the size and one deviation along each direction in common, so that a
+  wide valve is wide at its edge too;
+* leaflets have half of both, and a deviation of their own: they vary less than annuli;
+* papillary tips have the size and a shift of their own;
+* thickness (equal for both leaflets), saddle and contraction vary independently.
 
 Sources. Annulus diameters of normal valves have standard deviations of 12 to 14 % (24 ± 3 mm and
-30.8 ± 4.4 mm antero-posterior, 35 ± 5 mm commissural), which include errors of measurement; at a
-scale of 1 they are about half of that here (6 %), at 2 all of it. Anterior leaflets are 20 to 25 mm
-long, 11 % to both sides of their middle, which is the farthest that a leaflet's length gets at a
-scale of 1; tips lie 13 to 19 mm aside. The other spreads are choices.
+30.8 ± 4.4 mm antero-posterior, 35 ± 5 mm commissural), measurement errors included; here they have
+6 % at a scale of 1 and 12 % at 2. Anterior leaflets are 20 to 25 mm long, that is ± 11 %, which is
+the largest deviation at a scale of 1. Tips are 13 to 19 mm from the middle. The other spreads are
+choices.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 
 LIMIT = 2.0
-"""Standard deviations beyond which nothing is drawn."""
+"""Truncation of the normal deviates, in standard deviations."""
 
 MAX_REFUSED = 100
-"""Shapes refused in a row before the scale is held to be too large."""
+"""Number of successive refused shapes after which the scale counts as too large."""
 
 SIZE, AP, COMMISSURAL = 0.05, 0.035, 0.03
 LEAFLET, EDGE, SADDLE, THICKNESS, CONTRACTION = 0.01, 0.04, 0.10, 0.07, 0.15
 """Standard deviations of logarithms."""
 
 TIP = 0.7
-"""mm, standard deviation of each coordinate of a papillary tip beyond the size."""
+"""Standard deviation (mm) of each coordinate of a papillary tip, in addition to the size."""
 
 SAMPLING = (112, 29)
-"""Vertices at which a shape is tried."""
+"""Vertices of the valve that tests whether a shape is admissible."""
 
 
 def vary(
     parameters: TemplateParameters, rng: np.random.Generator, scale: float = 1.0
 ) -> TemplateParameters:
-    """A random anatomy around a given one, drawn until the template takes the shape.
+    """Draw a random anatomy around a given one until the template accepts it.
 
     Parameters
     ----------
     parameters : TemplateParameters
-        The median anatomy. Its chordae keep their places; their rest lengths follow the shape.
+        The median anatomy. Its chordae keep their insertions; their rest lengths follow the shape.
     rng : numpy.random.Generator
     scale : float
         Factor on all standard deviations.

@@ -1,10 +1,9 @@
-"""Two thick leaflets on a grid, as signed distances, and the closed surface that both have.
+"""Two thick leaflets on a grid, as signed distances, and their common closed surface.
 
-Where two leaflets meet they are one piece of tissue, at a commissure, or only in contact. A
-segmentation does not distinguish the two. An open valve meets at the commissures alone, and how far
-down from the annulus it does so is a length that does not change. In a closed valve the leaflets
-are therefore cut apart wherever they meet farther from the annulus, or farther in than they are
-thick.
+Where two leaflets meet they are either one piece of tissue (at a commissure) or only in contact,
+and a segmentation does not tell which. In an open valve they meet at the commissures alone, and how
+far down from the annulus they do is a length that does not change. So the leaflets of a closed
+valve are cut apart wherever they meet farther from the annulus, or deeper than their thickness.
 """
 
 from __future__ import annotations
@@ -31,23 +30,24 @@ from mvest.valve.geometry.triangles import euler_number, surface_edges
 marching_cubes: Any = measure.marching_cubes
 MARGIN_MM = 3.0
 STEP_MM = 0.4
-"""mm, of the grid on which a surface is drawn."""
+"""Grid step (mm) for open leaflets."""
 CLOSED_STEP_MM = 0.2
-"""The same where leaflets are cut apart: a cut has to leave most of a leaflet of one millimetre."""
+"""Grid step (mm) if leaflets are cut apart: a cut must leave most of a leaflet 1 mm thick."""
 CUT_STEPS = 2.0
-"""Width of the cut between leaflets in contact, in steps of the grid. It is not closed again: a
-wall that nothing touches loses as much by smoothing, and the middle stays where it is."""
+"""Width of the cut between leaflets in contact, in grid steps. It stays open: a free wall loses as
+much by smoothing, so the middle stays where it is."""
 SEAM_REACH_MM = 2.0
-"""From where leaflets meet as one piece, how far they are drawn as one."""
+"""Distance (mm) from the seam up to which leaflets are one piece."""
 SEAM_THICKNESSES = 2.5
-"""How wide a seam is at most; leaflets that meet farther in are in contact. Of the thickness by the
-mean distance, which rims and voxels make a quarter too small: too narrow a seam has holes."""
+"""Largest width of a seam over the thickness; beyond it leaflets are in contact. The thickness is
+estimated from the mean distance, which rims and voxels make a quarter too small; too narrow a seam
+leaves holes."""
 LAYER_MM = 0.5
-"""Of depth below the annulus, in which the outermost point of a seam is sought."""
+"""Depth (mm) of the layers below the annulus in which the outermost point of a seam is found."""
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
-"""Of a voxel, by which leaflets are made thicker until they have no more holes than an orifice."""
+"""Offsets of the walls, in voxels, that are tried until the orifice is the only hole."""
 ON_GRID = 0.02
-"""Of a step: the least distance that a point of the grid has from the surface."""
+"""Least distance of a grid point from the surface, in steps."""
 MAX_VOXELS = 4 * 10**7
 
 
@@ -58,15 +58,15 @@ class LeafletFields:
     Attributes
     ----------
     distance : (2, I, J, K) or (1, I, J, K) mm
-        To the anterior and to the posterior leaflet alone, or to both where they are one label.
+        To the anterior and to the posterior leaflet, or to both if they share one label.
     union : (I, J, K) mm
-        To both together.
+        To both leaflets together.
     step : float
-        mm between neighbouring points of the grid.
+        mm between grid points.
     blur_mm : float
-        Standard deviation of the smoothing that the distances went through.
+        Standard deviation of the smoothing of the distances.
     voxel_mm : float
-        Size of the voxels that they come from, 0 for surfaces.
+        Size of the original voxels, 0 for surfaces.
     """
 
     distance: FloatArray
@@ -76,9 +76,9 @@ class LeafletFields:
     voxel_mm: float
 
     def label(self, points: FloatArray) -> IntArray:
-        """The nearer leaflet ``(k,)`` of points, 0 anterior and 1 posterior.
+        """The nearer leaflet ``(k,)``, 0 anterior and 1 posterior, of points ``(k, 3)``.
 
-        Points ``(k, 3)`` are mm from the first point of the grid.
+        Points are in mm from the first grid point.
         """
         at = (points / self.step).T
         apart = self.distance[0] - self.distance[1]
@@ -86,7 +86,7 @@ class LeafletFields:
         return np.asarray((between < 0).astype(np.int64))
 
     def true_thickness(self, thickness: FloatArray) -> FloatArray:
-        """What tissue of a thickness seen in the smoothed distances has.
+        """True thickness (mm) of tissue, given its thickness in the smoothed distances.
 
         The distance ``a - |x|`` from the middle of a sheet of thickness 2 a, smoothed by a normal
         distribution, is zero where the mean of ``|x + blur z|`` is a.
@@ -100,18 +100,18 @@ class LeafletFields:
 
 
 class ThickLeaflets(NamedTuple):
-    """The closed surface of two leaflets, with a cut between them where they are in contact.
+    """The closed surface of two leaflets, cut apart in contact.
 
     Attributes
     ----------
     vertices, triangles
         ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``.
     seams : (2,) mm
-        How far down from the annulus the leaflets are one piece, on the side of each tip.
+        Length down from the annulus over which the leaflets are one piece, on the side of each tip.
     grown_mm : float
-        By which all walls lie too far out, since the leaflets had holes otherwise.
+        Outward offset of all walls that was needed to close holes.
     derived : tuple of str
-        What was done so that it is one closed surface.
+        Changes that were needed for one closed surface.
     """
 
     vertices: FloatArray
@@ -132,20 +132,20 @@ def fields_of_masks(
     Parameters
     ----------
     masks
-        ``(I, J, K)`` each, the voxels of the anterior and of the posterior leaflet, or of both.
+        ``(I, J, K)`` each: voxels of the anterior and of the posterior leaflet, or of both.
     spacing
         ``(3,)`` mm.
     blur
-        Standard deviation of the smoothing in voxels.
+        Standard deviation of the smoothing, in voxels.
     step_mm
-        Largest step of the finer grid, such as `STEP_MM` or, of a closed valve, `CLOSED_STEP_MM`.
+        Largest grid step: `STEP_MM`, or `CLOSED_STEP_MM` for a closed valve.
 
     Returns
     -------
     LeafletFields
-        On a finer grid about the leaflets.
+        On a finer grid around the leaflets.
     ndarray
-        ``(3,)`` where its first point lies, in voxels.
+        ``(3,)`` position of its first point, in voxels.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def fields_of_masks(
         part[inside] = mask[box]
         inner = ndimage.distance_transform_edt(part, sampling=spacing)
         outer = ndimage.distance_transform_edt(~part, sampling=spacing)
-        # From a centre to the wall of its voxel it is half a voxel less than to the next centre.
+        # The wall of a voxel is half a voxel nearer than the next centre.
         signed = np.where(part, inner - 0.5 * voxel, 0.5 * voxel - outer)
         fine = ndimage.map_coordinates(signed, at, order=1, mode="nearest")
         return np.asarray(ndimage.gaussian_filter(fine, blur * voxel / step))
@@ -194,17 +194,16 @@ def fields_of_masks(
 def inside_surfaces(
     surfaces: Sequence[tuple[FloatArray, IntArray]], step_mm: float
 ) -> tuple[list[BoolArray], FloatArray]:
-    """Which points of one grid lie inside each of some closed surfaces.
+    """Which points of a common grid lie inside each of several closed surfaces.
 
-    Near a surface the side follows from its normal at the closest point; what that encloses is
-    inside, too.
+    Near a surface its normal at the closest point decides; holes are then filled.
 
     Parameters
     ----------
     surfaces
         Vertices ``(n, 3)`` mm and triangles ``(m, 3)``, normals outwards.
     step_mm
-        Between neighbouring points.
+        Grid step.
 
     Returns
     -------
@@ -239,28 +238,29 @@ def inside_surfaces(
 def thick_leaflets(
     fields: LeafletFields, tips: FloatArray, seams: FloatArray | None = None
 ) -> ThickLeaflets:
-    """The surface of both leaflets, one piece at the commissures and cut apart in contact.
+    """The closed surface of both leaflets: one piece at the commissures, cut apart in contact.
 
     Parameters
     ----------
     fields
     tips
-        ``(2, 3)`` papillary tips, mm from the first point of the grid.
+        ``(2, 3)`` papillary tips, mm from the first grid point.
     seams
-        ``(2,)`` mm, how far down from the annulus the leaflets are one piece, on the side of each
-        tip, such as `ThickLeaflets.seams` of an open valve. Without it, wherever they meet; and so
-        for one label of both leaflets.
+        ``(2,)`` mm, `ThickLeaflets.seams` of the open valve. Without it, and with one label for
+        both leaflets, the leaflets are one piece wherever they meet.
 
     Raises
     ------
     GeometryError
-        The leaflets do not meet, or have no orifice or more holes, whichever way they are drawn.
+        The leaflets do not meet, or the orifice is not their only hole at any of `LEVELS`.
     """
     if len(fields.distance) == 1:
         meet, half = np.zeros(fields.union.shape, dtype=np.bool_), fields.union
         joined, lengths = ~meet, np.zeros(2)
     else:
-        meet, half = _meet(fields)
+        half = 0.5 * (fields.distance[0] - fields.distance[1])
+        near = np.minimum(*fields.distance) > -fields.voxel_mm - fields.step
+        meet = (np.abs(half) <= fields.step) & (fields.union > 0) & near
         if not meet.any():
             raise GeometryError("the leaflets meet nowhere, expected at two commissures")
         joined, lengths = _joined(fields, meet, tips, seams)
@@ -270,7 +270,7 @@ def thick_leaflets(
         grown = level * fields.voxel_mm
         together = fields.union + grown
         together = np.where(joined, together, np.minimum(together, np.abs(half) - cut))
-        # No corner at a point of the grid, where triangles would have no area.
+        # A surface through a grid point would have triangles without area.
         close = np.abs(together) < ON_GRID * fields.step
         together = np.where(close, np.copysign(ON_GRID * fields.step, together), together)
         vertices, faces, _, _ = marching_cubes(together, 0.0, spacing=(fields.step,) * 3)
@@ -299,23 +299,14 @@ def thick_leaflets(
     return ThickLeaflets(vertices, triangles, lengths, grown, tuple(derived))
 
 
-def _meet(fields: LeafletFields) -> tuple[BoolArray, FloatArray]:
-    """Points of the grid where the leaflets meet, and half the difference of their distances."""
-    half = 0.5 * (fields.distance[0] - fields.distance[1])
-    near = np.minimum(*fields.distance) > -fields.voxel_mm - fields.step
-    return (np.abs(half) <= fields.step) & (fields.union > 0) & near, half
-
-
 def _joined(
     fields: LeafletFields, meet: BoolArray, tips: FloatArray, seams: FloatArray | None
 ) -> tuple[BoolArray, FloatArray]:
-    """Points of the grid near to where leaflets are one piece, and the lengths of both seams.
+    """Grid points where the leaflets are one piece, and the lengths of both seams.
 
-    All of them if the leaflets meet nowhere else.
-
-    A seam begins where the leaflets meet farthest up and out to the side of its papillary tip, and
-    follows what meets farthest out from there. All that meets farther in, where leaflets fold on
-    each other beside a commissure, is in contact.
+    A seam starts where the leaflets meet farthest up and out on the side of its papillary tip, and
+    follows the outermost meeting points. Leaflets that meet farther in, as folds next to a
+    commissure do, are in contact. If nothing is in contact, all grid points are returned.
     """
     where = np.argwhere(meet) * fields.step
     tissue = np.argwhere(fields.union > 0).mean(axis=0) * fields.step
@@ -352,7 +343,7 @@ def _joined(
 
 
 def _behind_outermost(depth: FloatArray, outward: FloatArray) -> FloatArray:
-    """How far ``(k,)`` mm points lie behind that farthest out at about their depth ``(k,)`` mm."""
+    """Distance ``(k,)`` mm of points behind the outermost one of about the same depth."""
     layer = np.floor((depth - depth.min()) / LAYER_MM).astype(np.int64)
     farthest = np.full(layer.max() + 1, -np.inf)
     np.maximum.at(farthest, layer, outward)
@@ -360,6 +351,7 @@ def _behind_outermost(depth: FloatArray, outward: FloatArray) -> FloatArray:
 
 
 def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray, int]:
+    """The largest connected piece, and the number of the others."""
     edges = surface_edges(triangles)
     n = len(vertices)
     graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))

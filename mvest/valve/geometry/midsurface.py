@@ -1,10 +1,10 @@
 """The midsurface of thick leaflets: from a closed surface to a band with a thickness.
 
-The two walls of the closed surface (`mvest.valve.geometry.walls`) are bands with the same two
-edges. Points of both with the same harmonic coordinates face each other, and the middles of such
-pairs are a first midsurface. It is then moved to where both walls are equally far, which is the
-medial sheet of the tissue. Along the edges, where the nearest wall is the rim, the thickness is
-that of the tissue next to it.
+The two walls of the closed surface (`mvest.valve.geometry.walls`) are bands with common edges.
+Points of both walls with equal harmonic coordinates face each other, and the middles of such pairs
+form a first midsurface. It is then moved to where both walls are equally far away: the medial sheet
+of the tissue. Along the edges, where the nearest wall is the rim, the thickness is taken from the
+tissue next to it.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from mvest.valve.geometry.triangles import area_vectors
 from mvest.valve.geometry.walls import Wall, closed_band, walls
 
 EDGE_MM = 1.2
-"""Edge length of the triangles, on average."""
+"""Mean edge length of the triangles, mm."""
 ROUNDS = 8
-"""In which the sheet is drawn to the middle and its vertices are spread again."""
+"""Iterations of centring the sheet and spreading its vertices."""
 MAX_STEP = 0.5
-"""mm, of one step to the middle."""
+"""Largest centring step, mm."""
 RIM_SHARE = 0.8
-"""Of the thickness: within this distance of an edge the nearest wall is the rim."""
+"""Distance from an edge, over the thickness, within which the nearest wall is the rim."""
 FINE = 200
 """Samples of a line from annulus to free edge before its vertices are spread."""
 TIP_CONE = 60.0
-"""Degrees round the direction of a papillary tip within which its commissure lies."""
+"""Degrees around the direction of a papillary tip within which its commissure lies."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Midsurface:
     Attributes
     ----------
     vertices : (n, 3) mm
-        A grid: vertex ``j * columns + i`` is column i, row j, the first row the annulus and the
+        A grid: vertex ``j * columns + i`` is column i, row j. The first row is the annulus, the
         last one the free edge; the commissures are columns 0 and ``columns / 2``.
     triangles : (m, 3)
         Facing the ventricle.
@@ -60,7 +60,7 @@ class Midsurface:
     annulus, free_edge : (columns,)
         Vertices in loop order.
     derived : tuple of str
-        What was not given but follows from the shape.
+        Properties that were not given and follow from the shape.
     """
 
     vertices: FloatArray
@@ -73,7 +73,7 @@ class Midsurface:
 
     @property
     def commissures(self) -> IntArray:
-        """Vertices ``(2, 2)``: of each commissure that on the annulus and that on the free edge."""
+        """Vertices ``(2, 2)``: for each commissure those on the annulus and on the free edge."""
         columns = len(self.annulus)
         return np.column_stack([self.annulus, self.free_edge])[[0, columns // 2]]
 
@@ -84,7 +84,7 @@ class Midsurface:
         return np.asarray(_arc_lengths(grid)[-1].reshape(2, -1).max(axis=1))
 
     def exchanged(self) -> Midsurface:
-        """The same with the anterior leaflet called posterior, and the other way round."""
+        """The same with anterior and posterior leaflet exchanged."""
         columns = len(self.annulus)
 
         def turned(values: FloatArray) -> FloatArray:
@@ -94,10 +94,10 @@ class Midsurface:
         return replace(self, vertices=turned(self.vertices), thickness=turned(self.thickness))
 
     def smoothed(self, width_mm: float) -> tuple[Midsurface, float]:
-        """The same averaged round the valve, and by how many mm a vertex moves at most.
+        """The same smoothed around the valve, and the largest move (mm) of a vertex.
 
-        The standard deviation of the weights is `width_mm` along the annulus, and shorter in
-        proportion on shorter lines, such as the free edge.
+        The Gaussian weights have the standard deviation `width_mm` along the annulus, and
+        proportionally less on shorter lines such as the free edge.
         """
         grid = self.vertices.reshape(-1, len(self.annulus), 3)
         step = np.linalg.norm(np.roll(grid[0], -1, axis=0) - grid[0], axis=1).mean()
@@ -116,29 +116,29 @@ def midsurface(
     label: Callable[[FloatArray], IntArray] | None = None,
     edge_mm: float = EDGE_MM,
 ) -> Midsurface:
-    """The midsurface of the closed surface of two thick leaflets round one orifice.
+    """The midsurface of two thick leaflets around one orifice.
 
     Parameters
     ----------
     vertices, triangles
         ``(n, 3)`` mm and ``(m, 3)``.
     tips
-        ``(2, 3)`` mm, papillary tips: the free edge is the loop nearer to them, and a commissure
-        lies where the leaflets are shortest on the side of each.
+        ``(2, 3)`` mm, papillary tips. The free edge is the loop nearer to them, and each commissure
+        lies where the leaflets are shortest on the side of a tip.
     commissures
         ``(2, 3)`` mm, if known.
     anterior
-        ``(3,)`` mm, a point nearer to the anterior leaflet's part of the annulus, if known.
-        Otherwise the anterior leaflet is the taller one.
+        ``(3,)`` mm, a point near the anterior annulus, if known. Otherwise the anterior leaflet is
+        the taller one.
     label
         Leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known; then nothing is derived.
     edge_mm
-        Edge length of the triangles, on average.
+        Mean edge length of the triangles.
 
     Raises
     ------
     GeometryError
-        No closed surface of one thin band, or leaflets that cannot be told apart.
+        The surface is no closed thin band, or the leaflets cannot be distinguished.
     """
     first, second = walls(*closed_band(vertices, triangles))
     derived: list[str] = []
@@ -182,10 +182,10 @@ def _length(loop: FloatArray) -> float:
 
 
 class _PairedWalls:
-    """Both walls in coordinates that agree along their common edges.
+    """Both walls in coordinates (angle in rad, s) that agree along their common edges.
 
-    A place is an angle (rad) and s from annulus to free edge. The harmonic angles of the walls
-    differ along the edges; between them the difference is taken to be linear in s.
+    The harmonic angles of the two walls differ along the edges; in between, the difference is
+    interpolated linearly in s.
     """
 
     def __init__(self, first: Wall, second: Wall, annulus: int) -> None:
@@ -205,7 +205,7 @@ class _PairedWalls:
                 for wall, coordinates in zip(self._walls, self._coordinates, strict=True)
             ]
             if end == annulus:
-                # The angle of each wall has a beginning of its own.
+                # The angles of the two walls have different origins.
                 beginning = float(np.mean(own[0] - own[1]))
             shifted = own[1] + beginning
             turns = 2 * np.pi * np.round(np.mean(own[0] - shifted) / (2 * np.pi))
@@ -231,7 +231,7 @@ class _PairedWalls:
 
 
 def _periodic(angle: FloatArray, common: FloatArray, own: FloatArray) -> FloatArray:
-    """The own angle at common ones, both of which rise (or fall) by a turn along the table."""
+    """A wall's own angle at common angles; both change by one turn along the table."""
     order = np.argsort(common, kind="stable")
     x, y = common[order], np.maximum.accumulate(np.sort(own))
     turn = 2 * np.pi
@@ -244,9 +244,9 @@ def _periodic(angle: FloatArray, common: FloatArray, own: FloatArray) -> FloatAr
 def _label_seams(
     lines: FloatArray, angle: FloatArray, label: Callable[[FloatArray], IntArray]
 ) -> FloatArray:
-    """Angles ``(2, 2)`` of the seams, by end and commissure; anterior from the first on.
+    """Angles ``(2, 2)`` of the seams, by end and commissure; the first one starts the anterior.
 
-    Along each level line the labels are an arc, whose share and centre give both its ends.
+    The anterior label is an arc of each level line; its share and centre give both ends.
     """
     front = label(lines.reshape(-1, 3)).reshape(lines.shape[:2]) == 0
     share = front.mean(axis=1)
@@ -279,7 +279,7 @@ def _short_seams(
     anterior: FloatArray | None,
     derived: list[str],
 ) -> FloatArray:
-    """As `_label_seams`, where the leaflets are short."""
+    """As `_label_seams`, with seams where the leaflets are short."""
     annulus = lines[0]
     smooth = gaussian_filter1d(heights, max(1.0, len(angle) / 60), mode="wrap")
     if commissures is not None:
@@ -306,7 +306,7 @@ def _short_seams(
 
 
 def _shortest(annulus: FloatArray, heights: FloatArray, tips: FloatArray) -> IntArray:
-    """Two columns where the leaflets are shortest, each on the side of a tip."""
+    """Two columns where the leaflets are shortest, one on the side of each tip."""
     centre = annulus.mean(axis=0)
     normal = np.cross(annulus - centre, np.roll(annulus, -1, axis=0) - centre).sum(axis=0)
     normal /= np.linalg.norm(normal)
@@ -319,7 +319,7 @@ def _shortest(annulus: FloatArray, heights: FloatArray, tips: FloatArray) -> Int
 
 
 def _sheet(pair: _PairedWalls, seams: FloatArray, columns: int, rows: int) -> FloatArray:
-    """A first midsurface ``(rows, columns, 3)``, its columns by shares of the edges' arcs."""
+    """A first midsurface ``(rows, columns, 3)``, with columns at equal arc lengths of the edges."""
     angles = []
     for end in (0, 1):
         begin, middle = seams[end]

@@ -1,8 +1,8 @@
-"""Signed distances to a surface, and offsets from a curve, that move; and their derivatives.
+"""Signed distances to a moving surface and offsets from a moving curve, with their derivatives.
 
-Exact geometry on plain arrays. Facets have creases, across which derivatives jump, and a border,
-beyond which a distance has another sign. Smoothed over a width they have neither: a filter that
-uses the derivatives then converges, and its posterior is what it takes it for.
+Distances to facets have derivatives that jump at creases and a sign that flips beyond the border.
+Smoothed over a width they have neither problem, so that a filter that uses the derivatives
+converges to its true posterior.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.triangles import area_vectors
 
 TANGENT_REACH = 6.0
-"""Standard deviations of a curve's points over which its direction is taken, to each side: the
-direction is then known to 1 / (6 sqrt(2)) rad, and 1.4 % of the information across it is lost."""
+"""Distance to each side over which the direction of a curve is measured, in standard deviations of
+its points: the direction is then known to 1 / (6 sqrt(2)) rad, which loses 1.4 % of the information
+across it."""
 
 REACH = 5.5
-"""Widths beyond the nearest triangle from which on triangles do not count: less than 3e-7."""
+"""Distance beyond the nearest triangle, in widths, where weights are cut off (below 3e-7)."""
 
 
 def smooth_distances(
     points: FloatArray, vertices: FloatArray, triangles: IntArray, width: float
 ) -> tuple[FloatArray, list[csr_array]]:
-    """Signed distances of points to a surface that is smoothed over a width, and their derivatives.
+    """Signed distances of points to a surface smoothed over a width, and their derivatives.
 
-    Triangles with the area vectors a and the middles p count by ``g = exp(-|x - p|² / 2 w²)``::
+    Triangles with area vectors a and middles p have the weights ``g = exp(-|x - p|² / 2 w²)``::
 
         d = sum g a . (x - p) / |V|,   V = sum g a,   u = V / |V|
         dd = sum (g da . y - g a . dp + dg a . y) / |V|,   y = x - p - d u
 
-    (implicit moving least squares: Kolluri, ACM Trans. Algorithms 4 (2008) 18). It bends with the
-    surface and has neither creases where facets meet nor, beyond a border, another sign: the
-    surface goes on there as it ends. On a bend of radius r in both directions it is off by w²/r.
+    (implicit moving least squares: Kolluri, ACM Trans. Algorithms 4 (2008) 18). The surface is
+    continued beyond its border as it ends. On a sphere of radius r the distance is off by w²/r.
 
     Parameters
     ----------
     points : (q, 3) mm
     vertices : (n, 3) mm
     triangles : (m, 3)
-        All turning one way, not larger than the width.
+        Consistently oriented, not larger than the width.
     width : float
         w, mm.
 
@@ -50,7 +50,7 @@ def smooth_distances(
     distance : (q,) mm
         Positive on the side of the normals.
     derivative : list of three (q, n) sparse
-        By the x, y and z of the vertices.
+        With respect to the x, y and z of the vertices.
     """
     corner = vertices[triangles]
     middle, area = corner.mean(axis=1), area_vectors(vertices, triangles)
@@ -79,11 +79,11 @@ def smooth_distances(
 
 
 def across_curve(curve: FloatArray, std: float) -> FloatArray:
-    """Two unit vectors ``(j, 3, 2)`` across a closed curve as it was seen, at each of its points.
+    """Two unit vectors ``(j, 3, 2)`` across an observed closed curve, at each of its points.
 
-    The direction is that from a point before to a point after, ``TANGENT_REACH`` standard
-    deviations away but no more than an eighth of the points. Where it is wrong by an angle, one of
-    the components is too small by its cosine: information is lost, and none made up.
+    The tangent runs from a point before to a point after, ``TANGENT_REACH`` standard deviations
+    away but at most an eighth of the points. An error of the tangent makes one component too small
+    by its cosine: information is lost, never invented.
     """
     for reach in range(1, max(1, len(curve) // 8) + 1):
         span = np.roll(curve, -reach, axis=0) - np.roll(curve, reach, axis=0)
@@ -101,15 +101,13 @@ def smooth_offsets(
     width: float,
     own: BoolArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Offsets ``(2 j,)`` mm of seen points from a closed curve that is smoothed over a width.
+    """Offsets ``(2 j,)`` mm of observed points from a closed curve smoothed over a width.
 
-    Points p of the curve, r = x - p away, count by how near they are to the plane across the curve
-    as it was seen, of normal n, and only if the curve is not nearer elsewhere::
+    Points p of the curve, with r = x - p, are weighted by their distance from the plane (normal n)
+    across the observed curve, and from the point::
 
         h = sum g A' r / sum g,   g = exp(-(n . r)² / 2 w² - |r|² / 2 (3 w)²)
         dh = sum g (A' r - h) ((n . r) n + r / 9) . dp / w² / sum g - sum g A' dp / sum g
-
-    It bends with the curve, of which the closest point stays at a vertex or slides by turns.
 
     Parameters
     ----------
@@ -117,13 +115,13 @@ def smooth_offsets(
     across : (j, 3, 2)
         Two directions at each point, from `across_curve`.
     loop : (e, 3) mm
-        Points along the curve, nearer to each other than the width.
+        Points along the curve, spaced more closely than the width.
     motion : (e, 3, p)
-        Derivatives of these points by p parameters.
+        Derivatives of these points with respect to p parameters.
     width : float
         w, mm.
     own : (j, e), optional
-        Which points of the curve each may be compared with.
+        Points of the curve with which each observed point may be compared.
 
     Returns
     -------
@@ -156,7 +154,7 @@ def closest_on_loop(
     edge : (j,)
         Edge k runs from vertex k to the next.
     along : (j,)
-        Where the point is along the line of the edge, which ends at 0 and 1.
+        Position along the line of the edge, whose ends are 0 and 1.
     offset : (j, 3) mm
         From the closest point to the point.
     """

@@ -20,9 +20,9 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import directed_edges, surface_edges
 
 SAMPLED_EDGES = 100
-"""Whose boxes are compared with all others, to know how many overlap."""
+"""Number of edges from which the number of overlapping boxes is estimated."""
 Vector = tuple[float, float, float]
-"""A point or a vector in compiled code, where an array of three takes longer than its sums."""
+"""A point or vector in compiled code, where small arrays would be slow."""
 
 
 @njit(cache=True)
@@ -133,11 +133,11 @@ class ClosestPoints:
 
 
 def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> ClosestPoints:
-    """Find the exact closest point of a surface to every one of `points`.
+    """Find the exact closest point of a surface to each of `points`.
 
-    A tree of triangle centroids bounds the search: with the distance ``d`` of one candidate and
-    the largest centroid-to-corner distance ``R``, the closest triangle has its centroid within
-    ``d + R``, so nothing nearer can be missed.
+    A tree of triangle centroids bounds the search: given a candidate at the distance ``d`` and the
+    largest distance ``R`` from a centroid to its corners, the centroid of the closest triangle lies
+    within ``d + R``.
 
     Parameters
     ----------
@@ -185,18 +185,10 @@ def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray
 
 
 def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:
-    """Say whether any triangle edge passes through another triangle (IPC toolkit's check).
+    """Whether an edge of the surface passes through one of its triangles (IPC toolkit).
 
-    Triangles that share a vertex are not tested against each other's common edges, and two
-    overlapping triangles in one plane are not seen; duplicates are found by
-    `mvest.valve.geometry.surface_checks.check_surface`.
-
-    Parameters
-    ----------
-    vertices
-        ``(n, 3)`` mm.
-    triangles
-        ``(m, 3)``.
+    An edge is not tested against triangles that share one of its vertices. Overlapping triangles in
+    one plane are not found; `mvest.valve.geometry.surface_checks.check_surface` finds duplicates.
     """
     if len(triangles) == 0:
         return False
@@ -208,10 +200,10 @@ def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:
 
 
 def overlapping_boxes(vertices: FloatArray, triangles: IntArray) -> float:
-    """About how many pairs of an edge and a triangle have bounding boxes that overlap.
+    """Estimated number of pairs of an edge and a triangle whose bounding boxes overlap.
 
-    That many are looked at for intersections, each with its memory: some ten for an edge of a
-    surface in good order, and as many as there are triangles where these lie across each other.
+    Time and memory of the intersection check are proportional to it. A valid surface has about ten
+    per edge, a tangle of triangles up to one per edge and triangle.
     """
     edges = surface_edges(triangles)
     corners = vertices[triangles]
@@ -228,15 +220,8 @@ def intersecting_triangles(
 ) -> IntArray:
     """Pairs of intersecting triangles ``(k, 2)``, lower number first, each pair once.
 
-    A pair is listed when an edge of one passes through the other; see `has_intersections` for
-    what is not tested.
-
-    Parameters
-    ----------
-    vertices, triangles
-        ``(n, 3)`` mm and ``(m, 3)``.
-    most
-        Edges and triangles with overlapping boxes that are looked at; without it all are.
+    Not everything is tested, see `has_intersections`. At most ``most`` candidate pairs (overlapping
+    boxes of an edge and a triangle) are tested; all by default.
     """
     if not has_intersections(vertices, triangles):
         return np.zeros((0, 2), dtype=np.int64)
@@ -268,12 +253,12 @@ def plane_section(
     Returns
     -------
     segments
-        ``(k, 2, 3)`` mm, one for every triangle cut.
+        ``(k, 2, 3)`` mm, one for each triangle that is cut.
     triangle
-        ``(k,)`` numbers of those triangles.
+        ``(k,)`` these triangles.
     """
     height = (np.asarray(vertices, dtype=np.float64) - origin) @ normal
-    # A vertex exactly on the plane counts as above it, so that no segment is cut twice.
+    # A vertex on the plane counts as above it, so that no segment appears twice.
     above = height >= 0
     corner_above = above[triangles]
     cut = np.flatnonzero(corner_above.any(axis=1) & ~corner_above.all(axis=1))

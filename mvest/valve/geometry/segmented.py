@@ -1,4 +1,4 @@
-"""Segmented leaflets and papillary muscles: midsurface, its error, and tips that fit it."""
+"""Segmented leaflets and papillary muscles: midsurface, its error, and the papillary tips."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.thickening import thicken
 
 BEND_MM = 3.0
-"""Radius to which leaflets bend at the commissures."""
+"""Bending radius of the leaflets at the commissures."""
 REPAIRS_MM = (0.0, 1.0, 2.0, 4.0)
-"""Further smoothing that is tried where leaflets pass through themselves."""
+"""Additional smoothing that is tried if leaflets pass through themselves."""
 HEAD_MM = 5.0
-"""Height of the head of a muscle, from all of which its chordae rise."""
+"""Height of the head of a muscle, from which its chordae arise."""
 MIN_SLENDER = 1.5
-"""Length of a muscle over its width, below which it has no long axis and so no tip."""
+"""Least length of a muscle over its width; a rounder one has no identifiable tip."""
 MAX_AWAY = 60.0
-"""mm from the leaflets to the papillary tips."""
+"""Largest distance (mm) from the leaflets to the papillary tips."""
 TALLER = 1.1
-"""Height of a leaflet over that of the other, from which on it is the anterior one."""
+"""A leaflet that is this many times as tall as the other is the anterior one."""
 
 
 def masks_midsurface(
@@ -62,7 +62,7 @@ def masks_midsurface(
     Raises
     ------
     GeometryError
-        As these.
+        As raised by those functions.
     """
     spacing, direction, origin = grid
     step = STEP_MM if seams is None else CLOSED_STEP_MM
@@ -92,7 +92,7 @@ def masks_midsurface(
 def without_crossings(
     surface: Midsurface, smoothing_mm: float, *, thickened: bool
 ) -> tuple[Midsurface, str]:
-    """The surface smoothed round the valve, and further if it passes through itself.
+    """The surface smoothed around the valve, and smoothed further if it passes through itself.
 
     Parameters
     ----------
@@ -100,18 +100,18 @@ def without_crossings(
     smoothing_mm
         See `mvest.valve.geometry.midsurface.Midsurface.smoothed`.
     thickened
-        Whether its two walls must not pass through each other either, as it is to be meshed.
+        Whether the thickened surface must not pass through itself either (for meshing).
 
     Returns
     -------
     Midsurface
     str
-        What was done, if anything.
+        Description of the smoothing, empty without any.
 
     Raises
     ------
     GeometryError
-        It passes through itself however it is smoothed.
+        It passes through itself at every level of smoothing.
     """
     faults = []
     for further in REPAIRS_MM:
@@ -126,10 +126,10 @@ def without_crossings(
             faults.append(fault)
             continue
         done = (
-            f"smoothed round the valve over {smoothing_mm + further:g} mm, which moves it by at "
+            f"smoothed around the valve over {smoothing_mm + further:g} mm, which moves it by at "
             f"most {moved:.1f} mm"
         )
-        why = "; with less it passes through itself" if further else ""
+        why = "; with less smoothing it passes through itself" if further else ""
         return smooth, done + why if moved else ""
     raise faults[0]
 
@@ -137,23 +137,23 @@ def without_crossings(
 def segmentation_std(voxel_mm: float, blur_mm: float, observer_mm: float) -> float:
     """Standard deviation (mm) of a coordinate of the midsurface of a segmentation.
 
-    A wall lies anywhere within a voxel, with a standard deviation of ``voxel / sqrt(12)``, and the
-    midsurface is the mean of two walls. Smoothing a signed distance by a normal distribution moves
-    a surface of curvature k by ``blur^2 k / 2`` (mean curvature flow: Merriman, Bence and Osher
-    1994, J. Comput. Phys. 112:334). Whoever drew the walls was in error as well.
+    A wall is uniformly distributed within a voxel (standard deviation ``voxel / sqrt(12)``), and
+    the midsurface is the mean of two walls. Gaussian smoothing of a signed distance moves a surface
+    of curvature k by ``blur^2 k / 2`` (mean curvature flow: Merriman, Bence and Osher 1994, J.
+    Comput. Phys. 112:334). The observer's error is added.
     """
     return float(np.sqrt(voxel_mm**2 / 24 + (blur_mm**2 / (2 * BEND_MM)) ** 2 + observer_mm**2))
 
 
 def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
-    """The middle ``(3,)`` mm of a muscle's head: its last `HEAD_MM` along its own long axis.
+    """The middle ``(3,)`` mm of a muscle's head, its last `HEAD_MM` along its long axis.
 
     Parameters
     ----------
     muscle
         ``(n, 3)`` mm, points of the muscle.
     leaflets
-        ``(m, 3)`` mm; the head is at the end that is nearer to their middle.
+        ``(m, 3)`` mm; the head is the end nearer to their middle.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
 
 
 def check_tips_of(surface: Midsurface, tips: FloatArray, *, handedness: bool = True) -> None:
-    """Raise where tips have other axes than the leaflets, or the valve is its own mirror image.
+    """Raise if tips and leaflets have different axes, or the valve is a mirror image.
 
     Parameters
     ----------
@@ -182,13 +182,13 @@ def check_tips_of(surface: Midsurface, tips: FloatArray, *, handedness: bool = T
     tips
         ``(2, 3)`` mm, LPS, the antero-lateral one first.
     handedness
-        Whether a mirror image is refused.
+        Whether to refuse a mirror image.
 
     Raises
     ------
     GeometryError
-        Seen from the atrium, the antero-lateral tip is not on the left of the anterior leaflet, or
-        tips are farther from the leaflets than any.
+        The antero-lateral tip is not on the left of the anterior leaflet seen from the atrium, or a
+        tip is farther than `MAX_AWAY` from the leaflets.
     """
     centre = surface.vertices.mean(axis=0)
     away, turned = (

@@ -1,7 +1,6 @@
-"""Whether a triangulation is a surface in good order, and what it encloses.
+"""Validity checks of triangulated surfaces, and the volume they enclose.
 
-Every fault of a surface is one `GeometryError` that begins with the fault's name and gives the
-numbers of the triangles, edges or vertices concerned.
+Every fault is one `GeometryError` that names the fault and the triangles, edges or vertices.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from mvest.valve.geometry.proximity import (
 from mvest.valve.geometry.triangles import edge_table
 
 MAX_LOOKED_AT = 100_000
-"""Pairs of edges and triangles among which those that intersect are sought for a message."""
+"""Candidate pairs that are searched for the intersections named in a message."""
 MAX_OVERLAPS = 1e7
-"""Of bounding boxes of edges and triangles (0.3 GB); 50 000 triangles in good order have 1e6."""
+"""Largest number of overlapping bounding boxes (0.3 GB); 50 000 valid triangles have 1e6."""
 
 
 def listed(numbers: IntArray) -> str:
-    """The first eight numbers in words, for a message."""
+    """The first eight numbers as text."""
     shown = ", ".join(str(int(i)) for i in numbers[:8])
     return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > 8 else "")
 
@@ -39,7 +38,7 @@ def check_surface(
     self_intersections: bool = True,
     name: str = "surface",
 ) -> None:
-    """Raise unless a triangulation is an orientable manifold surface in good order.
+    """Raise unless a triangulation is a valid, oriented manifold surface.
 
     Parameters
     ----------
@@ -48,18 +47,18 @@ def check_surface(
     triangles
         ``(m, 3)`` vertex numbers.
     closed
-        Also demand that it has no boundary and that its normals point outwards.
+        Also require that it has no boundary and that its normals point outwards.
     self_intersections
-        Also demand that no triangle passes through another.
+        Also require that no triangle passes through another.
     name
-        What to call the surface in the message.
+        Name of the surface in the message.
 
     Raises
     ------
     GeometryError
-        wrong shape, not finite, no triangles, index out of range, degenerate triangle, duplicate
-        triangle, non-manifold edge, inconsistent orientation, non-manifold vertex, open surface,
-        inward normals, self-intersection: the first of these that is found.
+        The first of these faults: wrong shape, not finite, no triangles, index out of range,
+        degenerate triangle, duplicate triangle, non-manifold edge, inconsistent orientation,
+        non-manifold vertex, open surface, inward normals, self-intersection.
     """
     points = np.asarray(vertices, dtype=np.float64)
     faces = np.asarray(triangles)
@@ -157,14 +156,14 @@ def _check_edges(faces: IntArray, closed: bool, name: str) -> None:
 
 
 def _check_vertex_fans(faces: IntArray, name: str) -> None:
-    """Raise where the triangles round a vertex do not form one fan (two sheets meet in a point)."""
+    """Raise if the triangles around a vertex form several fans (sheets that meet in a point)."""
     _, _, inverse, count = edge_table(faces)
     order = np.argsort(inverse, kind="stable")
     ends = np.cumsum(count)
     second = order[ends[count == 2] - 1]
     first = order[ends[count == 2] - 2]
     # Corner 3 t + i is where half-edge 3 t + i starts; neighbours run along their edge oppositely.
-    after_first, after_second = _next_corner(first), _next_corner(second)
+    after_first, after_second = (k - k % 3 + (k + 1) % 3 for k in (first, second))
     rows = np.concatenate([first, after_first])
     columns = np.concatenate([after_second, second])
     n = 3 * len(faces)
@@ -177,10 +176,6 @@ def _check_vertex_fans(faces: IntArray, name: str) -> None:
             f"{name}: non-manifold vertex: sheets touch only in vertices "
             f"{listed(vertex[number > 1])}; split or remove them"
         )
-
-
-def _next_corner(corner: IntArray) -> IntArray:
-    return corner - corner % 3 + (corner + 1) % 3
 
 
 def enclosed_volume(vertices: FloatArray, triangles: IntArray) -> float:

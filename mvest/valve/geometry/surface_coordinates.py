@@ -1,21 +1,19 @@
-"""Smooth material coordinates of a leaflet surface that runs round from an annulus to a free edge.
+"""Harmonic material coordinates of a band of leaflets between annulus and free edge.
 
-The surface of an atrioventricular valve at rest is a band: a triangulation with exactly two
-boundary loops. It carries two natural coordinates,
+The leaflets of an atrioventricular valve form a band: a triangulation with exactly two boundary
+loops. It has two natural coordinates,
 
-* ``s``: 0 on the annulus, 1 on the free edge, harmonic in between (the temperature of a plate with
-  those two edge temperatures), and
-* ``theta``: the angle round the valve, harmonic with no flux through either edge, period 2 pi.
+* ``s``: 0 on the annulus, 1 on the free edge, harmonic in between, and
+* ``theta``: the angle around the valve, harmonic without flux through either edge, period 2 pi.
 
 Both solve Laplace's equation with the cotangent weights of linear triangles (Pinkall and Polthier
-1993, Exp. Math. 2:15). Together they map the band to a flat strip almost conformally once ``s`` is
-scaled by ``modulus``; ``exp`` of that strip is a plane annulus, in which a Delaunay triangulation
-recovers both edge loops because the points of a loop lie on one circle.
+1993, Exp. Math. 2:15). Together they map the band to a flat strip, almost conformally once ``s`` is
+scaled by ``modulus``.
 
-Across an edge between obtuse triangles a cotangent weight is negative, and the map may fold over.
-Positive weights never let it (Gortler, Gotsman and Thurston 2006, Comput. Aided Geom. Des. 23:83);
-so round the triangles that fold over, small and negative weights are raised until none does, and
-the coordinates are harmonic but for those few edges.
+Between obtuse triangles a cotangent weight is negative, and the map may fold over. With positive
+weights it cannot (Gortler, Gotsman and Thurston 2006, Comput. Aided Geom. Des. 23:83). So small and
+negative weights around folded triangles are raised until none is left; the coordinates are harmonic
+except at those few edges.
 """
 
 from __future__ import annotations
@@ -35,24 +33,23 @@ from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import edge_table, unit_rows
 
 MIN_WEIGHT = 0.05
-"""To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
-0.58."""
+"""Least cotangent weight around folded triangles; an equilateral triangle has 0.58."""
 MAX_ROUNDS = 10
-"""How often they are raised, each time round the triangles that still fold over."""
+"""Largest number of times that weights are raised around the triangles still folded."""
 OUTSIDE = 0.01
-"""Of the way around, beyond which a point is outside the surface and not a rounding error of s."""
+"""Share of a turn beyond which a point lies outside the surface; less is a rounding error of s."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceCoordinates:
-    """Harmonic coordinates of a band and the directions that belong to them.
+    """Harmonic coordinates of a band and their circumferential direction.
 
     Attributes
     ----------
     triangles : ndarray
         ``(m, 3)`` vertex indices.
     theta : ndarray
-        ``(n,)`` rad in [0, 2 pi), angle round the valve.
+        ``(n,)`` rad in [0, 2 pi), angle around the valve.
     s : ndarray
         ``(n,)`` from 0 (annulus) to 1 (free edge).
     modulus : float
@@ -69,7 +66,8 @@ class SurfaceCoordinates:
 
     def strip_triangles(self) -> FloatArray:
         """Corners ``(m, 3, 2)`` of all triangles in the strip, unwrapped about the first corner."""
-        theta = unwrapped(self.theta[self.triangles])
+        theta = self.theta[self.triangles]
+        theta = theta[:, :1] + wrapped(theta - theta[:, :1])
         return np.stack([theta, self.modulus * self.s[self.triangles]], axis=-1)
 
     @property
@@ -78,29 +76,17 @@ class SurfaceCoordinates:
         return bool(np.median(_signed_area(self.strip_triangles())) < 0)
 
     def folded(self) -> IntArray:
-        """Triangles ``(k,)`` that lie in the strip the other way round than most."""
+        """Triangles ``(k,)`` whose orientation in the strip differs from the majority."""
         area = _signed_area(self.strip_triangles())
         return np.flatnonzero(area * np.sign(np.median(area)) <= 0)
 
     def locate(self, theta: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Triangle and barycentric weights of points given by their coordinates.
+        """Triangles ``(k,)`` and barycentric weights ``(k, 3)`` of points at theta (rad) and s.
 
-        Parameters
-        ----------
-        theta, s : ndarray
-            ``(k,)`` rad and 0..1.
-
-        Returns
-        -------
-        triangle : ndarray
-            ``(k,)``.
-        weights : ndarray
-            ``(k, 3)``, non-negative, each row sums to 1. A point outside the polygonal edge by
-            rounding or by its curvature is moved to the nearest triangle's boundary.
+        A point slightly outside the polygonal edge is moved to the nearest triangle.
         """
-        corners = self.strip_triangles()
         points = np.column_stack([theta, self.modulus * np.asarray(s, dtype=float)])
-        return _locate_in_plane(corners, points, period=2 * np.pi)
+        return _locate_in_plane(self.strip_triangles(), points, period=2 * np.pi)
 
 
 def boundary_loops(triangles: IntArray) -> list[IntArray]:
@@ -109,8 +95,8 @@ def boundary_loops(triangles: IntArray) -> list[IntArray]:
     Raises
     ------
     GeometryError
-        If an edge has more than two triangles, or neighbours disagree in orientation, or a boundary
-        vertex has more than two boundary edges.
+        An edge has more than two triangles, neighbours differ in orientation, or a boundary vertex
+        has more than two boundary edges.
     """
     triangles = np.asarray(triangles)
     directed, edges, number, count = edge_table(triangles)
@@ -177,8 +163,8 @@ def surface_coordinates(
     Raises
     ------
     GeometryError
-        If the two sets are not the two boundary loops, if the surface does not run once round the
-        annulus axis, or if the coordinates fold over.
+        Annulus and free edge are not the two boundary loops, a triangle has all corners on one
+        loop, or the coordinates fold over.
     """
     vertices = np.asarray(vertices, dtype=float)
     loops = boundary_loops(triangles)
@@ -232,7 +218,7 @@ def _solve(
 
 
 def _raised(laplacian: sp.csr_matrix, near: BoolArray) -> sp.csr_matrix:
-    """The same with no weight below the smallest one at the vertices ``near (n,)``."""
+    """The same with weights of at least `MIN_WEIGHT` at the vertices ``near (n,)``."""
     edges = sp.triu(laplacian, k=1).tocoo()
     here = near[edges.row] | near[edges.col]
     weight = np.where(here, np.maximum(-edges.data, MIN_WEIGHT), -edges.data)
@@ -259,11 +245,11 @@ def _conjugate_angle(
     annulus: IntArray,
     free_edge: IntArray,
 ) -> FloatArray:
-    """Harmonic angle with natural boundaries, that of vertex 0 being its angle about the axis.
+    """Harmonic angle with natural boundaries; vertex 0 has its angle about the annulus axis.
 
-    A jump of 2 pi across a cut from edge to edge is a closed form of that period; subtracting the
-    gradient that makes it divergence-free leaves the harmonic one. The cut is one of the surface
-    and not of space: leaflets that have closed may lie across the axis.
+    A jump of 2 pi across a cut from edge to edge is a closed form with that period. Subtracting the
+    gradient that makes it divergence-free leaves the harmonic form. The cut runs along the surface,
+    because closed leaflets may lie across the axis.
     """
     row, column = _cut(triangles, annulus, free_edge).T
     jump = 2 * np.pi * -np.asarray(laplacian[row, column]).ravel()
@@ -276,7 +262,7 @@ def _conjugate_angle(
 
 
 def _angle_of_first(vertices: FloatArray, annulus: IntArray) -> float:
-    """Angle of vertex 0 about the axis of the annulus, from the annulus' first vertex."""
+    """Angle of vertex 0 about the annulus axis, measured from the first annulus vertex."""
     loop = vertices[annulus]
     centre = loop.mean(axis=0)
     axis = np.cross(loop - centre, np.roll(loop, -1, axis=0) - centre).sum(axis=0)
@@ -289,9 +275,9 @@ def _angle_of_first(vertices: FloatArray, annulus: IntArray) -> float:
 
 
 def _cut(triangles: IntArray, annulus: IntArray, free_edge: IntArray) -> IntArray:
-    """Edges ``(k, 2)`` across which a chain of triangles leads from the annulus to the free edge.
+    """Edges ``(k, 2)`` crossed by a chain of triangles from the annulus to the free edge.
 
-    Each runs the way that the annulus runs.
+    Each edge runs in the direction of the annulus.
     """
     corners = triangles.tolist()
     owner = {(t[i - 1], t[i]): n for n, t in enumerate(corners) for i in range(3)}
@@ -299,7 +285,7 @@ def _cut(triangles: IntArray, annulus: IntArray, free_edge: IntArray) -> IntArra
     start = (int(annulus[0]), int(annulus[1]))
     along = start in owner
     start = start if along else start[::-1]
-    # Triangle -> the edge through which it was entered, as it runs in it.
+    # Triangle -> the edge through which it was entered, in its own direction.
     entered = {owner[start]: start}
     queue = deque(entered)
     crossed: list[tuple[int, int]] = []
@@ -339,10 +325,9 @@ def _perpendicular_to_gradient(
 def _locate_in_plane(
     corners: FloatArray, points: FloatArray, period: float
 ) -> tuple[IntArray, FloatArray]:
-    """Triangle ``(n,)`` and weights ``(n, 3)`` of points in a strip that repeats itself.
+    """Triangle ``(n,)`` and weights ``(n, 3)`` of points in a periodic strip.
 
-    Nearly always one of the nearest dozen triangles has the point; long ones beside small ones may
-    be farther away, and the closest is then found among all.
+    One of the dozen nearest triangles nearly always holds the point; otherwise all are searched.
     """
     m, shift = len(corners), np.array([period, 0.0])
     repeated = np.concatenate([corners - shift, corners, corners + shift])
@@ -388,9 +373,3 @@ def _signed_area(corner: FloatArray) -> FloatArray:
 def wrapped(angle: FloatArray) -> FloatArray:
     """Angles (rad) in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def unwrapped(theta: FloatArray) -> FloatArray:
-    """Angles (rad) of the corners ``(m, 3)`` of triangles, without a jump from the first one."""
-    first = theta[:, :1]
-    return np.asarray(first + wrapped(theta - first))

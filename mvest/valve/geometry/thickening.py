@@ -19,7 +19,7 @@ from mvest.valve.geometry.triangles import (
 )
 
 FACE_KINDS = ("ventricular", "atrial", "rim")
-"""What a triangle of a thickened leaflet bounds."""
+"""Kinds of triangles of a thickened leaflet."""
 
 
 def smooth_vertex_normals(
@@ -27,14 +27,13 @@ def smooth_vertex_normals(
 ) -> FloatArray:
     """Unit normals ``(n, 3)`` after Laplacian smoothing over neighbouring vertices.
 
-    Each iteration replaces a normal by the normalised mean of itself and the mean of its
-    neighbours. Thickening along raw normals makes triangles cross where a leaflet bends sharply,
-    at the commissures above all.
+    Each iteration replaces a normal by the normalised mean of itself and its neighbours' mean.
+    Thickening along raw normals would make triangles cross at sharp bends, such as the commissures.
 
     Raises
     ------
     GeometryError
-        A vertex without triangles, or where opposite normals cancel.
+        A vertex has no triangle, or opposite normals cancel.
     """
     return smooth_normals_change(vertices, triangles, iterations, np.zeros((*vertices.shape, 0)))[0]
 
@@ -42,16 +41,7 @@ def smooth_vertex_normals(
 def smooth_normals_change(
     vertices: FloatArray, triangles: IntArray, iterations: int, moves: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Smooth unit normals ``(n, 3)``, and their change ``(n, 3, q)`` with the vertices.
-
-    Parameters
-    ----------
-    vertices, triangles, iterations
-        See `smooth_vertex_normals`.
-    moves : (n, 3, q) mm
-    """
-    if iterations < 0:
-        raise GeometryError(f"normal smoothing: {iterations} iterations; expected 0 or more")
+    """`smooth_vertex_normals`, and their change ``(n, 3, q)`` by displacements ``(n, 3, q)`` mm."""
     n = len(vertices)
     unused = np.setdiff1d(np.arange(n), triangles)
     if len(unused):
@@ -97,18 +87,16 @@ def _across(normals: FloatArray, change: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedSurface:
-    """Outer surface of thickened leaflets, outward normals.
+    """Outer surface of thickened leaflets, with outward normals.
 
     Attributes
     ----------
-    vertices
-        ``(n, 3)`` mm.
-    triangles
-        ``(m, 3)``.
-    region
-        ``(m,)`` leaflet of each triangle.
-    kind
-        ``(m,)`` index into `FACE_KINDS`.
+    vertices : (n, 3) mm
+    triangles : (m, 3)
+    region : (m,)
+        Leaflet of each triangle.
+    kind : (m,)
+        Index into `FACE_KINDS`.
 
     Raises
     ------
@@ -128,9 +116,8 @@ class ClosedSurface:
 def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> ClosedSurface:
     """Close a midsurface: offset both sides by half the thickness and stitch the rim.
 
-    Vertex ``i`` of the midsurface becomes vertices ``i`` (ventricular side, along the normal) and
-    ``i + n`` (atrial side). Every boundary edge, annulus and free edge alike, gives two rim
-    triangles.
+    Vertex ``i`` of the midsurface becomes the vertices ``i`` (ventricular side, along the normal)
+    and ``i + n`` (atrial side). Every boundary edge gives two rim triangles.
 
     Parameters
     ----------
@@ -142,8 +129,8 @@ def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> Close
     Raises
     ------
     GeometryError
-        The midsurface is faulty, or the thickened one passes through itself (thickness larger than
-        the radius of curvature).
+        The midsurface is invalid, or the thickened surface passes through itself (the thickness
+        exceeds the radius of curvature).
     """
     check_surface(surface.vertices, surface.triangles, name="midsurface")
     if normals is None:

@@ -1,14 +1,13 @@
 """Triangulations: edges, areas and normals, stretch between two shapes, and refinement.
 
-A surface is refined as a fixed linear function of its vertices. Facets of a curved surface lie
-inside it by ``h² / 8 r`` (edge length h, radius r), and its normals jump by ``h / r`` from one to
-the next: 0.1 mm and 20 degrees where leaflets bend. Edges are halved by Hermite's cubic, with the
-derivatives along the edge ``b - a`` that the triangles at its ends have on average::
+A refined surface is a fixed linear function of the coarse vertices. Facets of a curved surface
+(edge length h, radius r) lie ``h² / 8 r`` inside it, and the normals of neighbours differ by
+``h / r``: 0.1 mm and 20 degrees where leaflets bend. Edges are halved by Hermite's cubic, with mean
+gradients of the position over the surface at rest, taken from the triangles at both ends::
 
     (a + b) / 2 + (b - a) . (grad_a - grad_b) / 8
 
-of the position as a function over the surface at rest. The weights depend on that surface alone, so
-that derivatives of what moves with the vertices are exact.
+The weights depend on the surface at rest alone, so derivatives by the vertices are exact.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ def area_vectors_change(vertices: FloatArray, triangles: IntArray, moves: FloatA
 
 
 def directed_edges(triangles: IntArray) -> IntArray:
-    """Edges ``(3 m, 2)`` as triangles run through them: first all from corner 0, then 1, then 2."""
+    """Directed edges ``(3 m, 2)``: first all from corner 0, then those from 1, then from 2."""
     return np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
@@ -88,16 +87,10 @@ def unit_rows(vectors: FloatArray) -> FloatArray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
-def unit_vectors(vectors: FloatArray) -> FloatArray:
-    """Vectors ``(..., 3)`` of length one; zero where they were zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
-
-
 def mean_fibre(fibre: FloatArray, weights: FloatArray) -> FloatArray:
     """Weighted sum ``(..., 3)`` of the fibres ``(..., 3, 3)`` of a triangle's corners.
 
-    A fibre has no sign: they are turned to agree with that of the largest weight ``(..., 3)``.
+    Fibres have no sign: all are turned to agree with that of the largest weight ``(..., 3)``.
     """
     lead = np.take_along_axis(fibre, weights.argmax(axis=-1)[..., None, None], axis=-2)
     sign = np.where(np.sum(fibre * lead, axis=-1) < 0, -1.0, 1.0)
@@ -107,17 +100,10 @@ def mean_fibre(fibre: FloatArray, weights: FloatArray) -> FloatArray:
 def principal_stretches(
     rest: FloatArray, deformed: FloatArray, triangles: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Largest and smallest stretch ``(n,)`` at each vertex, means over its triangles by area.
+    r"""Largest and smallest stretch ``(n,)`` at each vertex, area-weighted over its triangles.
 
-    In a triangle with the edges :math:`D = [d_1, d_2]` at rest and :math:`d` now the stretches are
-    the singular values of :math:`d R^{-1}`, where :math:`D = Q R` (Q orthonormal).
-
-    Parameters
-    ----------
-    rest, deformed
-        ``(n, 3)`` mm.
-    triangles
-        ``(m, 3)``.
+    For a triangle with the edges :math:`D = [d_1, d_2] = Q R` at rest (Q orthonormal) and :math:`d`
+    when deformed, they are the singular values of :math:`d R^{-1}`.
     """
 
     def edges(points: FloatArray) -> FloatArray:
@@ -145,12 +131,12 @@ class Refinement:
     Attributes
     ----------
     weights : (r, n) sparse
-        Its vertices, of those of the coarse surface, which come first and stay.
+        Fine vertices from the coarse ones, which come first and stay.
     triangles : (m, 3)
     parent : (m,)
-        Triangle of the coarse surface of which each is a part.
+        Coarse triangle that holds each fine one.
     loops : tuple of (e,)
-        Closed loops along edges, drawn finer as well.
+        Refined closed loops along edges.
     """
 
     weights: sparse.csr_array
@@ -165,7 +151,7 @@ def refined(
     edge_length: float,
     loops: tuple[IntArray, ...] = (),
 ) -> Refinement:
-    """A surface with its edges halved until half of them are shorter than a length.
+    """Halve the edges of a surface until their median is at most a length.
 
     Parameters
     ----------
@@ -196,7 +182,7 @@ def _halved(vertices: FloatArray, coarse: Refinement) -> Refinement:
     middle = 0.5 * (own[a] + own[b])
     for along, slope in zip((x[b] - x[a]).T, _slopes(x, triangles), strict=True):
         middle = middle + sparse.diags_array(along / 8.0) @ (slope[a] - slope[b])
-    # Of each triangle the middles of its edges from corner 0, from 1 and from 2.
+    # Middles of the edges from corner 0, from 1 and from 2.
     p, q, r = n + number.reshape(-1, 3).T
     i, j, k = triangles.T
     parts = np.array([[i, p, r], [p, j, q], [r, q, k], [p, q, r]])
@@ -216,10 +202,7 @@ def _halved_loop(loop: IntArray, edges: IntArray, n: int) -> IntArray:
 
 
 def _slopes(x: FloatArray, triangles: IntArray) -> list[sparse.csr_array]:
-    """Gradient along x, y and z at each vertex, ``(n, n)`` of values at the vertices.
-
-    The mean over its triangles by area.
-    """
+    """Gradients along x, y and z at the vertices, each ``(n, n)``: area-weighted means."""
     n, m = len(x), len(triangles)
     area = np.maximum(areas(x, triangles), np.finfo(np.float64).tiny)
     corner, row = x[triangles], np.repeat(np.arange(m), 3)

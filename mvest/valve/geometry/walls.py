@@ -1,11 +1,11 @@
-"""The two walls of a thick leaflet band: its closed surface parted along the annulus and the edge.
+"""The two walls of a thick leaflet band: its closed surface split along annulus and free edge.
 
-A segmented surface does not state which of its triangles face the atrium. But two points that lie
-across the tissue from each other belong to different walls, and two neighbours on a smooth part of
-the surface to the same one. The walls are the sign of the vector that agrees best with both, the
-lowest eigenvector of a signed graph Laplacian (Kunegis et al. 2010, SIAM Int. Conf. Data Mining,
-section 4). What lies across follows from the largest ball inside that touches the surface at a
-vertex (shrinking balls: Ma, Bae and Choi 2012, Vis. Comput. 28:7).
+A segmented surface does not state which of its triangles face the atrium. But two points opposite
+each other across the tissue belong to different walls, and two neighbours on a smooth part of the
+surface to the same wall. The sign of the lowest eigenvector of a signed graph Laplacian satisfies
+both best (Kunegis et al. 2010, SIAM Int. Conf. Data Mining, section 4). The point opposite a vertex
+is found with the largest inner ball that touches the surface there (shrinking balls: Ma, Bae and
+Choi 2012, Vis. Comput. 28:7).
 """
 
 from __future__ import annotations
@@ -26,30 +26,29 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import euler_number, surface_edges
 
 MAX_THICKNESS = 8.0
-"""mm, diameter of the first ball; a thickened leaflet of a diseased valve has 5 mm."""
+"""Diameter of the first ball, mm; thickened leaflets of diseased valves have 5 mm."""
 BALL_ROUNDS = 40
 MIN_SEPARATION = np.cos(np.radians(40.0))
-"""Cosine of the angle between the two contacts of a ball, seen from its centre, at which it stops
-to shrink: what is nearer is roughness of the same wall."""
+"""Cosine of the angle between the two contacts of a ball, seen from its centre, at which shrinking
+stops: a smaller angle means roughness of the same wall."""
 OPPOSITE = -0.6
-"""Largest product of the normals of two points that lie across the tissue from each other."""
+"""Largest scalar product of the normals of two opposite points."""
 ACROSS_WEIGHT = 0.1
-"""Of such a pair beside that of two neighbours on a plane (1): the walls are then settled within
-three edges."""
+"""Weight of an opposite pair, relative to two neighbours on a plane."""
 EDGE_SHARE = 0.1
-"""Of an edge, within which no line between the walls comes to its ends."""
+"""Least distance of the dividing line from both ends of an edge, over its length."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wall:
-    """One wall of a thick band: itself a band, its triangles facing out of the tissue.
+    """One wall of a thick band: itself a band, with triangles facing out of the tissue.
 
     Attributes
     ----------
     vertices : (n, 3) mm
     triangles : (m, 3)
     loops : two (k,) arrays
-        Its boundary, each loop with the same points in the same order in both walls.
+        Its boundary; each loop has the same points in the same order in both walls.
     """
 
     vertices: FloatArray
@@ -58,12 +57,12 @@ class Wall:
 
 
 def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
-    """A closed surface with its normals outwards, after a check that it bounds one thick band.
+    """Check that a closed surface bounds one thick band, and turn its normals outwards.
 
     Raises
     ------
     GeometryError
-        It is open or faulty; several pieces; not one hole (Euler number other than 0): no orifice,
+        It is open or invalid, has several pieces, or has not one hole (Euler number 0): no orifice,
         or leaflets joined where they only touch.
     """
     vertices = np.asarray(vertices, dtype=np.float64)
@@ -99,12 +98,12 @@ def closed_band(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, 
 
 
 def walls(vertices: FloatArray, triangles: IntArray) -> tuple[Wall, Wall]:
-    """Part a closed surface from `closed_band` into its two walls.
+    """Split a closed surface from `closed_band` into its two walls.
 
     Raises
     ------
     GeometryError
-        It does not fall into two bands that share both their edges: no thin leaflets.
+        The parts are not two bands with common edges: the leaflets are not thin.
     """
     side = _sides(vertices, triangles)
     points, faces, upper = _parted(vertices, triangles, side)
@@ -120,7 +119,7 @@ def walls(vertices: FloatArray, triangles: IntArray) -> tuple[Wall, Wall]:
                 "expected an annulus and a free edge: the surface is no thin sheet everywhere"
             )
         parts.append((used, inverse.reshape(-1, 3), loops))
-    # Loops of the other wall run the other way: both take those of the first.
+    # The loops of the other wall run backwards: both walls take those of the first.
     number = [np.full(len(points), -1) for _ in parts]
     for own, (used, _, _) in zip(number, parts, strict=True):
         own[used] = np.arange(len(used))
@@ -137,7 +136,7 @@ def _graph(edges: IntArray, weight: FloatArray, n: int) -> sp.csr_matrix:
 
 
 def _across(vertices: FloatArray, normals: FloatArray) -> IntArray:
-    """The vertex ``(n,)`` that lies across the tissue from each, where the ball inside ends."""
+    """The vertex ``(n,)`` opposite each one across the tissue; -1 if none was found."""
     tree = cKDTree(vertices)
     n = len(vertices)
     radius = np.full(n, 0.5 * MAX_THICKNESS)
@@ -145,7 +144,7 @@ def _across(vertices: FloatArray, normals: FloatArray) -> IntArray:
     active = np.arange(n)
     for _ in range(BALL_ROUNDS):
         centre = vertices[active] - radius[active, None] * normals[active]
-        # The two nearest: the vertex itself may be one of them.
+        # The two nearest: one of them may be the vertex itself.
         distance, near = (np.asarray(found) for found in tree.query(centre, k=2))
         own = near[:, 0] == active
         other = np.where(own, near[:, 1], near[:, 0])
@@ -195,7 +194,7 @@ def _sides(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def _in_two_pieces(side: FloatArray, edges: IntArray) -> FloatArray:
-    """The same with islands of one sign within the other turned, so that each is one piece."""
+    """The same with isolated islands of either sign flipped, so that each sign is one piece."""
     side = side.copy()
     for sign in (1, -1):
         within = side * sign > 0
@@ -210,7 +209,7 @@ def _in_two_pieces(side: FloatArray, edges: IntArray) -> FloatArray:
 def _parted(
     vertices: FloatArray, triangles: IntArray, side: FloatArray
 ) -> tuple[FloatArray, IntArray, BoolArray]:
-    """The surface with its triangles cut along the line where `side` is zero.
+    """Cut the triangles along the line where `side` is zero.
 
     Returns
     -------

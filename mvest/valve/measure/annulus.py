@@ -1,7 +1,4 @@
-"""The annulus: its plane, the three clinical directions, its size and the surface that spans it.
-
-That surface is the minimal one: the soap film in a closed curve.
-"""
+"""The annulus: its plane, the three clinical directions, its size and its minimal surface."""
 
 from __future__ import annotations
 
@@ -39,12 +36,11 @@ class AnnulusPlane:
     def coordinates(self, points: FloatArray) -> FloatArray:
         """Coordinates ``(n, 3)`` mm of `points` along anterior, lateral and normal."""
         axes = np.column_stack([self.anterior, self.lateral, self.normal])
-        result: FloatArray = (np.asarray(points, dtype=np.float64) - self.origin) @ axes
-        return result
+        return np.asarray((np.asarray(points, dtype=np.float64) - self.origin) @ axes)
 
 
 def checked_loop(annulus: FloatArray) -> FloatArray:
-    """Return a closed curve ``(k, 3)`` mm as an array, or say what is wrong with it."""
+    """A closed curve ``(k, 3)`` mm as an array; GeometryError if it is none."""
     loop = np.asarray(annulus, dtype=np.float64)
     if loop.ndim != 2 or loop.shape[1] != 3 or len(loop) < 3:
         raise GeometryError(f"annulus: shape {loop.shape}, expected (k, 3) with k >= 3 points (mm)")
@@ -59,14 +55,13 @@ def unit_vector(vector: FloatArray, what: str) -> FloatArray:
     length = float(np.linalg.norm(vector))
     if not length > 1e-9:
         raise GeometryError(f"{what}: direction has no length; give a point away from the centre")
-    result: FloatArray = vector / length
-    return result
+    return np.asarray(vector / length)
 
 
 def annulus_plane(
     annulus: FloatArray, ventricle_point: FloatArray, anterior_point: FloatArray
 ) -> AnnulusPlane:
-    """Fit the annulus plane by least squares, every stretch of the curve weighted by its length.
+    """Fit the annulus plane by least squares, each segment of the curve weighted by its length.
 
     Parameters
     ----------
@@ -160,31 +155,12 @@ TOLERANCE = 1e-7
 """Relative change of the area at which the surface is taken as minimal."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SpanningSurface:
-    """A triangulated disc whose edge is the curve.
+def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> tuple[FloatArray, IntArray]:
+    """Triangulate the minimal surface (the soap film) in a closed curve.
 
-    Attributes
-    ----------
-    vertices : (n, 3) mm
-        The curve first, its points in their order.
-    triangles : (m, 3)
-    area : float
-        mm².
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
-    area: float
-
-
-def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> SpanningSurface:
-    """Span a closed curve by the surface of least area that is a height over its plane.
-
-    The height ``h`` solves the minimal surface equation ``div(grad h / sqrt(1 + |grad h|²)) = 0``
-    with linear triangles, the root taken from the round before (Johnson and Thomée 1975, Math.
-    Comp. 29:343, for the elements). Over a convex outline the minimal surface is such a height and
-    unique (Radó 1930, Math. Z. 32:763).
+    Its height ``h`` over the plane solves ``div(grad h / sqrt(1 + |grad h|²)) = 0`` with linear
+    triangles (Johnson and Thomée 1975, Math. Comp. 29:343); the root is that of the iteration
+    before. Over a convex outline this surface is unique (Radó 1930, Math. Z. 32:763).
 
     Parameters
     ----------
@@ -193,10 +169,16 @@ def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> SpanningSurfac
     plane : AnnulusPlane
         Of this annulus.
 
+    Returns
+    -------
+    vertices : (n, 3) mm
+        The points of the curve first, in their order.
+    triangles : (m, 3)
+
     Raises
     ------
     GeometryError
-        No curve, or one of which not every point is seen from its centre in the plane.
+        No curve, or its projection on the plane is not star-shaped about its centre.
     """
     loop = plane.coordinates(checked_loop(annulus))
     k = len(loop)
@@ -227,12 +209,11 @@ def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> SpanningSurfac
         )
     flat = flat + loop[:, :2].mean(axis=0)
     axes = np.stack([plane.anterior, plane.lateral, plane.normal])
-    vertices = plane.origin + np.column_stack([flat, height]) @ axes
-    return SpanningSurface(vertices, triangles, area)
+    return plane.origin + np.column_stack([flat, height]) @ axes, triangles
 
 
 def _disc(k: int) -> IntArray:
-    """Triangles of rings of k vertices from outside inwards and a centre."""
+    """Triangles between rings of k vertices, from the outermost to the centre."""
     here = np.arange(k)
     after = (here + 1) % k
     triangles = []
@@ -245,7 +226,7 @@ def _disc(k: int) -> IntArray:
 
 
 def _gradient(points: FloatArray, triangles: IntArray) -> tuple[sp.csr_array, FloatArray]:
-    """Derivatives along x of all triangles, then along y, of vertex values; and areas, mm²."""
+    """Matrix of the triangles' derivatives along x, then along y; and their areas, mm²."""
     m = len(triangles)
     corner = points[triangles]
     # The edge opposite to a corner, turned by a right angle, is the gradient times twice the area.

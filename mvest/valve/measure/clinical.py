@@ -1,7 +1,22 @@
-"""Clinical measurements of a valve in one frame: plain arrays in, numbers with their units out.
+"""Clinical measurements of a valve in one frame, following the usual echocardiographic definitions.
 
-Lengths follow the usual echocardiographic definitions, which the names below state. Annulus,
-contact and orifice have modules of their own beside this one.
+Depth and height are distances from the annulus plane; *the middle section* is the plane through the
+annulus centre that holds its normal and the anterior direction.
+
+* ``annulus_area``: within the annulus seen along its normal; ``annulus_area_3d``: of the minimal
+  surface in it. ``ap_diameter`` and ``commissural_diameter``: chords through the centre seen along
+  the normal. ``height_to_width_ratio``: height over commissural diameter; ``sphericity_ratio``:
+  anteroposterior over commissural diameter.
+* ``tenting_height``: largest depth of the leaflets in the middle section; ``tenting_volume``:
+  between annulus plane and leaflets, negative above the plane.
+* ``prolapse``: leaflets above the annulus plane (a saddle-shaped annulus has some of it in every
+  valve: Levine et al. 1987, Circulation 75:756); ``billow``: above the minimal surface instead.
+* ``orifice``: area within the annulus that no leaflet covers seen along the normal.
+* ``coaptation_length``: over which the leaflets touch in the middle section, the smaller of both;
+  ``coaptation_area``: mean of both leaflets.
+* ``length`` of a leaflet: from annulus to free edge in the middle section.
+* ``tip_depth``, ``tip_annulus_distance``: means over the papillary tips, the latter to the nearest
+  annulus points; ``tip_separation``: between the tips.
 """
 
 from __future__ import annotations
@@ -22,7 +37,6 @@ from mvest.valve.measure.annulus import (
     checked_loop,
     measure_annulus,
     spanning_surface,
-    unit_vector,
 )
 from mvest.valve.measure.coaptation import (
     coaptation_area,
@@ -34,48 +48,19 @@ from mvest.valve.measure.coaptation import (
 Numbers: TypeAlias = dict[str, float]
 """Name with its unit -> number."""
 
-_MEANING = {
-    "annulus_circumference_mm": "length of the annulus in space",
-    "annulus_area_mm2": "area within the annulus seen along the normal of its plane (2D area)",
-    "annulus_area_3d_mm2": "area of the minimal surface that spans the annulus (3D area)",
-    "ap_diameter_mm": "chord of the annulus through its centre from anterior to posterior, seen "
-    "along the normal",
-    "commissural_diameter_mm": "chord of the annulus through its centre across the former, seen "
-    "along the normal",
-    "annulus_height_mm": "extent of the annulus along the normal of its plane",
-    "annulus_height_to_width_ratio": "height of the annulus over its commissural diameter",
-    "annulus_sphericity_ratio": "anteroposterior over commissural diameter of the annulus",
-    "tenting_height_mm": "largest depth of the leaflets below the annulus plane in the middle "
-    "anteroposterior section",
-    "tenting_volume_mm3": "volume between annulus plane and leaflets; parts above it count "
-    "negative",
-    "prolapse_height_mm": "largest height of the leaflets above the annulus plane; a saddle-shaped "
-    "annulus has some of it in every valve",
-    "prolapse_volume_mm3": "volume of the leaflets above the annulus plane; likewise",
-    "billow_height_mm": "largest height of the leaflets above the minimal surface that spans the "
-    "annulus",
-    "billow_volume_mm3": "volume between the leaflets and the minimal surface that spans the "
-    "annulus, above it",
-    "orifice_mm2": "area within the annulus that no leaflet covers seen along the normal",
-    "coaptation_length_mm": "length over which the leaflets touch in the middle anteroposterior "
-    "section, the smaller of both",
-    "coaptation_area_mm2": "area over which the leaflets touch, mean of both",
-    "tip_depth_mm": "mean distance of the papillary tips below the annulus plane",
-    "tip_annulus_distance_mm": "mean distance of the papillary tips to their nearest "
-    "annulus points",
-    "tip_separation_mm": "distance between the papillary tips",
-}
-_MEANING_OF_PART = {
-    "area_mm2": "area of the {} leaflet",
-    "length_mm": "length of the {} leaflet from annulus to free edge in the middle anteroposterior "
-    "section",
-    "depth_mm": "distance of papillary {} below the annulus plane",
-    "annulus_distance_mm": "distance of papillary {} to its nearest annulus point",
-}
+_NAMES = (
+    "annulus_circumference_mm", "annulus_area_mm2", "annulus_area_3d_mm2", "ap_diameter_mm",
+    "commissural_diameter_mm", "annulus_height_mm", "annulus_height_to_width_ratio",
+    "annulus_sphericity_ratio", "tenting_height_mm", "tenting_volume_mm3", "prolapse_height_mm",
+    "prolapse_volume_mm3", "billow_height_mm", "billow_volume_mm3", "orifice_mm2",
+    "coaptation_length_mm", "coaptation_area_mm2", "tip_depth_mm", "tip_annulus_distance_mm",
+    "tip_separation_mm",
+)  # fmt: skip
+_OF_LEAFLET, _OF_TIP = ("area_mm2", "length_mm"), ("depth_mm", "annulus_distance_mm")
 
 
 class MeasuredLeaflets(Protocol):
-    """What is measured of leaflets besides their shape, as `LeafletSurface` has it."""
+    """Triangles of leaflets, such as a `LeafletSurface`."""
 
     @property
     def triangles(self) -> IntArray:
@@ -91,10 +76,9 @@ class MeasuredLeaflets(Protocol):
 
 
 def clinical_names(region_names: Sequence[str], tip_names: Sequence[str] = ()) -> list[str]:
-    """Every name that `clinical_measurements` can give two leaflets and two tips, in order."""
-    leaflet, tip = list(_MEANING_OF_PART)[:2], list(_MEANING_OF_PART)[2:]
-    named = [f"{name}_{ending}" for name in region_names for ending in leaflet]
-    return [*_MEANING, *named, *(f"{name}_{ending}" for name in tip_names for ending in tip)]
+    """All names that `clinical_measurements` can return for two leaflets, in order."""
+    leaflets = [f"{name}_{ending}" for name in region_names for ending in _OF_LEAFLET]
+    return [*_NAMES, *leaflets, *(f"{name}_{ending}" for name in tip_names for ending in _OF_TIP)]
 
 
 def clinical_measurements(
@@ -115,9 +99,9 @@ def clinical_measurements(
     Parameters
     ----------
     vertices : (n, 3) mm
-        Where the vertices of ``surface`` are in this frame.
-    surface : LeafletSurface or the like
-        Triangles and regions.
+        Positions in this frame.
+    surface : MeasuredLeaflets
+        The first region is the anterior leaflet.
     annulus : (k, 3) mm
         In loop order.
     tips : (t, 3) mm
@@ -125,13 +109,13 @@ def clinical_measurements(
     contact_distance : float
         mm between midsurfaces that count as touching.
     tip_names : sequence of str
-        For each tip, if every one is to be measured besides their mean: ``tip_0``.
+        Names of the tips, such as ``tip_0``, to report each one as well as their mean.
 
     Returns
     -------
     dict
-        Name with unit -> number; what the shape defies is not in it, and nothing is where the
-        annulus has no plane. The first region is the anterior one.
+        Name with unit -> number. Measurements that the shape does not admit are missing; all are
+        if the annulus has no plane.
     """
     try:
         plane = _plane(vertices, surface, annulus, tips)
@@ -155,13 +139,7 @@ def clinical_measurements(
 def annulus_and_tips(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, tips: FloatArray
 ) -> Numbers:
-    """Those of `clinical_measurements` that take no leaflets, in a hundredth of the time.
-
-    Parameters
-    ----------
-    vertices, surface, annulus, tips
-        As there; of the leaflets only which side the anterior one is on.
-    """
+    """The measurements of `clinical_measurements` that need no leaflets, a hundred times faster."""
     try:
         plane = _plane(vertices, surface, annulus, tips)
     except MvestError:
@@ -180,7 +158,7 @@ def _plane(
 
 
 def _tried(measure: Callable[..., Numbers], *shape: Any) -> Numbers:
-    """Measurements, or none where the shape defies them."""
+    """Measurements, or none if the shape does not admit them."""
     try:
         return measure(*shape)
     except MvestError:
@@ -207,20 +185,16 @@ def tenting(
     plane: AnnulusPlane,
     resolution: float = 0.2,
 ) -> Numbers:
-    """Tenting as seen from the atrium: depth of the first leaflet surface below the annulus plane.
+    """Depth of the first leaflet surface seen from the atrium below the annulus plane.
 
-    Height is the largest depth on the middle line, volume the sum over the whole annulus. Points
-    where nothing is met (an open orifice) have no depth. On a closed valve this is the usual
-    definition.
+    Lines of sight through an open orifice have no depth.
 
     Parameters
     ----------
     vertices, triangles
         Midsurface of all leaflets, ``(n, 3)`` mm and ``(m, 3)``.
-    annulus
-        ``(k, 3)`` mm in loop order.
-    plane
-        Of that annulus.
+    annulus, plane
+        ``(k, 3)`` mm in loop order, and its plane.
     resolution
         Pixel size, mm.
     """
@@ -237,22 +211,17 @@ def tenting(
 def _prolapse(
     vertices: FloatArray, triangles: IntArray, annulus: FloatArray, plane: AnnulusPlane
 ) -> Numbers:
-    """What of the first leaflet surface seen from the atrium lies above the annulus.
-
-    An annulus is a saddle, and the leaflets near its two high points lie above its plane in every
-    valve (Levine et al. 1987, Circulation 75:756); above the surface that spans it only a leaflet
-    that bulges into the atrium does.
-    """
-    spanning, step = spanning_surface(annulus, plane), 0.2
+    """The first leaflet surface seen from the atrium above the plane and the minimal surface."""
+    film, step = spanning_surface(annulus, plane), 0.2
     image = project_leaflets(vertices, triangles, annulus, plane, step)
-    film = project_leaflets(spanning.vertices, spanning.triangles, annulus, plane, step)
+    below = project_leaflets(*film, annulus, plane, step).depth
     seen = image.inside & np.isfinite(image.depth)
     over_plane = np.where(seen, np.maximum(-image.depth, 0.0), 0.0)
-    both = seen & np.isfinite(film.depth)
+    both = seen & np.isfinite(below)
     over_film = np.zeros_like(over_plane)
-    over_film[both] = np.maximum(film.depth[both] - image.depth[both], 0.0)
+    over_film[both] = np.maximum(below[both] - image.depth[both], 0.0)
     return {
-        "annulus_area_3d_mm2": spanning.area,
+        "annulus_area_3d_mm2": float(areas(*film).sum()),
         "prolapse_height_mm": float(over_plane.max()),
         "prolapse_volume_mm3": float(over_plane.sum() * step**2),
         "billow_height_mm": float(over_film.max()),
@@ -288,19 +257,8 @@ def closure(
 
 
 def leaflet_length(vertices: FloatArray, triangles: IntArray, plane: AnnulusPlane) -> float:
-    """Length (mm) of a leaflet from annulus to free edge, in the middle of A2 or P2.
-
-    The section is the plane through the annulus centre spanned by its normal and the anterior
-    direction; its length is the sum of the segments in which it cuts the leaflet's triangles.
-
-    Parameters
-    ----------
-    vertices, triangles
-        The triangles of one leaflet.
-    plane : AnnulusPlane
-    """
-    across = unit_vector(np.cross(plane.normal, plane.anterior), "anterior direction")
-    segments, _ = plane_section(vertices, triangles, plane.origin, across)
+    """Length (mm) of a leaflet's ``triangles`` from annulus to free edge in the middle section."""
+    segments, _ = plane_section(vertices, triangles, plane.origin, plane.lateral)
     return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
 
 

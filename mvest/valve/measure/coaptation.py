@@ -1,11 +1,11 @@
 """How far a valve is closed: orifice in the line of sight, coaptation length and area, and the gap.
 
-Surfaces are leaflet midsurfaces in their current shape; a distance between two midsurfaces that
-touch equals the mean leaflet thickness, so give contact distances that include it.
+Surfaces are leaflet midsurfaces in their current shape. Two midsurfaces that touch are one leaflet
+thickness apart, so contact distances must include it.
 
-The gap is where a closed valve leaks. Midsurfaces that touch lie a thickness or more apart, and the
-slit between them is no leak. A line of sight from the atrium counts as open only where it keeps
-clear of every leaflet by half the distance at which two of them touch.
+The gap is where a closed valve leaks. The slit between two midsurfaces that touch is no leak: a
+line of sight from the atrium counts as open only if it is farther from every leaflet than half the
+distance at which two of them touch.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _rasterise(
     step: float,
     depth: FloatArray,
 ) -> None:
-    """Lower `depth` to the height of every triangle over the pixel centres it covers."""
+    """Set `depth` at all pixel centres to that of the first triangle that covers them."""
     rows, columns = depth.shape
     for t in range(triangles.shape[0]):
         a, b, c = points[triangles[t, 0]], points[triangles[t, 1]], points[triangles[t, 2]]
@@ -148,9 +148,8 @@ def orifice_area(
 ) -> float:
     """Orifice area (mm²) in the line of sight from the atrium.
 
-    The part of the projected annulus that no leaflet triangle covers, counted in pixels of
-    `resolution` (mm) looking along the annulus normal. An oblique gap between overlapping leaflets
-    is not seen.
+    Pixels of `resolution` (mm) within the annulus that no triangle covers along its normal. An
+    oblique gap between overlapping leaflets is not seen.
     """
     image = project_leaflets(vertices, triangles, annulus, plane, resolution)
     return float((image.inside & np.isinf(image.depth)).sum() * resolution**2)
@@ -163,15 +162,7 @@ def _in_contact(
     opposing: IntArray,
     contact_distance: float,
 ) -> BoolArray:
-    """Which points lie within the contact distance of an opposing, facing leaflet.
-
-    Raises
-    ------
-    GeometryError
-        If the contact distance is not positive.
-    """
-    if not (np.isfinite(contact_distance) and contact_distance > 0):
-        raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
+    """Which points lie within the contact distance of an opposing, facing leaflet."""
     if len(points) == 0 or len(opposing) == 0:
         return np.zeros(len(points), dtype=np.bool_)
     corners = vertices[opposing]
@@ -196,12 +187,11 @@ def coaptation_length(
     contact_distance: float,
     sampling: float = 0.02,
 ) -> float:
-    """Length (mm) over which two leaflets lie against each other in the middle AP plane.
+    """Length (mm) over which two leaflets touch in the middle anteroposterior plane.
 
-    Each leaflet is cut by the plane through the annulus centre spanned by annulus normal and
-    anterior direction. Counted is the arc length of its section whose points lie within
-    `contact_distance` of the other leaflet (anywhere, not only in the plane) where the two face
-    each other (surface normals more than 90° apart); of the two leaflets' lengths the smaller one.
+    The arc length of each leaflet's section within `contact_distance` of the other leaflet (in or
+    out of the plane), where the two face each other (normals more than 90° apart). The result is
+    the smaller of both lengths.
 
     Parameters
     ----------
@@ -213,7 +203,7 @@ def coaptation_length(
     contact_distance
         mm between midsurfaces: about the thickness plus the contact model's gap.
     sampling
-        mm between the points tested along a section; the answer is that fine.
+        mm between the tested points of a section.
     """
     lengths = []
     for own, other in ((first, second), (second, first)):
@@ -242,10 +232,10 @@ def coaptation_area(
     contact_distance: float,
     subdivisions: int = 3,
 ) -> float:
-    """Area (mm²) over which two leaflets lie against each other.
+    """Area (mm²) over which two leaflets touch.
 
-    Mean of the two leaflets' own areas within `contact_distance` of the other and facing it, each
-    triangle counted by ``subdivisions²`` equal parts. Parameters as in `coaptation_length`.
+    Mean of both leaflets' areas within `contact_distance` of the other and facing it. Each triangle
+    is cut into ``subdivisions²`` equal parts. Parameters as in `coaptation_length`.
     """
     weights = _part_centroids(subdivisions)
     touching = []
@@ -273,7 +263,7 @@ def _part_centroids(n: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gap:
-    """What is open of a closed valve, as an image seen from the atrium along the annulus normal.
+    """The gap of a closed valve as an image, seen from the atrium along the annulus normal.
 
     Attributes
     ----------
@@ -310,20 +300,14 @@ def find_gap(
     reach: float,
     resolution: float = 0.1,
 ) -> Gap:
-    """Find the gap of a closed valve.
-
-    A straight line along the annulus normal is open if it keeps farther than half of ``reach`` from
-    every midsurface; its distance from a leaflet is the distance of two points in the projection.
-    A gap that an overlapping leaflet hides is not counted.
+    """Find the gap of a closed valve; a gap that an overlapping leaflet hides is not counted.
 
     Parameters
     ----------
     vertices, triangles : ndarray
         Midsurfaces in their current shape, ``(n, 3)`` mm and ``(m, 3)``.
-    annulus : ndarray
-        ``(k, 3)`` mm in loop order.
-    plane : AnnulusPlane
-        Of that annulus.
+    annulus, plane
+        ``(k, 3)`` mm in loop order, and its plane.
     reach : float
         mm, largest distance of two midsurfaces that touch.
     resolution : float

@@ -1,7 +1,7 @@
-"""Run fTetWild on one surface, in a process of its own: it may crash without a Python exception.
+"""Run fTetWild on one surface in a child process: it may crash without a Python exception.
 
-Started by `mvest.valve.mesh.tetwild` as ``_tetwild_worker.py INPUT.npz OUTPUT.npz``, in
-a temporary folder because fTetWild writes files of its own into the current one.
+Started by `mvest.valve.mesh.tetwild` as ``_tetwild_worker.py INPUT.npz OUTPUT.npz`` in a temporary
+folder, because fTetWild writes files into the current one.
 """
 
 import importlib.util
@@ -13,8 +13,8 @@ import numpy as np
 
 def main(source: str, target: str) -> None:
     """Read surface and settings from `source` (npz), write nodes and tetrahedra to `target`."""
-    # From 0.4 on, importing the package asks for pyvista (with VTK, half a gigabyte) for something
-    # that is not needed here. So a package that does nothing stands for it.
+    # Since version 0.4 the package imports pyvista, which is not needed here. An empty package with
+    # the same path avoids that import.
     spec = importlib.util.find_spec("pytetwild")
     if spec is not None and spec.submodule_search_locations is not None:
         package = types.ModuleType("pytetwild")

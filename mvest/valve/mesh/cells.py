@@ -1,7 +1,7 @@
 """Elements that fill the cells of a regular lattice, and the outer faces of any mesh.
 
-A lattice has two steps along each axis of a cell, so that the nodes in the middle of edges are
-points of it. A cell is one brick, two wedges or six tetrahedra.
+A lattice has two steps along each axis of a cell, so that mid-edge nodes are lattice points. A cell
+is one brick, two wedges or six tetrahedra.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _TRIANGLES = (
     ((0, 0), (2, 2), (0, 2), (1, 1), (1, 2), (0, 1)),
 )
 _MIRRORED = {"quad9": [2, 1, 0, 5, 4, 3, 8, 7, 6], "tri6": [0, 2, 1, 5, 4, 3]}
-"""Nodes of a face in the order that turns its normal."""
+"""Nodes of a face in the order that reverses its normal."""
 
 
 def _cell(element_type: str) -> IntArray:
@@ -53,7 +53,7 @@ def lattice_elements(
     cells : tuple of int
         Along the first (fastest), second and third axis; the third is the thickness.
     left_handed : bool
-        Whether the lattice is laid out along left-handed axes.
+        Whether the lattice has left-handed axes.
     """
     reference, local = element(element_type), _cell(element_type)
     if left_handed and reference.layered:
@@ -68,7 +68,7 @@ def lattice_elements(
 
 
 def numbered(grid: IntArray, points: tuple[int, int, int]) -> tuple[IntArray, IntArray]:
-    """Elements ``(m, k)`` and places ``(n, 3)`` of their nodes on a lattice of so many points."""
+    """Elements ``(m, k)`` and lattice positions ``(n, 3)`` of their nodes."""
     number = np.ravel_multi_index(tuple(np.moveaxis(grid, -1, 0)), points, order="F")
     used, elements = np.unique(number, return_inverse=True)
     at = np.stack(np.unravel_index(used, points, order="F"), axis=-1)
@@ -78,23 +78,16 @@ def numbered(grid: IntArray, points: tuple[int, int, int]) -> tuple[IntArray, In
 def box(
     element_type: str, cells: tuple[int, int, int], size: tuple[float, float, float]
 ) -> tuple[FloatArray, IntArray]:
-    """Nodes and elements of the block ``[0, size]``, its third axis being the thickness.
+    """Nodes ``(n, 3)`` mm and elements ``(m, k)`` of the block ``[0, size]``.
 
     Parameters
     ----------
     element_type : str
         Any element; each cell becomes one brick, two wedges or six tetrahedra.
     cells : tuple of int
-        Cells along x, y and z.
+        Cells along x, y and z; z is the thickness.
     size : tuple of float
         mm.
-
-    Returns
-    -------
-    nodes : ndarray
-        ``(n, 3)`` mm.
-    elements : ndarray
-        ``(m, k)`` node indices.
 
     Raises
     ------
@@ -109,10 +102,10 @@ def box(
 
 
 def local_faces(element_type: str) -> IntArray:
-    """Local nodes ``(f, kf)`` of an element's faces, normals out of it.
+    """Local nodes ``(f, kf)`` of an element's faces, with outward normals.
 
-    Of layered elements only the two faces across the thickness: pressure acts on those. The nodes
-    have the order of the element's face (see :mod:`mvest.elements`).
+    Layered elements have two faces only, those across the thickness, on which pressure acts. Nodes
+    have the order of the face element (:mod:`mvest.elements`).
     """
     reference = element(element_type)
     if reference.layered:
@@ -123,7 +116,7 @@ def local_faces(element_type: str) -> IntArray:
 
 
 def boundary(elements: IntArray, element_type: str) -> tuple[IntArray, IntArray]:
-    """Faces that belong to one element only: their elements ``(f,)``, and their numbers there.
+    """Faces of one element only: their elements ``(f,)`` and local numbers ``(f,)``.
 
     Raises
     ------
@@ -144,19 +137,7 @@ def boundary(elements: IntArray, element_type: str) -> tuple[IntArray, IntArray]
 
 
 def outer_faces(elements: IntArray, element_type: str) -> IntArray:
-    """Faces that belong to one element only, normals pointing out of the solid.
-
-    Parameters
-    ----------
-    elements : ndarray
-        ``(m, k)``.
-    element_type : str
-
-    Returns
-    -------
-    faces : ndarray
-        ``(f, kf)``, see `local_faces`.
-    """
+    """Faces ``(f, kf)`` of one element only, with outward normals (see `local_faces`)."""
     elements = np.asarray(elements)
     owner, which = boundary(elements, element_type)
     return np.asarray(elements[owner[:, None], local_faces(element_type)[which]])

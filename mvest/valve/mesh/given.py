@@ -1,8 +1,8 @@
-"""A valve that is given as a surface, laid out and meshed as the template is.
+"""Sampling and meshing of a valve that is given as a surface.
 
-Leaflets may also be thickened and meshed with tetrahedra, and get labels, fibres and pressure
-faces. The mesher keeps neither vertices nor labels, so everything is found again by nearness: the
-region and the fibre from the midsurface, the side of an outer face from the closed surface.
+With material coordinates it is meshed in layers like the template. Otherwise its thickened leaflets
+are meshed with tetrahedra. The mesher keeps neither vertices nor labels, so these are transferred
+by nearness: regions and fibres from the midsurface, pressure faces from the closed surface.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mvest.valve.mesh.tetwild import tetrahedralize
 
 
 class GivenValve:
-    """A valve from outside in every resolution, and its meshes.
+    """An imported valve in any resolution, and its meshes.
 
-    With two leaflets it has material coordinates (`mvest.valve.anatomy.band.Band`) and may be
-    meshed in layers; otherwise it is what was given, and its meshes are unstructured.
+    A valve with two leaflets has material coordinates (`mvest.valve.anatomy.band.Band`) and can be
+    meshed in layers. Any other valve keeps its given surface and has unstructured meshes.
     """
 
     def __init__(self, given: Valve) -> None:
@@ -38,7 +38,7 @@ class GivenValve:
 
     @cached_property
     def band(self) -> Band | None:
-        """Material coordinates, of two leaflets.
+        """Material coordinates of a valve with two leaflets.
 
         Raises
         ------
@@ -48,7 +48,7 @@ class GivenValve:
         return Band(self.given) if len(self.region_names) == 2 else None
 
     def valve(self, columns: int, rows: int) -> Valve:
-        """The valve sampled on ``columns x rows`` vertices; as it was given without coordinates."""
+        """The valve on ``columns x rows`` vertices, or as given without material coordinates."""
         return self.given if self.band is None else self.band.sampled(columns, rows)
 
     def normals(self, columns: int, rows: int) -> FloatArray:
@@ -95,10 +95,9 @@ def tetrahedral_leaflets(
 ) -> SolidMesh:
     """Thicken leaflets, mesh them with pytetwild, and transfer labels, fibres and faces.
 
-    Elements take the region of the midsurface triangle nearest to their centroid. Fibres are those
-    of the nearest midsurface point, projected on the tangent plane there. Pressure faces are the
-    outer faces nearest to the closed surface's ventricular triangles, among those that face the
-    same way.
+    An element has the region of the midsurface triangle nearest to its centroid. Fibres are those
+    of the nearest midsurface point, projected on its tangent plane. Pressure faces are the outer
+    faces nearest to ventricular triangles of the closed surface that face the same way.
 
     Parameters
     ----------
@@ -116,7 +115,7 @@ def tetrahedral_leaflets(
     InputError
         The element type is neither ``tet4`` nor ``tet10``.
     MeshingError
-        See there, or the pressure faces' area is not that of the ventricular side.
+        As `tetrahedralize`, or the area of the pressure faces is not that of the ventricular side.
     """
     if element_type not in ("tet4", "tet10"):
         raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")
@@ -125,25 +124,35 @@ def tetrahedral_leaflets(
     owner, which = boundary(elements, "tet4")
     faces = elements[owner[:, None], local_faces("tet4")[which]]
     pressure = _ventricular(nodes, faces, closed)
-    _check_pressure_area(nodes, faces[pressure], closed)
+    ventricular = closed.triangles[closed.kind == FACE_KINDS.index("ventricular")]
+    wanted = areas(closed.vertices, ventricular).sum()
+    area = areas(nodes, faces[pressure]).sum()
+    if abs(area - wanted) > PRESSURE_AREA_TOLERANCE * wanted:
+        raise MeshingError(
+            f"pressure faces cover {area:.1f} mm^2 of the {wanted:.1f} mm^2 of the ventricular "
+            f"side; give a shorter edge_length"
+        )
     centroids = nodes[elements].mean(axis=1)
     nearest = closest_points(centroids, surface.vertices, surface.triangles)
     if element_type == "tet10":
         nodes, elements = with_middles(nodes, elements)
         faces = elements[owner[:, None], local_faces("tet10")[which]]
+    fibre = _fibres(nodes, surface)[elements]
+    # Elements interpolate between their nodes, whose fibres must therefore agree in sign.
+    fibre = np.where((fibre * fibre[:, :1]).sum(axis=2, keepdims=True) < 0, -fibre, fibre)
     return SolidMesh(
         nodes=nodes,
         elements=elements,
         element_type=element_type,
         region=surface.region[nearest.triangle],
         region_names=surface.region_names,
-        fibre=_alike_within_elements(_fibres(nodes, surface)[elements]),
+        fibre=fibre,
         pressure_faces=faces[pressure],
     )
 
 
 def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> IntArray:
-    """Outer faces whose nearest facing part of the closed surface is ventricular."""
+    """Outer faces whose nearest triangle that faces the same way is ventricular."""
     centroids = nodes[faces].mean(axis=1)
     normals = area_vectors(nodes, faces)
     distance = np.full((len(faces), len(FACE_KINDS)), np.inf)
@@ -154,20 +163,9 @@ def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> I
             continue
         nearest = closest_points(centroids, closed.vertices, closed.triangles[numbers])
         facing = (normals * closed_normals[numbers[nearest.triangle]]).sum(axis=1) > 0
-        # A face that looks away is a candidate of last resort, behind every facing one.
+        # Triangles that face the other way count only if there is no other.
         distance[:, kind] = nearest.distance + np.where(facing, 0.0, 1e6)
     return np.flatnonzero(distance.argmin(axis=1) == FACE_KINDS.index("ventricular"))
-
-
-def _check_pressure_area(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> None:
-    ventricular = closed.triangles[closed.kind == FACE_KINDS.index("ventricular")]
-    wanted = areas(closed.vertices, ventricular).sum()
-    area = areas(nodes, faces).sum()
-    if abs(area - wanted) > PRESSURE_AREA_TOLERANCE * wanted:
-        raise MeshingError(
-            f"pressure faces cover {area:.1f} mm^2 of the {wanted:.1f} mm^2 of the ventricular "
-            f"side; give a shorter edge_length"
-        )
 
 
 def _fibres(nodes: FloatArray, surface: LeafletSurface) -> FloatArray:
@@ -185,15 +183,4 @@ def _fibres(nodes: FloatArray, surface: LeafletSurface) -> FloatArray:
             f"fibres stand upright on the leaflet near {np.round(nodes[bad[0]], 2)} mm; they must "
             f"lie in it"
         )
-    result: FloatArray = tangent / length
-    return result
-
-
-def _alike_within_elements(fibre: FloatArray) -> FloatArray:
-    """Turn the fibres ``(m, k, 3)`` of every element's nodes to agree in sign.
-
-    A fibre and its negative are the same tissue, but elements interpolate between their nodes.
-    """
-    lead = fibre[:, :1]
-    result: FloatArray = np.where((fibre * lead).sum(axis=2, keepdims=True) < 0, -fibre, fibre)
-    return result
+    return np.asarray(tangent / length)

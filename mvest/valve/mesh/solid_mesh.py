@@ -1,9 +1,9 @@
-"""The solid mesh of a valve: nodes, elements, what tissue each is, and where the pressure acts.
+"""The solid mesh of a valve: nodes, elements, regions, fibres and pressure faces.
 
-Material points can be embedded in it. Whatever must not depend on the mesh (observation vertices,
-contact samples, chord patches, the hinge) is given as points of the reference frame. Here they get
-a host element and shape-function weights, so that the position of a point is ``weights @ nodal
-positions`` in any state and any mesh.
+Material points can be embedded in it. What must not depend on the mesh (observation vertices,
+contact samples, chord patches, the hinge) is given as points of the reference frame. Each gets a
+host element and shape-function weights, so that its position is ``weights @ nodal positions`` in
+any state.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class SolidMesh:
         ``(m,)`` index into ``region_names``.
     region_names : tuple of str
     fibre : ndarray
-        ``(m, k, 3)`` unit collagen directions at the nodes of each element, so that the direction
-        may jump between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
+        ``(m, k, 3)`` unit collagen directions at the nodes of each element: directions may jump
+        between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
     pressure_faces : ndarray
         ``(f, kf)`` nodes of the ventricular faces, normals pointing out of the solid.
 
     Raises
     ------
     InputError, GeometryError
-        On wrong shapes, values that are not finite, unused nodes, fibres without direction, or an
-        element whose Jacobian determinant is not positive at a quadrature point.
+        Wrong shapes, values that are not finite, unused nodes, fibres without direction, or
+        elements whose Jacobian determinant is not positive at a quadrature point.
     """
 
     nodes: FloatArray
@@ -122,7 +122,7 @@ class SolidMesh:
 
 
 LAST_STEP = 1e-9
-"""In reference coordinates; the step after one this small, its square, is round-off."""
+"""In reference coordinates; the Newton step after one this small is round-off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +136,7 @@ class Embedding:
     weights : ndarray
         ``(k, w)``, each row sums to one.
     host : ndarray
-        ``(k,)`` host element, or -1 where a point has none (averages over several elements).
+        ``(k,)`` host element, or -1 for averages over several elements.
     """
 
     nodes: IntArray
@@ -194,28 +194,18 @@ def _weighted_sums(nodes: IntArray, weights: FloatArray, values: FloatArray) -> 
 def embed(
     mesh: SolidMesh, points: FloatArray, *, tolerance: float = 1.0, candidates: int = 12
 ) -> Embedding:
-    """Embed points of the reference frame in ``mesh``.
+    """Embed points ``(k, 3)`` mm of the reference frame in ``mesh``.
 
-    Each point gets the element whose map it inverts with the smallest violation of the element's
-    bounds (Newton iteration per candidate element). Points slightly outside the mesh (a coarse mesh
-    cuts corners of a curved surface) are extrapolated within their nearest element.
-
-    Parameters
-    ----------
-    mesh : SolidMesh
-    points : ndarray
-        ``(k, 3)`` mm.
-    tolerance : float
-        Largest accepted distance (mm) of a point from the mesh.
-    candidates : int
-        Number of nearest elements tried.
+    The map of the nearest ``candidates`` elements is inverted by Newton's method; the host is the
+    element whose bounds the point violates least. Points slightly outside the mesh (a coarse mesh
+    cuts corners of a curved surface) are extrapolated from their nearest element.
 
     Raises
     ------
     InputError
         If ``points`` is not ``(k, 3)`` finite.
     GeometryError
-        If a point is farther from the mesh than ``tolerance``.
+        If a point is farther from the mesh than ``tolerance`` mm.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -242,8 +232,7 @@ def embed(
     distance = np.maximum(best, 0.0) * size / 2
     far = np.flatnonzero(np.isfinite(distance) & (distance > tolerance))
     for c in range(n_try if far.size else 0):
-        # Elements are thin: a point beyond a face is nearer to its element than the same violation
-        # beyond an end would be.
+        # Elements are thin: a violation across a face is a shorter distance than one along it.
         e = near[far, c]
         xi, error = _invert(mesh, e, points[far])
         at = np.einsum(

@@ -1,9 +1,8 @@
 """Tetrahedral meshes of closed surfaces by pytetwild (fTetWild; Hu et al. 2020, ACM TOG 39:117).
 
-fTetWild meshes open or NaN surfaces without complaint, may end the process on bad input, returns
-negative volumes, and is not deterministic. So the surface is checked first, the mesher runs in a
-process of its own, its answer is checked against the surface, and the mesh is stored under the
-hash of its input and read back ever after.
+fTetWild accepts open surfaces and NaN, may crash on bad input, returns negative volumes, and is not
+deterministic. Therefore the surface is checked first, the mesher runs in a child process, its
+result is checked against the surface, and the mesh is cached under the hash of its input.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ Tetrahedra: TypeAlias = tuple[FloatArray, IntArray]
 ENVELOPE_SHARE = 0.05
 """Largest distance of the mesh's surface from the given one, over the edge length."""
 SHAPING: dict[str, Any] = {"stop_energy": 10.0, "iterations": 80, "coarsen": False}
-"""fTetWild's own: shape energy at which it stops (lower is better), rounds, few tetrahedra."""
+"""fTetWild's settings: shape energy at which it stops, most iterations, whether to coarsen."""
 TIME_LIMIT = 300.0
-"""s after which the mesher is stopped."""
+"""Time limit of the mesher, s."""
 VOLUME_TOLERANCE = 0.05
 """Largest relative difference between the volumes of mesh and surface."""
 DISTANCE_TOLERANCE = 0.5
@@ -47,7 +46,7 @@ DISTANCE_TOLERANCE = 0.5
 def tetrahedralize(
     vertices: FloatArray, triangles: IntArray, edge_length: float, store: Path | None = None
 ) -> Tetrahedra:
-    """Mesh the inside of a closed surface, or read the mesh made of it before.
+    """Mesh the inside of a closed surface, or read the cached mesh.
 
     Parameters
     ----------
@@ -56,17 +55,16 @@ def tetrahedralize(
     edge_length
         Target, mm.
     store
-        Folder in which the mesh is cached as ``tetwild-KEY.npz``, KEY being the hash of surface and
-        settings. Not given, the mesh is made anew, and never the same twice.
+        Cache folder. Without it the mesh is made anew, and differs each time.
 
     Raises
     ------
     ConfigurationError
         The edge length is not positive.
     GeometryError
-        The surface has a fault; its name and the triangles are in the message.
+        The surface is invalid.
     MeshingError
-        The mesher failed, crashed or took too long, its mesh does not fit the surface, or a stored
+        The mesher failed, crashed or took too long, its mesh does not fit the surface, or a cached
         mesh is damaged.
     """
     if not (np.isfinite(edge_length) and edge_length > 0):
@@ -83,15 +81,22 @@ def tetrahedralize(
         return make()
 
     def read(path: Path) -> Tetrahedra:
-        return _checked(*_load(path), vertices, triangles, envelope)
+        try:
+            nodes, tetrahedra = read_npz(path, ["nodes", "tetrahedra"]).values()
+        except InputError as fault:
+            raise MeshingError(f"{path}: stored mesh is unreadable ({fault}); delete it") from fault
+        return _checked(nodes, tetrahedra, vertices, triangles, envelope)
+
+    def save(path: Path, mesh: Tetrahedra) -> None:
+        np.savez_compressed(path, nodes=mesh[0], tetrahedra=mesh[1])
 
     path = Path(store) / f"tetwild-{_key(vertices, triangles, edge_length)}.npz"
-    # Another mesh would not be the same again.
-    return Entry(path, read, remake=False).get_or_make(make, _save)
+    # A damaged entry is not remade: the new mesh would differ.
+    return Entry(path, read, remake=False).get_or_make(make, save)
 
 
 def _key(vertices: FloatArray, triangles: IntArray, edge_length: float) -> str:
-    """Hash of everything that shapes the mesh; limits that only accept or refuse it are not in."""
+    """Hash of everything that shapes the mesh, without the limits that only accept or refuse it."""
     digest = hashlib.sha256()
     digest.update(np.ascontiguousarray(vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(triangles, dtype="<i8").tobytes())
@@ -101,8 +106,8 @@ def _key(vertices: FloatArray, triangles: IntArray, edge_length: float) -> str:
 
 
 def _mesh(vertices: FloatArray, triangles: IntArray, edge_length: float) -> Tetrahedra:
-    """Run the mesher in its own process and return its raw answer."""
-    # Its lengths are relative to the diagonal of the bounding box.
+    """Run the mesher in a child process and return its raw result."""
+    # fTetWild's lengths are relative to the diagonal of the bounding box.
     share = edge_length / float(np.linalg.norm(np.ptp(vertices[np.unique(triangles)], axis=0)))
     with tempfile.TemporaryDirectory(prefix="tetwild-") as folder:
         source, target = Path(folder) / "surface.npz", Path(folder) / "mesh.npz"
@@ -131,15 +136,11 @@ def _mesh(vertices: FloatArray, triangles: IntArray, edge_length: float) -> Tetr
                 f"({edge_length:g} mm now)"
             ) from None
         if done.returncode != 0 or not target.exists():
-            raise MeshingError(f"pytetwild {_failure(done.returncode, done.stderr)}")
+            lines = [line for line in done.stderr.splitlines() if line.strip()]
+            message = f": {lines[-1].strip()}" if lines else " without a message"
+            raise MeshingError(f"pytetwild failed: {ending(done.returncode)}{message}")
         nodes, tetrahedra = read_npz(target, ["nodes", "tetrahedra"]).values()
         return nodes, tetrahedra
-
-
-def _failure(code: int, stderr: str) -> str:
-    lines = [line for line in stderr.splitlines() if line.strip()]
-    message = f": {lines[-1].strip()}" if lines else " without a message"
-    return f"failed: {ending(code)}{message}"
 
 
 def _checked(
@@ -149,7 +150,7 @@ def _checked(
     triangles: IntArray,
     envelope: float,
 ) -> Tetrahedra:
-    """Orient the mesh, and refuse it unless it fills the surface."""
+    """The oriented mesh; MeshingError unless it fills the surface."""
     if len(tetrahedra) == 0 or not np.isfinite(nodes).all():
         raise MeshingError(
             f"pytetwild returned {len(tetrahedra)} tetrahedra on {len(nodes)} nodes; expected "
@@ -175,7 +176,7 @@ def _checked(
             f"{change:.1%} apart, expected at most {VOLUME_TOLERANCE:.0%}; give a shorter "
             "edge_length"
         )
-    # The mesher checks its envelope on samples, hence the margin.
+    # The mesher checks its envelope at samples only, hence the margin.
     away = closest_points(nodes[np.unique(faces)], vertices, triangles).distance.max()
     if away > 1.5 * envelope:
         raise MeshingError(
@@ -190,28 +191,14 @@ def _checked(
     return nodes, tetrahedra
 
 
-def _save(path: Path, mesh: Tetrahedra) -> None:
-    nodes, tetrahedra = mesh
-    np.savez_compressed(path, nodes=nodes, tetrahedra=tetrahedra)
-
-
-def _load(path: Path) -> Tetrahedra:
-    try:
-        nodes, tetrahedra = read_npz(path, ["nodes", "tetrahedra"]).values()
-    except InputError as fault:
-        raise MeshingError(f"{path}: stored mesh is unreadable ({fault}); delete it") from fault
-    return nodes, tetrahedra
-
-
 def volumes(nodes: FloatArray, tetrahedra: IntArray) -> FloatArray:
     """Signed volume ``(m,)`` mm³ of every tetrahedron."""
     edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
-    result: FloatArray = np.linalg.det(edges) / 6.0
-    return result
+    return np.asarray(np.linalg.det(edges) / 6.0)
 
 
 def orient(nodes: FloatArray, tetrahedra: IntArray) -> IntArray:
-    """Tetrahedra with two corners exchanged wherever the volume is negative."""
+    """Tetrahedra with two corners exchanged if the volume was negative."""
     result = np.array(tetrahedra, dtype=np.int64)
     negative = volumes(nodes, result) < 0
     result[negative, 2], result[negative, 3] = result[negative, 3], result[negative, 2].copy()

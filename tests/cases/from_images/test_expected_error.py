@@ -98,13 +98,6 @@ def test_samples_are_as_wide_as_the_error_of_one_more_valve(law):
     assert np.mean(square) < (1.05, 0.9, 0.5)[(0.0, 0.3, 2.0).index(law)] * np.mean(plain)
 
 
-def test_a_valve_that_is_found_elsewhere_than_all_others_is_less_sure():
-    shapes, errors, _ = made_up(3, 30, noise=0.3, law=1.0)
-    near, far = shapes.mean(axis=0), shapes.mean(axis=0) + 5 * (shapes[0] - shapes.mean(axis=0))
-    width = [error_at_shape(SMALL, errors, shapes, at)[1].std() for at in (near, far)]
-    assert width[1] > 1.3 * width[0]
-
-
 def test_the_expected_error_is_taken_off_in_the_axes_of_the_valve():
     # Taken off in the image's axes; shapes compared in axes that are not the valve's own.
     rng = np.random.default_rng(4)

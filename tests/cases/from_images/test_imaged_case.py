@@ -88,10 +88,6 @@ def test_thickness_and_fibres_vary_as_in_the_template():
     away = np.abs(np.sin(np.deg2rad(LAYOUT.phi))) > 0.3
     assert along[away].min() > 0.97
     assert np.median(along) > 0.995
-    # Half-way to the commissure they are turned by half a right angle, to one side only.
-    turned = case.surface.fibre @ TURN
-    t = np.cross(valve.surface.fibre, turned)
-    assert np.median(np.linalg.norm(t, axis=1)) < 0.1
     thicker = case_of_sequence(
         sequence(), FRAMES, TEXTS, thickness_mm={"anterior": 2.64, "posterior": 1.26}
     )
@@ -107,13 +103,12 @@ def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
     assert found.open == int(np.argmax(orifice)) == 0
     assert found.closed not in (0, 1)
     assert len(found.derived) == 2
-    assert all(str(n) in text for n, text in zip((found.closed, 0), found.derived, strict=True))
     # Frames that no one believes in are not chosen, whatever they show.
     unsure = replace(seen, frame_confidence=np.array([0.3, 0.8, 0.85, 0.9]))
     assert choose_frames(unsure, rows, 120.0).open == 1
     told = choose_frames(seen, rows, 120.0, open_=1, closed=3)
     assert (told.open, told.closed, told.derived) == (1, 3, ())
-    with pytest.raises(InputError, match=r"0 of 4 frames .*landmarks by hand"):
+    with pytest.raises(InputError, match=r"0 of 4 frames .*imaged\.open_frame"):
         choose_frames(replace(seen, frame_confidence=np.full(4, 0.2)), rows, 120.0)
     with pytest.raises(InputError, match="closed frame 4, expected one of 0 to 3"):
         choose_frames(seen, rows, 120.0, closed=4)
@@ -168,7 +163,7 @@ def test_a_surface_that_is_no_valve_is_refused_with_its_frame():
             case_of_sequence(seen, FRAMES, TEXTS)
 
 
-def test_frames_and_pressures_that_are_none_are_refused():
+def test_frames_pressures_and_thicknesses_out_of_place_are_refused():
     with pytest.raises(InputError, match="both the open and the closed"):
         CaseFrames(1, 1, 100.0)
     with pytest.raises(InputError, match=r"pressure of frame 2 = 16.0 mmHg"):

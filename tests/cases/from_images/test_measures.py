@@ -1,4 +1,4 @@
-"""Measures of every frame, and the files of a valve from images, read back."""
+"""Measures of every frame with their bands, and the files of a valve from images."""
 
 import csv
 import dataclasses
@@ -7,9 +7,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from mvest.cases.from_images.detector_errors import BANDED, valve_axes, with_bands
 from mvest.cases.from_images.measures import (
     closed_frame,
-    contact_distance,
     measure_sequence,
     write_landmarks,
     write_measures,
@@ -18,6 +18,7 @@ from mvest.cases.from_images.measures import (
 from mvest.errors import InputError
 from mvest.exchange.markups import read_markups
 from mvest.exchange.surfaces import read_surface
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import LANDMARKS
 from tests import made_up_sequence
@@ -45,10 +46,7 @@ def test_the_closed_frame_has_all_and_the_open_one_no_tenting(rows):
         for what in ("tenting", "prolapse", "billow")
         for part in ("height_mm", "volume_mm3")
     }
-    assert (closed["frame"], opened["frame"]) == (0, 1)
-    assert opened["time_s"] == pytest.approx(0.04)
-    assert closed["confidence"] == 0.9
-    assert closed["vertex_confidence_mean"] == pytest.approx(0.8)
+    assert (opened["frame"], opened["time_s"], opened["confidence"]) == (1, 0.04, 0.9)
     assert opened["orifice_mm2"] > 100 > closed["orifice_mm2"]
     # The annulus stands still, the tips come 0.8 mm nearer.
     assert closed["annulus_area_mm2"] == pytest.approx(opened["annulus_area_mm2"])
@@ -57,17 +55,21 @@ def test_the_closed_frame_has_all_and_the_open_one_no_tenting(rows):
     assert opened["coaptation_length_mm"] == 0.0
 
 
-def test_leaflets_touch_within_their_thickness_and_their_error(valve):
-    one = dataclasses.replace(valve, std_mm=np.full(valve.layout.size, 0.3))
-    assert contact_distance(one, 1.0) == pytest.approx(1.0 + 0.3 * np.sqrt(2))
-    never = dataclasses.replace(valve, std_mm=np.full(valve.layout.size, np.nan))
-    assert contact_distance(never, 1.2) == 1.2
+def test_leaflets_touch_within_their_thickness_and_their_error():
+    valve = made_up_sequence.sequence((1.0,), SMALL)
+    for std, reach in ((0.3, 1.0 + 0.3 * np.sqrt(2)), (np.nan, 1.0)):
+        seen = dataclasses.replace(valve, std_mm=np.full(SMALL.size, std))
+        assert measure_sequence(seen, 1.0)[0]["contact_distance_mm"] == pytest.approx(reach)
+    with pytest.raises(InputError, match="thickness_mm = nan"):
+        measure_sequence(valve, np.nan)
 
 
-@pytest.mark.parametrize("thickness", [0.0, -1.0, np.nan])
-def test_a_thickness_that_is_none_is_refused(valve, thickness):
-    with pytest.raises(InputError, match="thickness_mm"):
-        measure_sequence(valve, thickness)
+def test_the_table_has_a_row_per_frame_and_empty_cells(tmp_path, rows):
+    with write_measures(tmp_path, rows).open(encoding="utf-8") as stream:
+        read = list(csv.DictReader(stream))
+    assert len(read) == 2
+    assert read[1]["tenting_height_mm"] == ""
+    assert float(read[0]["ap_diameter_mm"]) == pytest.approx(rows[0]["ap_diameter_mm"], rel=1e-6)
 
 
 def test_a_frame_without_a_valve_is_empty():
@@ -79,21 +81,6 @@ def test_a_frame_without_a_valve_is_empty():
     for row in rows[1:]:
         assert {name for name, value in row.items() if value is not None} == own
     assert rows[0]["ap_diameter_mm"] is not None
-
-
-def test_the_table_has_a_row_per_frame_and_empty_cells(tmp_path, rows):
-    with write_measures(tmp_path, rows).open(encoding="utf-8") as stream:
-        read = list(csv.DictReader(stream))
-    assert len(read) == 2
-    assert read[1]["tenting_height_mm"] == ""
-    assert float(read[0]["ap_diameter_mm"]) == pytest.approx(rows[0]["ap_diameter_mm"], rel=1e-6)
-
-
-def test_nothing_to_write_and_nowhere_to_write_are_refused(tmp_path, rows):
-    with pytest.raises(InputError, match="no frames"):
-        write_measures(tmp_path, [])
-    with pytest.raises(InputError, match="cannot write"):
-        write_measures(tmp_path / "none", rows)
 
 
 def test_the_closed_frame_is_where_most_touches(rows):
@@ -126,7 +113,6 @@ def test_the_surfaces_carry_their_times_confidence_and_leaflets(tmp_path):
 def test_landmarks_are_read_back_in_place(tmp_path):
     valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
     lists = read_markups(write_landmarks(tmp_path / "points.mrk.json", valve, 1))
-    assert list(lists) == ["landmarks", "annulus", "free edge", "AnnulusLabelsMarkup"]
     assert lists["AnnulusLabelsMarkup"].labels == ("A", "P", "AL", "PM", "ALC", "PMC", "MC")
     named = lists["landmarks"]
     assert named.labels == LANDMARKS
@@ -139,4 +125,54 @@ def test_landmarks_are_read_back_in_place(tmp_path):
     np.testing.assert_allclose(lists["free edge"].points, valve.free_edge[1])
     with pytest.raises(InputError, match="frame 2, expected 0 to 1"):
         write_landmarks(tmp_path / "other.mrk.json", valve, 2)
-    assert [path.name for path in tmp_path.iterdir()] == ["points.mrk.json"]
+
+
+CLOSED, OPEN = 0, 1
+LENGTHS = ("ap_diameter_mm", "commissural_diameter_mm", "annulus_height_mm", "tip_separation_mm",
+           "tip_depth_mm")  # fmt: skip
+
+
+def swollen(valve, shares):
+    """Errors of detectors that see a valve larger, all of it alike, by these shares (K, 2) of it.
+
+    Of each sample in the open and in the closed frame.
+    """
+    errors = np.zeros((len(shares), 2, SMALL.size, 3))
+    tips = np.zeros((len(shares), 2, 2, 3))
+    for which, frame in enumerate((OPEN, CLOSED)):
+        axes, centre = valve_axes(valve, frame), valve.annulus[frame].mean(axis=0)
+        share = np.asarray(shares)[:, which, None, None]
+        errors[:, which] = share * ((valve.vertices[frame] - centre) @ axes)
+        tips[:, which] = share * ((valve.tips[frame] - centre) @ axes)
+    return DetectionAccuracy(np.ones(SMALL.size), 5.0, errors, tips)
+
+
+def test_a_valve_seen_larger_or_smaller_gives_lengths_a_band_of_that_share():
+    valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
+    rows = measure_sequence(valve, 1.0)
+    shares = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])
+    banded = with_bands(valve, rows, swollen(valve, np.stack([shares, 0 * shares], axis=1)))
+    # Student's bound of four degrees of freedom, for one further number (any table of it).
+    half = 2.776 * np.std(shares, ddof=1) * np.sqrt(1 + 1 / 5)
+    for name in LENGTHS:
+        seen = rows[OPEN][name]
+        assert banded[OPEN][f"{name}_low"] == pytest.approx(seen * (1 - half), rel=1e-4), name
+        assert banded[OPEN][f"{name}_high"] == pytest.approx(seen * (1 + half), rel=1e-4), name
+        # In closed frames there is no error.
+        assert banded[CLOSED][f"{name}_low"] == pytest.approx(rows[CLOSED][name])
+        assert banded[CLOSED][f"{name}_high"] == pytest.approx(rows[CLOSED][name])
+    assert [{name: row[name] for name in rows[0]} for row in banded] == rows
+    # Without the mean error, where the valve is.
+    centred = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))
+    for row, own in zip(rows, centred, strict=True):
+        for end in ("low", "high"):
+            found = own[f"annulus_area_mm2_{end}"]
+            assert found == pytest.approx(0.9**2 * row["annulus_area_mm2"])
+
+
+def test_a_frame_without_a_valve_has_no_band():
+    valve = made_up_sequence.sequence((1.0, 1.0), SMALL)
+    valve.frame_confidence[1] = 0.0
+    rows = measure_sequence(valve, 1.0)
+    empty = with_bands(valve, rows, swollen(valve, np.full((3, 2), 0.1)))[1]
+    assert {empty[f"{name}_{end}"] for name in BANDED for end in ("low", "high")} == {None}

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.estimation import EnsembleFilter, Gaussian, IteratedFilter, Prediction, Reason
-from mvest.estimation.filters.ensemble import exact_ensemble
-from tests.estimation.problems import Linear, square
-
-
-def test_the_drawn_ensemble_has_exactly_the_priors_mean_and_covariance() -> None:
-    X = exact_ensemble(6, 4, np.random.default_rng(2))
-    np.testing.assert_allclose(X.mean(axis=0), 0.0, atol=1e-14)
-    np.testing.assert_allclose(X.T @ X / 5, np.eye(4), atol=1e-14)
+from mvest.estimation import EnsembleFilter, IteratedFilter, Prediction, Reason
+from tests.estimation.problems import Linear
 
 
 @pytest.mark.parametrize(("members", "steps"), [(5, 1), (5, 3), (12, 1), (40, 4)])
@@ -29,15 +22,6 @@ def test_the_square_root_is_the_kalman_filter_exactly(members: int, steps: int) 
     np.testing.assert_allclose(found.prediction.jacobian, problem.H, atol=1e-10)
     reference = problem.by(IteratedFilter())
     assert found.innovation.nis == pytest.approx(reference.innovation.nis, rel=1e-9)
-
-
-def test_after_k_of_n_steps_the_ensemble_has_seen_k_nths() -> None:
-    problem = Linear()
-    found = problem.by(EnsembleFilter(8, 4), plain=True)
-    information = problem.H.T @ np.diag(1 / problem.R) @ problem.H
-    for k in range(5):
-        P = np.linalg.inv(np.linalg.inv(problem.prior.covariance) + k / 4 * information)
-        np.testing.assert_allclose(found.iterate_covariances[k], P, rtol=1e-9, atol=1e-10)
 
 
 def perturbed(problem, members, seed=1):
@@ -58,22 +42,11 @@ def test_perturbed_observations_approach_the_covariance_like_one_over_root_n() -
     # is 2/N to within 4 √(2/40) = 0.9 of itself; without the perturbations the spread would be too
     # small by the factor (I − K H), and the error would not fall with N.
     problem = Linear(p=1)
-    for members in (20, 320):
+    for members in (16, 64):
         found = [perturbed(problem, members, seed).covariance[0, 0] for seed in range(40)]
         errors = np.array(found) / problem.covariance[0, 0] - 1.0
         ratio = np.mean(np.square(errors)) / (2.0 / members)
         assert 0.1 < ratio < 1.9
-
-
-def test_more_steps_are_nearer_to_the_posterior_of_a_non_linear_model() -> None:
-    # h = m², prior N(2, 1), y = 6, R = 0.02: mode near √6, standard deviation about 1/34 (Gauss
-    # Newton: √(R)/(2 m) = 0.029). One step takes its gain from the whole prior and its residual
-    # for a part of the noise; four take it from where they have come to.
-    prior, y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 0.02
-    reference = IteratedFilter()(square, prior, y, R)
-    one, four = (EnsembleFilter(20, steps)(square, prior, y, R) for steps in (1, 4))
-    assert abs(four.mean[0] - reference.mean[0]) < 0.5 * abs(one.mean[0] - reference.mean[0])
-    assert abs(four.std[0] / reference.std[0] - 1) < abs(one.std[0] / reference.std[0] - 1)
 
 
 def with_failures(p, members, failing):

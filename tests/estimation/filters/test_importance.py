@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.errors import InputError
 from mvest.estimation import Gaussian, ImportanceFilter, Prediction, Reason, UnscentedFilter
 from tests.estimation.problems import Linear, banana, gridded, wings
 
@@ -68,8 +67,3 @@ def test_where_the_model_fails_there_is_no_posterior() -> None:
     density = np.exp(-0.5 * (grid - 0.26) ** 2 / 0.2)
     expected = np.sum(grid * density) / np.sum(density)
     assert found.mean[0] == pytest.approx(expected, abs=4.0 * 0.3 / np.sqrt(60.0))
-
-
-def test_settings_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(InputError, match="batches of at least 10"):
-        ImportanceFilter(batch=5)

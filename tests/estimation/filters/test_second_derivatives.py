@@ -81,15 +81,6 @@ def test_iterations_that_do_not_end_are_ended_by_newton_steps():
     assert np.all(np.abs(better.mean - exact.mean) < 0.1 * exact.std)
 
 
-def test_what_is_left_out_is_the_residual_times_the_second_derivatives():
-    y = observed(-4.0)
-    assert filtered(y).curvature is None
-    better = filtered(y, second_order=True)
-    residual = BENT @ (y - bent(better.mean).y)
-    # Over a standard deviation to both sides the fourth power of the saddle counts, too.
-    assert better.curvature == pytest.approx(-residual * BEND, abs=0.1)
-
-
 def test_errors_by_samples_reach_the_estimate_as_they_move_it():
     y = observed(-4.0)
     better = filtered(y, second_order=True)

@@ -8,7 +8,6 @@ from mvest.estimation import (
     ExtendedFilter,
     Gaussian,
     IteratedFilter,
-    Log,
     Prediction,
     Reason,
     UnscentedFilter,
@@ -69,23 +68,6 @@ def test_hand_worked_rounds_on_a_square() -> None:
     assert twice.forward_solves == 2 * 2 + 1
 
 
-def test_close_points_give_the_iterated_extended_filter() -> None:
-    # With a spread of 1e-4 the slope is the derivative but for the second order, and the fixed
-    # point the posterior mode 1 + √2 with the variance 1/(7 + 4√2) (see test_filters).
-    found = UnscentedFilter(spread=1e-4, tolerance=1e-10)(square, PRIOR, Y, R)
-    assert found.converged
-    assert found.mean[0] == pytest.approx(1 + np.sqrt(2), rel=1e-7)
-    assert found.covariance[0, 0] == pytest.approx(1 / (7 + 4 * np.sqrt(2)), rel=1e-6)
-
-
-def test_observations_are_counted_once_however_many_rounds() -> None:
-    prior = Gaussian(np.zeros(1), np.eye(1))
-    for rounds in (1, 2, 7):
-        filter_ = UnscentedFilter(max_iterations=rounds, tolerance=1e-300)
-        found = filter_(Prediction.undifferentiated, prior, np.ones(1), 1.0)
-        assert found.covariance[0, 0] == pytest.approx(0.5, rel=1e-14)
-
-
 def test_points_draw_together_where_the_model_fails() -> None:
     # The points of the prior are 2 ± 1; beyond 2.6 the model fails, so that the spread is halved,
     # to 2 ± 1/2, and nothing else changes for a linear model.
@@ -111,18 +93,6 @@ def test_a_parameter_that_the_prior_holds_fixed_stays() -> None:
     reference = IteratedFilter()(problem.differentiated, prior, problem.y, problem.R)
     np.testing.assert_allclose(found.mean, reference.mean, rtol=1e-11)
     np.testing.assert_allclose(found.covariance, reference.covariance, rtol=1e-10, atol=1e-14)
-
-
-def test_it_works_in_logarithms() -> None:
-    # log h is linear in log m, so that in logarithms h(m) = log m is the linear problem itself.
-    model = lambda m: Prediction.undifferentiated(np.log(m))  # noqa: E731
-    prior = Gaussian(np.array([3.0]), np.array([[9.0 * 0.25]]))  # standard deviation of the log 0.5
-    found = UnscentedFilter()(model, prior, np.array([1.0]), 0.25, transform=Log())
-    # Equal variances: half way between log 3 and 1; variance 1/8.
-    assert np.log(found.mean[0]) == pytest.approx(0.5 * (np.log(3.0) + 1.0), rel=1e-12)
-    assert found.transformed.covariance[0, 0] == pytest.approx(0.125, rel=1e-12)
-    # dh/dm = 1/m, from the slope 1 in logarithms.
-    assert found.prediction.jacobian[0, 0] == pytest.approx(1 / found.mean[0], rel=1e-12)
 
 
 def test_inadmissible_settings_and_models_are_refused() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction, identifiability
+from mvest.estimation import Gaussian, IteratedFilter, Prediction, identifiability
 from mvest.estimation.information.identifiability import shift_by_model_error, with_shift
 from tests.estimation.problems import bound
 
@@ -21,6 +21,37 @@ def test_the_bound_of_a_straight_line_by_hand():
     # A slope known beforehand to 0.5, as one more observation: H'R^-1H = [[6, 6], [6, 10 + 4]].
     prior = Gaussian.from_variance(np.zeros(2), np.array([1e12, 0.25]))
     assert bound(H, 0.5, prior)[0, 0] == pytest.approx(14.0 / (6 * 14 - 36))
+
+
+def test_identifiability_by_hand():
+    # H = diag(2, 1), R = 1/4: information diag(16, 4), standard deviations 1/4 and 1/2. In units of
+    # (10, 1): 1600 and 4, the worst combination is the second parameter.
+    report = identifiability(np.diag([2.0, 1.0]), 0.25, np.array([10.0, 1.0]))
+    np.testing.assert_allclose(report.std, [0.25, 0.5])
+    np.testing.assert_allclose(report.eigenvalues, [4.0, 1600.0])
+    np.testing.assert_allclose(np.abs(report.eigenvectors[:, 0]), [0.0, 1.0], atol=1e-15)
+    np.testing.assert_allclose(report.information, np.diag([1600.0, 4.0]), atol=1e-10)
+    assert report.condition_number == pytest.approx(400.0)
+    # A parameter that is seen stays known beside one that is not.
+    blind = identifiability(np.array([[2.0, 0.0], [0.0, 0.0]]), 1.0, np.ones(2))
+    assert blind.std[0] == pytest.approx(0.5)
+    assert blind.std[1] == np.inf
+
+
+def test_two_parameters_with_the_same_effect_are_not_determined():
+    # The relative combination (E, q) = (1, 1)/√2 changes nothing.
+    values = np.array([6.0, 1.0])
+    H = np.outer(np.arange(1.0, 5.0), [-1.0 / values[0], 1.0])
+    report = identifiability(H, 0.01, values, names=("E", "pressure_scale"))
+    (words,) = report.flat()
+    assert words.endswith("not determined at all")
+    assert report.condition_number == np.inf
+    assert np.all(np.isinf(report.std))
+    assert np.all(np.isnan(report.correlation))
+    # A prior of 10 % on the pressure makes the modulus known to 10 %.
+    prior = Gaussian(values, np.diag([100.0**2, 0.1**2]))
+    known = identifiability(H, 1e-6, values, prior=prior)
+    assert known.std[0] / values[0] == pytest.approx(0.1, rel=1e-2)
 
 
 def test_parameters_that_act_alike_are_named_with_how_one_makes_up_for_the_other():
@@ -94,26 +125,3 @@ def test_the_shift_is_the_difference_of_two_estimates_of_a_linear_model():
     wider = with_shift(found, shift)
     np.testing.assert_allclose(wider.std, np.hypot(found.std, shift))
     np.testing.assert_array_equal(wider.mean, found.mean)
-
-
-def test_the_shift_is_in_the_coordinates_of_the_filter():
-    H, y, offset = drawn(6)
-    prior = Gaussian.from_variance(np.ones(2), np.ones(2))
-    # Linear in the logarithms.
-    found, moved = (
-        IteratedFilter(1e-12)(
-            lambda m: Prediction(H @ np.log(m), H / m), prior, seen, R, transform=Log()
-        )
-        for seen in (y, y + offset)
-    )
-    difference = moved.transformed.mean - found.transformed.mean
-    np.testing.assert_allclose(shift_by_model_error(found, R, offset), difference, rtol=1e-8)
-
-
-def test_what_the_prior_holds_is_not_shifted():
-    held = Gaussian.from_variance(np.zeros(2), np.array([1.0, 0.0]))
-    found = estimated(np.ones((3, 2)), np.zeros(3), held, 0.01)
-    shift = shift_by_model_error(found, 0.01, np.ones(3))
-    assert shift[1] == 0.0
-    # One parameter, three observations: 300 of 300 + 1.
-    assert shift[0] == pytest.approx(300 / 301)

@@ -49,7 +49,6 @@ def test_the_settings_that_name_files_are_found():
         ("case", "case"),
         ("volume", "volume"),
         ("volume", "imaged.model"),
-        ("volume", "imaged.landmarks"),
         ("imported", "donor.recording"),
         ("external", "external.command"),
         ("external", "external.inputs"),
@@ -92,8 +91,7 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
             file = folder / f"{folder.name}{ending}"
             file.write_text("1")
         return str(folder), file
-    listed = {"imaged.landmarks": [[2, str(file)]]}
-    listed |= {"external.inputs": [str(file)], "heart.muscles": [str(file)]}
+    listed: dict = {"external.inputs": [str(file)], "heart.muscles": [str(file)]}
     listed["external.command"] = [sys.executable, f"--mesh={file}"]
     listed["external.python"] = f"{file}:function"
     return listed.get(name.replace(".models", ""), str(file)), file

@@ -151,7 +151,7 @@ def test_each_case_changes_its_own_setting_only():
             "guided": model.guide is not None,
             "perturbed": None if model.perturbation is None else float(model.perturbation.sum()),
             "start": model.continuation,
-            "rest": (settings.tissue, settings.damping, model.names, model.anchors),
+            "rest": (settings.tissue, settings.damping, model.names),
             "observed": model.valve.surface.vertices.shape,
         }
 

@@ -114,7 +114,7 @@ def test_an_absent_recording_is_one_clear_line(run, tmp_path: Path, monkeypatch)
         ("donor.starts=[]", "expected lists of 3 moduli"),
         ("donor.vertices=10", "remesh to 10 vertices"),
         ("donor.vertexes=10", "did you mean vertices?"),
-        ("mechanics.element=hex18", "cannot thicken into 'hex18'"),
+        ("mechanics.element=hex18", "layers of 'hex18'"),
         ("mechanics.protocol.pressure_mmHg=5", "the recording says how large the pressure is"),
         ("donor.annulus=Rand", "no node set 'Rand'; there are ALL"),
         ("donor.case=Other", "there is no folder"),

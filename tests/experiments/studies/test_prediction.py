@@ -13,7 +13,7 @@ from experiments.common.records.record import read_record
 from experiments.common.study import Results
 from experiments.studies import prediction
 from experiments.studies.prediction import DRAWN, PREDICTED, coverage_table
-from mvest.closure.anchors import ClosedState
+from mvest.closure.continuation import ClosedState
 from mvest.closure.model import ClosureModel
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import build_system

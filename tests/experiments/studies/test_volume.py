@@ -13,7 +13,6 @@ import pytest
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.detector_errors import valve_axes
 from mvest.errors import InputError
-from mvest.exchange.markups import PointList, write_markups
 from mvest.exchange.segmentations import write_sequence_nrrd
 from mvest.files import sha256_of
 from mvest.imaging.detection.detect import NoValveError
@@ -52,9 +51,9 @@ def run(run, monkeypatch, volume):
     )
     told = []
 
-    def detect(volume, given, *, min_confidence, landmarks=None, progress=None):
+    def detect(volume, given, *, min_confidence, progress=None):
         assert given is model
-        told.append((volume, landmarks))
+        told.append(volume)
         return sequence()
 
     detected = "mvest.cases.from_images.detected"
@@ -88,7 +87,7 @@ def finds(monkeypatch, found):
     """Let the detectors find this, or fail with it; what confidence they are told."""
     told = []
 
-    def detect(volume, model, *, min_confidence, landmarks=None, progress=None):
+    def detect(volume, model, *, min_confidence, progress=None):
         told.append(min_confidence)
         if isinstance(found, NoValveError):
             raise found
@@ -161,36 +160,12 @@ def test_the_pressure_may_come_from_a_curve(run, tmp_path):
     assert read_case(case).frames[-1].pressure_mmHg == pytest.approx(96.0)
 
 
-def test_landmarks_placed_by_hand_are_handed_on(run, tmp_path):
-    points = PointList(("tip_0", "commissure_180"), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
-    write_markups(tmp_path / "hand.mrk.json", {"mine": points})
-    assert run("check=true", "imaged.landmarks=[[2,hand.mrk.json]]")[0] == 0
-    ((_, landmarks),) = run.told
-    assert set(landmarks) == {2}
-    np.testing.assert_array_equal(landmarks[2]["commissure_180"], [4.0, 5.0, 6.0])
-    # One of them is not placed, and a line lies beside.
-    lists = json.loads((tmp_path / "hand.mrk.json").read_text())
-    lists["markups"][0]["controlPoints"][0] |= {"position": "", "positionStatus": "undefined"}
-    lists["markups"].insert(0, {"type": "Line", "controlPoints": [{"position": [1, 2, 3]}]})
-    (tmp_path / "hand.mrk.json").write_text(json.dumps(lists))
-    status, out, _ = run("check=true", "imaged.landmarks=[[2,hand.mrk.json]]")
-    assert status == 0
-    assert "landmarks of frame 2: tip_0 not placed" in out
-    assert set(run.told[-1][1][2]) == {"commissure_180"}
-    strange = PointList(("apex",), np.zeros((1, 3)))
-    write_markups(tmp_path / "hand.mrk.json", {"mine": strange})
-    status, _, err = run("check=true", "imaged.landmarks=[[2,hand.mrk.json]]")
-    assert status == 2
-    assert "points apex, expected some of commissure_0" in err
-
-
 @pytest.mark.parametrize(
     ("arguments", "pressure", "message"),
     [
         (("imaged.pressure_curve=curve.csv",), True, "expected one of them"),
         (("imaged.pressure_mmHg=16",), False, "16.0 mmHg on the closed valve"),
         (("imaged.closed_frame=9",), True, "closed frame 9, expected one of 0 to 3"),
-        (("imaged.landmarks=[3,a]",), True, "imaged.landmarks has 3, expected [frame, FILE]"),
         (("imaged.thickness_mm=[1.2]",), True, "one number for each of anterior, posterior"),
         (("imaged.modality=xray",), True, "imaged.modality = 'xray'"),
         (("volume=null",), True, "volume is not given"),

@@ -6,7 +6,7 @@ An oracle stands in for trees. Features are replaced by the geometry they were t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from mvest.imaging.detection import leaflets, pose_search
 from mvest.imaging.detection.leaflets import landmark_points
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.pose_search import MODES
+from mvest.imaging.detection.pose_search import MODES, REFINEMENTS
 from mvest.imaging.detection.shape_model import LabelledFrame
-from mvest.imaging.detection.trained_model import STAGES, DetectionModel
+from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.valve_sequence import MovingValve
+from mvest.imaging.valve_sequence import LANDMARKS, MovingValve
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.template import Template
 from tests import made_up_sequence
@@ -89,16 +89,16 @@ def ball_volume(spacing, direction, origin, shape, points, width_mm=2.0, backgro
 
 
 # --- oracles ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class NumberedFrame:
-    """Stands in for a frame: says which one it is."""
+class NumberedFrame(NamedTuple):
+    """Stands in for a frame: only its number."""
 
     number: int = 0
 
 
-def labelled(true, shape, seed=0, frame=NumberedFrame()):
+FIRST = NumberedFrame()
+
+
+def labelled(true, shape, seed=0, frame=FIRST):
     """A frame to draw samples from."""
     return LabelledFrame(frame, *true, shape, np.random.default_rng(seed))
 
@@ -151,22 +151,21 @@ def rim_oracle(truths, layout, row):
     return knowing(truths, 2, answer)
 
 
-def boundary_oracle(truths, layout, width_mm=0.6, best=1.0):
+def boundary_oracle(truths, layout, best=1.0):
     """How likely a place is on the true leaflet, at most `best`; they come vertex by vertex."""
 
     def answer(true, here):
         gap = gaps(here, true.vertices[np.arange(len(here)) * layout.size // len(here)])[:, 2:]
-        return best * np.exp(-0.5 * (gap / width_mm) ** 2)
+        return best * np.exp(-0.5 * (gap / 0.6) ** 2)
 
     return knowing(truths, 1, answer)
 
 
-def landmark_oracle(truths, layout, number):
-    return knowing(
-        truths,
-        3,
-        lambda true, here: gaps(here, landmark_points(true.vertices, true.tips, layout)[number]),
-    )
+def landmark_oracle(truths, layout, k):
+    def answer(true, here):
+        return gaps(here, landmark_points(true.vertices, true.tips, layout)[k])
+
+    return knowing(truths, 3, answer)
 
 
 def rating_oracle(truths, shape, best=1.0):
@@ -182,19 +181,21 @@ def rating_oracle(truths, shape, best=1.0):
 
 def refinement_oracle(truths, share=0.8):
     """Corrects a share of the error."""
-    return knowing(
-        truths, 7, lambda true, here: share * here.towards(true.pose.repeated(len(here)))
-    )
+
+    def answer(true, here):
+        return share * here.towards(true.pose.repeated(len(here)))
+
+    return knowing(truths, 7, answer)
 
 
-def start_oracle(truths, shape, modes):
+def start_oracle(truths, shape):
     def answer(true, here):
         local = here.local(np.broadcast_to(true.vertices, (len(here), *true.vertices.shape)))
         tips = here.local(np.broadcast_to(true.tips, (len(here), 2, 3)))
-        b = shape.coefficients(local)[:, :modes] / shape.std[:modes]
+        b = shape.coefficients(local)[:, :MODES] / shape.std[:MODES]
         return np.concatenate([b, (tips - shape.tips).reshape(-1, 6)], axis=1)
 
-    return knowing(truths, modes + 6, answer)
+    return knowing(truths, MODES + 6, answer)
 
 
 def position_oracle(truths):
@@ -206,7 +207,7 @@ def position_oracle(truths):
 
 
 def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
-    """A detection model all of whose trees know where the valve is in every frame.
+    """A detection model whose trees know the valve of every frame.
 
     Poses are rated `best` at most, and the boundary `seen`.
     """
@@ -215,16 +216,13 @@ def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
         "position": position_oracle(truths),
         "pose_coarse": rating,
         "pose_fine": rating,
-        "shape": start_oracle(truths, shape, MODES),
+        **{f"pose_refine_{k}": refinement_oracle(truths) for k in range(len(REFINEMENTS))},
+        "shape": start_oracle(truths, shape),
+        **{f"landmark_{k}": landmark_oracle(truths, layout, k) for k in range(len(LANDMARKS))},
         "annulus": rim_oracle(truths, layout, 0),
         "free_edge": rim_oracle(truths, layout, -1),
-        "boundary": boundary_oracle(truths, layout, best=seen),
+        "boundary": boundary_oracle(truths, layout, seen),
     }
-    for name in STAGES:
-        if name.startswith("pose_refine"):
-            known[name] = refinement_oracle(truths)
-        elif name.startswith("landmark_"):
-            known[name] = landmark_oracle(truths, layout, int(name.removeprefix("landmark_")))
     return DetectionModel(shape, known, {}, accuracy)
 
 

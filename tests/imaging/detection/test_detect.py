@@ -3,18 +3,10 @@
 import numpy as np
 import pytest
 
-from mvest.imaging.detection import detect
 from mvest.imaging.detection.detect import fit_frame
-from mvest.imaging.detection.leaflets import landmark_points, leaflet_axes
-from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.detection.pose_search import search_poses
-from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (
-    LAYOUT,
     NumberedFrame,
     Oracle,
-    Placed,
-    moving_valve,
     oracle_model,
     placed,
     poses,
@@ -22,13 +14,6 @@ from tests.imaging.detection.made_up import (
 )
 
 MISSED = np.array([[2.0, -1.5, 1.0, 0.1, -0.08, 0.1, 0.04]])
-
-
-def by_hand_at(points):
-    fixed = np.full((len(LANDMARKS), 3), np.nan)
-    for number, point in points.items():
-        fixed[number] = point
-    return fixed
 
 
 def mean_gap(a, b):
@@ -41,14 +26,6 @@ def true(shape, monkeypatch):
     found = placed(shape, poses(1, 2), b)
     use_geometry(monkeypatch, [found])
     return found
-
-
-def test_the_search_finds_the_pose(shape, true):
-    found, ratings = search_poses(NumberedFrame(), oracle_model(shape, [true]).boosters, 3)
-    assert len(found) == len(ratings) == 3
-    by = found.towards(true.pose.repeated(3))[0]
-    assert np.linalg.norm(by[:3]) < 1.0
-    assert np.linalg.norm(by[3:6]) < 0.1
 
 
 def fitted(shape, true, pose=None, **more):
@@ -69,28 +46,6 @@ def test_the_fit_arrives_at_the_true_valve(shape, true):
     assert mean_gap(found.vertices, shown) < 0.3
 
 
-def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypatch):
-    # A valve unlike those the model learned from: a loose free displacement follows what is seen,
-    # a stiff one leaves the fitted shape.
-    valve = moving_valve(77)
-    x, tips = true.pose.world(valve.vertices[1])[0], true.pose.world(valve.tips[1])[0]
-    other = Placed(x, tips, pose_of(x, tips, LAYOUT, shape.size_mm))
-    use_geometry(monkeypatch, [other])
-
-    def errors(stiffness):
-        monkeypatch.setattr(detect, "STIFFNESS", stiffness)
-        monkeypatch.setattr(detect, "HOLD", 0.001)
-        found = fitted(shape, other, other.pose.moved(MISSED))
-        off = leaflet_axes(x, LAYOUT)[:, :, 2]
-        shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
-        return [np.abs(((v - x) * off).sum(axis=1)).mean() for v in (shown, found.vertices)]
-
-    shown, loose = errors(0.02)
-    assert shown > 0.2
-    assert loose < 0.5 * shown
-    assert errors(1e5)[1] > 0.8 * shown
-
-
 def test_a_given_start_is_begun_with(shape, true):
     # Trees that read no shape off at a pose have no part in it.
     b = shape.coefficients(true.pose.local(true.vertices[None]))[0]
@@ -99,30 +54,6 @@ def test_a_given_start_is_begun_with(shape, true):
     for model in (oracle_model(shape, [true]), blind):
         found = fit_frame(NumberedFrame(), model, true.pose, coefficients=b, tips=true.tips)
         assert mean_gap(found.vertices, true.vertices) < 0.3
-
-
-@pytest.mark.parametrize("name", ["annulus_anterior", "free_edge_posterior", "commissure_180"])
-def test_a_landmark_placed_by_hand_stays_where_it_was_put(shape, true, name):
-    # Trees see the valve elsewhere: the hand is believed, also by the free displacement at the end.
-    number = LANDMARKS.index(name)
-    vertex = landmark_vertices(LAYOUT)[name]
-    by_hand = true.vertices[vertex] + 3.0 * true.pose.rotation[0][:, 2]
-    found = fitted(shape, true, fixed=by_hand_at({number: by_hand}))
-    assert np.linalg.norm(found.vertices[vertex] - by_hand) < 0.5
-    far = np.linalg.norm(true.vertices - true.vertices[vertex], axis=1) > 15
-    assert mean_gap(found.vertices[far], true.vertices[far]) < 1.0
-
-
-def test_a_tip_placed_by_hand_is_the_tip(shape, true):
-    by_hand = true.tips[1] + np.array([2.0, -1.0, 0.5])
-    found = fitted(shape, true, fixed=by_hand_at({LANDMARKS.index("tip_180"): by_hand}))
-    np.testing.assert_array_equal(found.tips[1], by_hand)
-    np.testing.assert_allclose(found.tips[0], true.tips[0], atol=1e-3)
-    # With all landmarks by hand none is looked for.
-    points = landmark_points(true.vertices, true.tips, LAYOUT)
-    found = fitted(shape, true, true.pose.moved(MISSED), fixed=points)
-    np.testing.assert_array_equal(found.tips, true.tips)
-    assert mean_gap(found.vertices, true.vertices) < 0.3
 
 
 def test_the_confidence_is_what_is_seen_of_leaflets_and_part_of_the_pose_rating(shape, true):

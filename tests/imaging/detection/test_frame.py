@@ -10,10 +10,8 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.detection.frame import (
-    LEVELS,
     SamplePattern,
     StandardFrame,
-    directions,
     features,
     standard_frame,
 )
@@ -58,43 +56,6 @@ def test_gain_offset_and_type_make_no_difference(to):
     np.testing.assert_array_equal(framed(volume, to(dark)).data, expected.data)
 
 
-@pytest.mark.parametrize("spacing", [0.8, 1.3])
-@pytest.mark.parametrize("power", [0.5, 6.0])
-def test_a_monotone_map_of_grey_values_makes_no_difference(spacing, power):
-    # A map that crushes dark values in few of 256 even bins, or interpolation before ranks.
-    volume = cube((spacing,) * 3, shape=(24, 27, 29))
-    grey = volume.frames.astype(np.float32)
-    expected = framed(volume, grey)
-    found = framed(volume, 1000.0 * (grey / 255.0) ** power)
-    assert np.abs(found.data.astype(int) - expected.data).max() <= 1
-
-
-def test_ranks_are_shares_of_darker_voxels():
-    volume = cube(width_mm=4.0)
-    ranks, grey = framed(volume).level(0), volume.frames[0]
-    assert ranks.max() >= 250
-    order = np.argsort(grey.ravel(), kind="stable")
-    assert np.all(np.diff(ranks.ravel()[order].astype(int)) >= 0)
-    for threshold in (60, 128, 200):
-        assert np.mean(ranks < threshold) == pytest.approx(threshold / 255, abs=0.04)
-
-
-def test_outside_the_field_of_view_ranks_are_zero_and_are_left_out():
-    # Were the black half counted, nothing inside would rank below the middle.
-    volume = cube(shape=(48, 43, 41))
-    frames = volume.frames.copy()
-    frames[:, :20] = 0
-    frames[:, 20:] = np.maximum(frames[:, 20:], 1)
-    frame = framed(volume, frames)
-    ranks = frame.level(0)
-    assert np.all(ranks[:12] == 0)
-    assert np.all(ranks[28:] > 0)
-    assert np.percentile(ranks[28:], 5) < 64
-    for number in range(LEVELS):
-        side = 2**number
-        assert np.all(frame.level(number)[: 12 // side] == 0)
-
-
 def test_dark_blood_is_within_the_field_of_view_and_what_lies_beyond_is_not():
     # A pyramid of echo with a black pool in it: the pool is dark, the corners are nothing.
     volume = cube(shape=(48, 48, 48))
@@ -109,16 +70,6 @@ def test_dark_blood_is_within_the_field_of_view_and_what_lies_beyond_is_not():
     far = np.hypot(i - 24, j - 24) > 16 + 0.4 * k
     assert np.all(ranks[far] == 0)
     assert np.all(ranks[wide] > 0)
-
-
-def test_wide_ranges_of_grey_values_are_ranked_like_narrow_ones():
-    # Tables over all values for 32-bit numbers would not fit; comparing some voxels must do.
-    volume = cube(width_mm=4.0)
-    narrow = framed(volume)
-    for factor, dtype in ((3_000_000, np.int32), (100, np.int16), (1e-6, np.float32)):
-        scaled = (volume.frames.astype(np.float64) * factor).astype(dtype)
-        found = framed(volume, scaled)
-        assert np.abs(found.data.astype(int) - narrow.data).max() <= 2
 
 
 @pytest.mark.parametrize(
@@ -137,26 +88,17 @@ def test_what_is_no_image_is_refused(to, message):
     assert "\n" not in str(told.value)
 
 
-def test_frames_are_not_confused():
-    volume = cube()
-    frames = np.concatenate([volume.frames, volume.frames[:, ::-1]])
-    both = replace(volume, frames=frames, times=np.array([0.0, 0.1]))
-    first, second = standard_frame(both, 0), standard_frame(both, 1)
-    np.testing.assert_array_equal(second.level(0), first.level(0)[::-1])
-
-
 # --- places -------------------------------------------------------------------------------------
 
 GRIDS = [
     ((0.8, 0.8, 0.8), (38, 43, 41)),
-    ((0.75, 0.85, 0.8), (37, 40, 45)),  # within a fifth: left as it is
     ((0.5, 0.9, 1.4), (61, 35, 27)),  # resampled finer and coarser
     ((1.7, 0.4, 0.8), (21, 83, 40)),
 ]
 
 
 @pytest.mark.parametrize(("spacing", "shape"), GRIDS)
-@pytest.mark.parametrize("direction", [np.eye(3), ROTATION, MIRRORED])
+@pytest.mark.parametrize("direction", [ROTATION, MIRRORED])
 def test_a_bright_ball_is_at_its_place_in_every_level(spacing, shape, direction):
     # Half a voxel of some level, of the old or the new grid, or transposed axes, are seen here.
     frame = standard_frame(cube(spacing, direction, shape, 2.5), 0)
@@ -169,22 +111,6 @@ def test_a_bright_ball_is_at_its_place_in_every_level(spacing, shape, direction)
         middle = (weight[:, None] * centres).sum(axis=0) / weight.sum()
         tolerance = 0.1 * 0.8 * 2**number
         assert np.linalg.norm(middle - POINT) < max(0.12, tolerance), number
-
-
-@pytest.mark.parametrize(("spacing", "shape"), GRIDS)
-def test_the_corners_of_the_volume_stay_its_corners(spacing, shape):
-    # A first voxel's centre kept as origin while voxels grow shifts everything by up to 0.5 mm.
-    volume = cube(spacing, MIRRORED, shape)
-    frame = standard_frame(volume, 0)
-    step = np.linalg.inv(frame.to_index)
-    size = frame.shapes[0]
-    for corner in ((0, 0, 0), (1, 0, 1), (1, 1, 1)):
-        there = np.array(corner)
-        old = volume.world(there * np.array(shape) - 0.5)
-        new = frame.origin + step @ (there * size - 0.5)
-        np.testing.assert_allclose(new, old, rtol=0, atol=1e-9)
-    edges = np.linalg.norm(step, axis=0)
-    assert np.all((edges > 0.64) & (edges < 0.96))
 
 
 def test_levels_are_means_over_cubes_and_odd_sides_are_filled_up():
@@ -256,25 +182,6 @@ def test_a_ramp_is_read_at_turned_and_scaled_offsets(direction, level):
     np.testing.assert_allclose(features(frame, pattern, points, some.axes), value(at), atol=0.51)
 
 
-def test_levels_of_one_pattern_are_not_mixed_up():
-    frame = frame_of(np.random.default_rng(1).uniform(0, 255, SHAPE))
-    pattern = SamplePattern(np.zeros((3, 3)), np.arange(3), NO_PAIRS)
-    for level in range(3):
-        index = (np.array([3, 4, 5]) + 0.5) * 2**level - 0.5
-        found = at_points(frame, pattern, [ORIGIN + ROTATION @ (SPACING * index)])[0]
-        assert found[level] == pytest.approx(frame.level(level)[3, 4, 5], abs=1e-3)
-
-
-def test_pairs_are_differences_of_first_minus_second():
-    frame, _ = ramp(ROTATION)
-    offsets = np.array([[0.0, 0, 0], [3.0, 0, 0], [0, 3.0, 0]])
-    pattern = SamplePattern(offsets, np.zeros(3, np.int64), np.array([[0, 1], [2, 1]]))
-    found = at_points(frame, pattern, [middle(ROTATION)])
-    assert found.shape == (1, 5)
-    np.testing.assert_allclose(found[0, 3], found[0, 0] - found[0, 1])
-    np.testing.assert_allclose(found[0, 4], found[0, 2] - found[0, 1])
-
-
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_outside_the_volume_features_are_zero(level):
     frame = frame_of(np.full(SHAPE, 200.0))
@@ -300,25 +207,3 @@ def test_a_side_of_a_single_voxel_is_read_within_its_bounds():
     places = [[1.2, 1.7, 0.0], [3.0, 3.0, 0.3], [3.4, 3.4, -0.4]]
     found = at_points(frame, SamplePattern(np.zeros((1, 3)), one, NO_PAIRS), places)
     np.testing.assert_allclose(found[:, 0], 100, atol=1e-3)
-
-
-def test_no_hypotheses_give_no_features():
-    frame, _ = ramp(ROTATION)
-    pattern = SamplePattern.paired(np.ones((4, 3)) * np.arange(4)[:, None], np.zeros(4, int), 3, 0)
-    assert features(frame, pattern, np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0, 7)
-
-
-def test_pairs_are_of_two_samples_and_rather_near_ones():
-    offsets = np.random.default_rng(2).standard_normal((60, 3)) * 8
-    first, second = SamplePattern.paired(offsets, np.zeros(60, np.int64), 400, 5).pairs.T
-    assert np.all(first != second)
-    gap = np.linalg.norm(offsets[first] - offsets[second], axis=1)
-    every = np.linalg.norm(offsets[:, None] - offsets, axis=2)[~np.eye(60, dtype=bool)]
-    assert gap.mean() < 0.9 * every.mean()
-
-
-def test_directions_are_unit_vectors_all_around():
-    d = directions(40)
-    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1)
-    np.testing.assert_allclose(d.mean(axis=0), 0, atol=0.02)
-    np.testing.assert_allclose(d.T @ d / 40, np.eye(3) / 3, atol=0.03)

@@ -10,29 +10,16 @@ import pytest
 
 from mvest.imaging.detection import pose_search, tracking
 from mvest.imaging.detection.detect import NoValveError, fit_frame
-from mvest.imaging.detection.leaflets import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
-from mvest.imaging.valve_sequence import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
-from tests.imaging.detection.made_up import (
-    LAYOUT,
-    NumberedFrame,
-    Oracle,
-    oracle_model,
-    placed,
-    poses,
-    position_oracle,
-    rating_oracle,
-    use_geometry,
-)
+from tests.imaging.detection import made_up as made
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
-FRAMES = [NumberedFrame(k) for k in range(4)]
+FRAMES = [made.NumberedFrame(k) for k in range(4)]
 STEPS = [f"pose_refine_{k}" for k in range(3)]
-NO_HANDS = np.full((len(TIMES), len(LANDMARKS), 3), np.nan)
 
 
 @pytest.fixture
@@ -44,15 +31,15 @@ def unsmoothed(monkeypatch):
 def truths(shape, monkeypatch):
     """A valve that moves and closes a little over four frames, which oracles know."""
     rng = np.random.default_rng(3)
-    pose, b = poses(1, 2), rng.standard_normal(8) * 0.5 * shape.std[:8]
+    pose, b = made.poses(1, 2), rng.standard_normal(8) * 0.5 * shape.std[:8]
     found = []
     for k in range(len(TIMES)):
         moved = pose.moved(np.array([[0.4 * k, -0.3 * k, 0.5 * k, 0, 0.01 * k, 0, 0.0]]))
         b = b.copy()
         b[0] = (0.3 * k - 0.4) * shape.std[0]
-        found.append(placed(shape, moved, b))
-    use_geometry(monkeypatch, found)
-    monkeypatch.setattr(tracking, "standard_frame", lambda volume, k: NumberedFrame(k))
+        found.append(made.placed(shape, moved, b))
+    made.use_geometry(monkeypatch, found)
+    monkeypatch.setattr(tracking, "standard_frame", lambda volume, k: made.NumberedFrame(k))
     return found
 
 
@@ -61,12 +48,10 @@ def volume(count=4):
     return VolumeSequence(grey, np.ones(3), np.eye(3), np.zeros(3), times, source="made up.nrrd")
 
 
-def detected(shape, truths, frames=4, *, landmarks=None, min_confidence=0.7, progress=None, **of):
+def detected(shape, truths, frames=4, *, min_confidence=0.7, progress=None, **of):
     """What oracles make of a volume."""
-    model = oracle_model(shape, truths, **of)
-    return detect_valve(
-        volume(frames), model, min_confidence=min_confidence, landmarks=landmarks, progress=progress
-    )
+    model = made.oracle_model(shape, truths, **of)
+    return detect_valve(volume(frames), model, min_confidence=min_confidence, progress=progress)
 
 
 # --- whole sequences ----------------------------------------------------------------------------
@@ -83,7 +68,7 @@ def test_the_valve_is_found_in_every_frame(shape, truths, unsmoothed):
         np.testing.assert_allclose(found.tips[k], true.tips, atol=0.05)
     np.testing.assert_array_equal(found.times, TIMES)
     assert np.all(found.frame_confidence > 0.9)
-    assert found.vertex_confidence.shape == (4, LAYOUT.size)
+    assert found.vertex_confidence.shape == (4, made.LAYOUT.size)
     assert told == [(k + 1, 4) for k in range(4)]
     assert np.all(np.isnan(found.std_mm))
     assert np.isnan(found.correlation_length_mm)
@@ -93,7 +78,7 @@ def test_the_valve_is_found_in_every_frame(shape, truths, unsmoothed):
 
 
 def test_the_measured_accuracy_goes_with_the_sequence_wider_for_low_confidence(shape, truths):
-    n = LAYOUT.size
+    n = made.LAYOUT.size
     rng = np.random.default_rng(0)
     samples, tips = rng.standard_normal((3, 2, n, 3)), rng.standard_normal((3, 2, 2, 3))
     accuracy = DetectionAccuracy(np.linspace(1, 2, n), 7.5, samples, tips)
@@ -101,36 +86,25 @@ def test_the_measured_accuracy_goes_with_the_sequence_wider_for_low_confidence(s
     # Smoothing leaves a steady motion where it is.
     for x, true in zip(found.vertices, truths, strict=True):
         assert np.linalg.norm(x - true.vertices, axis=1).mean() < 0.5
-    np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
-    assert found.correlation_length_mm == 7.5
     accuracy = replace(accuracy, widening=(1.2, 2.0))
     found = detected(shape, truths, min_confidence=0.0, best=0.3, accuracy=accuracy, seen=0.6)
     factor = 1.2 * np.exp(2.0 * (1.0 - np.median(found.frame_confidence)))
     assert factor > 1.25
     np.testing.assert_allclose(found.std_mm, factor * accuracy.std_mm)
-    wider = accuracy.at(found.confidence)
-    np.testing.assert_allclose(wider.samples.mean(axis=0), accuracy.samples.mean(axis=0))
-    for name in ("samples", "tip_samples"):
-        ratio = getattr(wider, name).std(axis=0) / getattr(accuracy, name).std(axis=0)
-        np.testing.assert_allclose(ratio, factor)
+    assert found.correlation_length_mm == 7.5
 
 
 def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
     # Its own search ended elsewhere; two frames in a row are found one after the other.
-    model = oracle_model(shape, truths)
+    model = made.oracle_model(shape, truths)
     valves = [fit_frame(FRAMES[k], model, truths[k].pose) for k in range(4)]
     for k in (1, 2):
         away = valves[k].pose.moved(np.array([[30.0, 0, 0, 0, 0, 0, 0]]))
         x = valves[k].vertices + 30.0
         valves[k] = replace(valves[k], pose=away, vertices=x, confidence=0.4)
-    again = tracking._found_again(FRAMES, valves, model, NO_HANDS)
+    tracking._refit_lost_frames(FRAMES, valves, model)
     for k, true in enumerate(truths):
-        assert np.linalg.norm(again[k].vertices - true.vertices, axis=1).mean() < 0.6
-    # Hands that placed a frame are not overruled.
-    placed = NO_HANDS.copy()
-    placed[1:3, 0] = 0.0
-    kept = tracking._found_again(FRAMES, valves, model, placed)
-    assert [a is b for a, b in zip(kept, valves, strict=True)] == [True] * 4
+        assert np.linalg.norm(valves[k].vertices - true.vertices, axis=1).mean() < 0.6
 
 
 def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
@@ -144,84 +118,6 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     detected(shape, truths, min_confidence=0.01, best=0.05, seen=0.05)
 
 
-# --- by hand ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("landmarks", "message"),
-    [
-        ({4: {"tip_0": np.zeros(3)}}, "frame 4.*frames 0 to 3"),
-        ({-1: {"tip_0": np.zeros(3)}}, "frame -1"),
-        ({1: {"tip_0": np.zeros(3), "apex": np.zeros(3)}}, "frame 1.*apex.*commissure_0"),
-        ({1: {"tip_0": np.array([0.0, np.nan, 0.0])}}, "frame 1.*tip_0"),
-        ({1: {"tip_0": np.zeros(2)}}, "frame 1.*tip_0"),
-        # All at one place, or on one line: any turn about it would do.
-        ({2: dict.fromkeys(LANDMARKS[:5], np.ones(3))}, "frame 2 lie within .* of one line"),
-        (
-            {2: {name: np.array([5.0 * k, 0.1, 3.0]) for k, name in enumerate(LANDMARKS[:5])}},
-            "frame 2 lie within .* of one line",
-        ),
-    ],
-)
-def test_landmarks_by_hand_are_checked(shape, truths, landmarks, message):
-    with pytest.raises(tracking.InputError, match=message) as told:
-        detected(shape, truths, landmarks=landmarks)
-    assert "\n" not in str(told.value)
-
-
-def test_four_landmarks_by_hand_lay_the_mean_valve_on_them(shape, truths):
-    # The pose is a similarity: a shear, a mirror image, or scale left out miss the points.
-    model = oracle_model(shape, truths)
-    pose = poses(1, 9, 40.0)
-    at = list(landmark_vertices(LAYOUT).values())
-    points = pose.world(np.concatenate([shape.mean[at], shape.tips]))[0]
-
-    def by_hand(*numbers):
-        return np.where(np.isin(np.arange(len(points)), numbers)[:, None], points, np.nan)
-
-    found = tracking._pose_by_hand(by_hand(11, 3, 0, 6, 9), model)
-    np.testing.assert_allclose(found.centre, pose.centre, atol=1e-6)
-    np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-8)
-    np.testing.assert_allclose(found.log_scale, pose.log_scale, atol=1e-9)
-    assert tracking._pose_by_hand(by_hand(11, 3, 0), model) is None
-    assert tracking._pose_by_hand(by_hand(), model) is None
-
-
-def test_a_tip_by_hand_stays_while_the_others_are_smoothed(shape, truths, monkeypatch):
-    # Smoothing in time would take it back to what the trees saw before and after.
-    by_hand = truths[1].tips[0] + np.array([3.0, 0, 0])
-    found = detected(shape, truths, landmarks={1: {"tip_0": by_hand}})
-    np.testing.assert_allclose(found.tips[1, 0], by_hand, atol=1e-9)
-    assert np.linalg.norm(found.tips[1, 1] - truths[1].tips[1]) < 0.5
-    # Frames without any place to look at show no valve.
-    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
-    with pytest.raises(NoValveError, match="no valve found"):
-        detected(shape, truths)
-
-
-def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths, unsmoothed):
-    # The trees rate highest a valve that lies elsewhere; hands in every frame decide otherwise.
-    elsewhere = [
-        placed(shape, t.pose.moved(np.array([[25.0, 0, 0, 0.6, 0, 0, 0]])), np.zeros(4))
-        for t in truths
-    ]
-    model = oracle_model(shape, truths)
-    astray = oracle_model(shape, elsewhere)
-    for name in ("position", "pose_coarse", "pose_fine", *STEPS):
-        model.boosters[name] = astray.boosters[name]
-    lost = tracking._trajectory(FRAMES, TIMES, model, NO_HANDS)
-    expected = np.concatenate([t.pose.centre for t in truths])
-    assert np.linalg.norm(lost.centre - expected, axis=1).min() > 15.0
-    points = [landmark_points(t.vertices, t.tips, LAYOUT) for t in truths]
-    led = tracking._trajectory(FRAMES, TIMES, model, np.stack(points))
-    assert np.linalg.norm(led.centre - expected, axis=1).max() < 3.0
-    by_hand = {k: dict(zip(LANDMARKS, points[k], strict=True)) for k in range(4)}
-    found = detect_valve(volume(), model, min_confidence=0.0, landmarks=by_hand)
-    np.testing.assert_allclose(found.tips, np.stack([t.tips for t in truths]), atol=1e-9)
-    gap = np.linalg.norm(found.vertices - np.stack([t.vertices for t in truths]), axis=2)
-    assert gap.mean() < 0.5
-
-
 # --- the path -----------------------------------------------------------------------------------
 
 
@@ -232,7 +128,7 @@ def hypotheses(centres, ratings):
 
 def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_higher(shape, truths):
     # Each frame by itself would jump 20 mm away and back.
-    model = oracle_model(shape, truths)
+    model = made.oracle_model(shape, truths)
     both = [0.0, 0, 0], [20.0, 0, 0]
     frames = [hypotheses(both, ratings) for ratings in ([0.9, 0.5], [0.6, 0.8], [0.9, 0.5])]
     times = np.array([0.0, 0.02, 0.04])
@@ -248,23 +144,25 @@ def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_highe
 
 def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, truths):
     # Every frame by itself, or without the hypotheses of the others, would lose one of them.
-    far = placed(shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2))
-    right = rating_oracle(truths, shape, 0.6)
-    wrong = rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
-    rating = Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
-    model = oracle_model(shape, truths)
-    still = Oracle(7, lambda x: np.zeros((len(x), 7)))
+    far = made.placed(
+        shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2)
+    )
+    right = made.rating_oracle(truths, shape, 0.6)
+    wrong = made.rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
+    rating = made.Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
+    model = made.oracle_model(shape, truths)
+    still = made.Oracle(7, lambda x: np.zeros((len(x), 7)))
     model.boosters.update(dict.fromkeys(STEPS, still), pose_coarse=rating, pose_fine=rating)
-    model.boosters["position"] = position_oracle([*truths[:2], far, truths[3]])
+    model.boosters["position"] = made.position_oracle([*truths[:2], far, truths[3]])
     alone = search_poses(FRAMES[2], model.boosters, 1)[0]
     assert np.linalg.norm(alone.centre - far.pose.centre) < 6
-    found = tracking._trajectory(FRAMES, TIMES, model, NO_HANDS)
+    found = tracking._trajectory(FRAMES, TIMES, model)
     expected = np.concatenate([t.pose.centre for t in truths])
     assert np.linalg.norm(found.centre - expected, axis=1).max() < 10.0
 
 
 def test_hypotheses_that_are_about_the_same_count_once():
-    base = poses(1, 3)
+    base = made.poses(1, 3)
     by = np.zeros((5, 7))
     by[1, 0], by[2, 3], by[3, 5], by[4, 1] = 1.0, 0.05, 1.0, 12.0
     some = base.repeated(5).moved(by)
@@ -291,19 +189,6 @@ def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
     np.testing.assert_allclose(found, line, atol=1e-7)
 
 
-def test_no_smoothing_is_none_at_all():
-    x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
-    np.testing.assert_array_equal(smooth(x, times=(0.0, 0.0, 0.0)), x)
-    two = smooth_in_time(UNEVEN[:2], x[:2], np.ones((2, 3)), np.full(3, 0.1))
-    np.testing.assert_array_equal(two, x[:2])
-    # Each point by its own time.
-    x = np.repeat(x[:, :1], 3, 1)
-    found = smooth(x, times=(0.06, 0.03, 0.0))
-    np.testing.assert_allclose(found[:, 2], x[:, 2], atol=1e-9)
-    moved = np.abs(found - x).mean(axis=(0, 2))
-    assert moved[0] > moved[1] > 0.01
-
-
 def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
     # Weights that do not count, or count the other way round, are seen here.
     x = np.zeros((len(UNEVEN), 3, 3))
@@ -318,13 +203,7 @@ def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
     np.testing.assert_allclose(found, smooth(x, 0.3 * weight, (0.02, 0.02, 0.02)), atol=1e-9)
 
 
-def test_fast_changes_go_and_slow_ones_stay():
-    # Smoothing over 0.06 s: a wave of 0.03 s goes, one of 1.5 s stays.
-    times = 0.01 * np.arange(60)
-    slow, fast = (np.sin(2 * np.pi * times / period) for period in (1.5, 0.03))
-    x = np.stack([slow, fast, slow + fast], axis=1)[..., None] * np.ones(3)
-    found = smooth_in_time(times, x, np.ones((60, 3)), np.full(3, 0.06))
-    inner = slice(10, -10)
-    np.testing.assert_allclose(found[inner, 0], x[inner, 0], atol=0.06)
-    assert np.abs(found[inner, 1]).max() < 0.05
-    np.testing.assert_allclose(found[:, 2], found[:, 0] + found[:, 1], atol=1e-9)
+def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch):
+    monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
+    with pytest.raises(NoValveError, match="no valve found"):
+        detected(shape, truths)

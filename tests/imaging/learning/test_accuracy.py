@@ -58,14 +58,6 @@ def test_few_samples_have_no_bias_and_independent_errors_no_length():
     assert fitted_length(*correlogram(white, sheet())) < 1.5
 
 
-def test_the_share_within_tells_too_small_errors():
-    std = np.full(len(sheet()), 0.7)
-    errors = fields(40, std)
-    assert share_within(errors, std) == pytest.approx(0.95, abs=0.01)
-    assert share_within(errors, 0.5 * std) == pytest.approx(0.67, abs=0.03)
-    assert share_within(errors + 5.0, std) < 0.01
-
-
 def test_errors_are_stated_wider_where_there_is_less_confidence():
     # Errors of the further volumes are three times as large, and these are believed less.
     std = np.full(len(sheet()), 0.7)

@@ -1,17 +1,13 @@
 """Training: samples of all stages, and degraded volumes."""
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from mvest.imaging.detection.pose_search import search_poses
 from mvest.imaging.detection.trained_model import STAGES
-from mvest.imaging.learning import training
-from mvest.imaging.learning.training import degrade, draw_samples, train_stage, volume_samples
+from mvest.imaging.learning.training import degrade, draw_samples
 from mvest.imaging.volume import VolumeSequence
-from tests.imaging.detection.made_up import labelled, moving_valve
+from tests.imaging.detection.made_up import labelled
 
 
 @pytest.fixture
@@ -42,34 +38,6 @@ def test_every_stage_gets_samples_that_its_trees_can_learn_from(trained, samples
     assert "objective=cross_entropy" in trained.boosters["boundary"].texts[0]
 
 
-def test_a_stage_learns_from_its_samples(samples, settings):
-    # More of it than its mean: on the samples themselves, with enough trees.
-    found = samples()
-    more = replace(settings, boosting=replace(settings.boosting, trees=60))
-    for name in ("position", "pose_refine_0", "annulus"):
-        x, y = found[name]
-        said = train_stage(name, x, y, more, 1)(x)
-        assert np.abs(said - y).mean() < 0.6 * np.abs(y - y.mean(axis=0)).mean(), name
-
-
-@pytest.fixture
-def rendered(monkeypatch, seen_valve):
-    """No volume is simulated: every valve is seen in the same small frame."""
-    calls = []
-
-    def render(valve, which, base, spread, seed, *, degraded):
-        assert degraded
-        assert spread == "training"
-        assert 0 <= which < len(valve.times)
-        calls.append((valve.name, which, seed.entropy, seed.spawn_key))
-        true = seen_valve[1]
-        return None, SimpleNamespace(vertices=true.vertices[None], tips=true.tips[None])
-
-    monkeypatch.setattr(training, "render_frame", render)
-    monkeypatch.setattr(training, "standard_frame", lambda volume, k: seen_valve[0])
-    return calls
-
-
 def test_a_drafts_mistakes_are_its_best_and_some_others(trained, samples, seen_valve, settings):
     (frame, _), draft, count = seen_valve, trained.boosters, settings.samples.mistaken
     without, found = (samples(trees)["pose_fine"] for trees in (None, draft))
@@ -78,21 +46,6 @@ def test_a_drafts_mistakes_are_its_best_and_some_others(trained, samples, seen_v
     _, ratings = search_poses(frame, draft, count // 2)
     np.testing.assert_allclose(rated[: count // 2], ratings)
     assert len(np.unique(rated.round(9))) > 2
-
-
-def test_a_volume_has_samples_of_its_own_seed(rendered, shape, settings):
-    valve = moving_valve(3)
-    draws = ((0, 3), (0, 3), (1, 3), (0, 4))
-    samples = [volume_samples(valve, k, shape, settings, seed) for k, seed in draws]
-    assert set(samples[0]) == {f"{name}.{axis}" for name in STAGES for axis in "xy"}
-    assert all(array.dtype == np.float32 for array in samples[0].values())
-    first, again, other, _ = (each["position.x"] for each in samples)
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-    # Every volume is rendered by a stream of its own, whatever the number of volumes.
-    streams = [(entropy, key) for *_, entropy, key in rendered]
-    assert streams[0] == streams[1]
-    assert len(set(streams)) == 3
 
 
 # -- degraded volumes -----------------------------------------------------------------------------

@@ -3,13 +3,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import (
     RANGES,
     Acquisition,
-    Probe,
     draw_acquisition,
     draw_probe,
 )
@@ -19,35 +17,16 @@ from tests.imaging.simulator.made_up_valve import SMALL
 BOTH = {"wall_db", "chord_db", "papillary_db", "vessel_db", "compensation_db_per_cm_mhz"}
 
 
-def test_the_wavelength_follows_from_1540_m_per_s():
-    # 5 MHz: 0.308 mm.
-    assert 2 * math.pi / Acquisition(frequency_mhz=5.0).wave_number == pytest.approx(0.308)
-
-
 BAD = {
-    "frequency_mhz": [0.0],
-    "axial_mm": [-1.0, 40.0],
-    "lateral_deg": [0.0],
-    "elevation_deg": [30.0],
-    "azimuth_deg": [150.0],
-    "dropout": [0.7],
-    "dropout_db": [3.0],
-    "side_lobe_db": [1.0],
-    "attenuation_db_per_cm_mhz": [-0.1],
-    "dynamic_range_db": [0.0],
-    "blood_db": [math.nan],
-    "depth_mm": [(50.0, 20.0), (0.0, 20.0)],
-    "beats": [0],
-    "voxel_mm": [0.0],
-    "shape": [(4, 40, 40), (40, 40)],
-}
+    "frequency_mhz": 0.0, "axial_mm": 40.0, "elevation_deg": 30.0, "dropout_db": 3.0,
+    "blood_db": math.nan, "depth_mm": (50.0, 20.0), "shape": (4, 40, 40),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("setting", BAD)
 def test_a_setting_out_of_range_is_refused_by_name(setting):
-    for value in BAD[setting]:
-        with pytest.raises(InputError, match=f"acquisition {setting} = .*expected"):
-            replace(SMALL, **{setting: value})
+    with pytest.raises(InputError, match=f"acquisition {setting} = .*expected"):
+        replace(SMALL, **{setting: BAD[setting]})
 
 
 def test_shifted_acquisitions_lie_outside_of_all_training_ranges():
@@ -110,15 +89,6 @@ def test_the_valve_lies_in_the_pyramid():
         azimuth, elevation = np.degrees(np.arctan(p[:, :2] / p[:, 2:])).T
         assert np.mean(np.abs(azimuth) <= acquisition.azimuth_deg / 2) > 0.8
         assert np.mean(np.abs(elevation) <= acquisition.elevation_span_deg / 2) > 0.8
-
-
-def test_coordinates_lead_from_valve_to_world():
-    turn = Rotation.from_euler("zyx", [30, -50, 110], degrees=True).as_matrix()
-    probe = Probe(turn, np.array([3.0, -4.0, 50.0]))
-    np.testing.assert_allclose(probe.to_world(probe.apex_in_valve), 0, atol=1e-12)
-    np.testing.assert_allclose(
-        probe.to_world(np.array([0.0, 2.0, 0.0])), probe.translation + 2 * turn[:, 1]
-    )
 
 
 def test_ranges_without_meaning_are_refused():

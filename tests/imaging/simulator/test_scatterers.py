@@ -53,9 +53,6 @@ def test_a_sheet_fills_its_thickness_outside_of_its_grid_and_fades():
     radius = np.linalg.norm(place[:, :2], axis=1)
     assert radius.min() > 19.9
     assert 21.8 < radius.max() < 22.01
-    # Evenly: mean depth of the middle of each tenth of the length.
-    counts = np.histogram(place[:, 2], 10, (-30, 0))[0]
-    assert 320 < counts.min() <= counts.max() < 480
     assert sheet.volume == pytest.approx(2 * np.pi * 20 * 30 * 2, rel=0.01)
     # Facing is the cosine between normal and line of sight.
     seeds = np.array([[5.0, 0.0, 0.0], [5.0, 22.5, 0.0]])

@@ -110,13 +110,6 @@ def test_a_sampled_valve_is_the_same_valve(valve, band):
     np.testing.assert_allclose(fine.motion.annulus[0], fine.surface.vertices[:96], atol=1e-12)
 
 
-def test_points_move_with_the_surface(valve, band):
-    phi, s = np.array([20.0, 250.0]), np.array([0.3, 0.8])
-    by = np.array([1.0, 2.0, 3.0])
-    moved = band.displaced(phi, s, valve.surface.vertices + by)
-    np.testing.assert_allclose(moved, band.position(phi, s) + by, atol=1e-9)
-
-
 def test_a_valve_of_three_leaflets_is_refused(valve):
     surface = valve.surface
     region = surface.region.copy()

