@@ -1,4 +1,4 @@
-"""Pages of the API, written from the packages as they are: the front door, and one a package."""
+"""API pages: one for the public names of ``mvest``, and one for each package."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def titled(text: str, underline: str) -> str:
 
 
 def front_door() -> str:
-    """The names of ``import mvest``, each leading to its own page."""
+    """The names of ``import mvest``, each linked to its page."""
     names = sorted(set(mvest.__all__) - {"__version__", "units"}, key=str.lower)
     listing = "\n".join(f"   {name}" for name in names)
     return f"""{titled("API", "=")}
@@ -76,14 +76,14 @@ def package_page(package: Path) -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file unless it says the same already."""
+    """Write a file unless its content is unchanged."""
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Write the pages before Sphinx looks for its sources."""
+    """Write the pages before Sphinx reads its sources."""
     folder, library = Path(app.srcdir) / "api", Path(mvest.__file__).parent
     write(folder / "index.rst", front_door())
     packages = {path.name: path for path in library.iterdir() if (path / "__init__.py").is_file()}

@@ -1,4 +1,4 @@
-"""Directives whose tables are computed from the code, the configuration and ``results/``.
+"""Directives for tables computed from code, configuration and ``results/``.
 
 ``{parameter-table}``, ``{setting-groups}``, ``{setting-ranges}``, ``{sweep-list}`` and
 ``{guess-comparison}`` take no options and no content.
@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LEAFLETS = ("anterior", "posterior")
 
 NOT_SETTINGS = ("experiment", "sweep", "hydra", "launcher", "imaging")
-"""Groups of the configuration that other pages are about."""
+"""Groups of the configuration described on other pages."""
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -40,7 +40,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def parameter_table() -> str:
-    """All kinds of parameters that the mechanics differentiate by."""
+    """All kinds of parameters that the mechanics can differentiate by."""
     rows = []
     for name, kind in KINDS.items():
         names = [f"`{name}`"] if kind.whole else []
@@ -54,11 +54,11 @@ def parameter_table() -> str:
                 "yes" if kind.positive else "no",
             ]
         )
-    return markdown(["name", "what it is", "unit", "positive"], rows)
+    return markdown(["name", "meaning", "unit", "positive"], rows)
 
 
 def setting_groups() -> str:
-    """The folders of ``conf/`` with the names that each offers."""
+    """The folders of ``conf/`` with their files."""
     rows = []
     for folder in sorted((ROOT / "conf").iterdir()):
         names = sorted(path.stem for path in folder.glob("*.yaml")) if folder.is_dir() else []
@@ -68,7 +68,7 @@ def setting_groups() -> str:
 
 
 def setting_ranges() -> str:
-    """What settings may be, by the kinds of quantities."""
+    """Ranges of settings, by kind of quantity."""
     found: dict[tuple[str, ...], set[str]] = {}
     for kind in [Config, *(load_study(name).settings for name in study_names())]:
         for key, mark in marks_in(kind):
@@ -77,7 +77,7 @@ def setting_ranges() -> str:
             row = (f"{mark.low:.10g}", f"{mark.high:.10g}", mark.unit, mark.why)
             found.setdefault(row, set()).add(key.rpartition(".")[2] if "*" not in key else key)
     return markdown(
-        ["from", "to", "unit", "why", "settings"],
+        ["from", "to", "unit", "reason", "settings"],
         [[*row, ", ".join(f"`{name}`" for name in sorted(names))] for row, names in found.items()],
     )
 
@@ -100,18 +100,18 @@ def marks_in(kind: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def sweep_list() -> str:
-    """The sweeps, each with what its file says of it."""
+    """The sweeps with their descriptions."""
     rows = []
     for path in sorted((ROOT / "conf" / "sweep").glob("*.yaml")):
         about = comment_of(path.read_text(encoding="utf-8"))
         page = (ROOT / "docs" / "studies" / f"sweep_{path.stem}.md").is_file()
         name = f"[`{path.stem}`](studies/sweep_{path.stem}.md)" if page else f"`{path.stem}`"
         rows.append([name, about])
-    return markdown(["sweep", "what it does"], rows)
+    return markdown(["sweep", "question"], rows)
 
 
 def guess_comparison() -> str:
-    """Median errors of estimates, and of guessing the generic moduli for everybody."""
+    """Median errors of estimates and of the generic moduli as a guess."""
     rows = []
     for title, name in (("known geometry", "population"), ("simulated volumes", "volume")):
         kept = records_of(ROOT / "results", name)
@@ -139,7 +139,7 @@ def directive(table: Callable[[], str]) -> type[SphinxDirective]:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Make the directives known."""
+    """Register the directives."""
     for table in (parameter_table, setting_groups, setting_ranges, sweep_list, guess_comparison):
         app.add_directive(table.__name__.replace("_", "-"), directive(table))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""Figures of gallery scripts that the library made, without pyplot: those called ``figure``."""
+"""Saves figures of gallery scripts named ``figure`` that were made without pyplot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sphinx_gallery.scrapers import figure_rst
 
 
 def figure_scraper(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]) -> str:
-    """Save what a block left as ``figure``, once, if pyplot knows nothing of it."""
+    """Save the variable ``figure`` of a block, once, unless pyplot manages it."""
     names = block_vars["example_globals"]
     figure = names.get("figure")
     if not isinstance(figure, Figure) or hasattr(figure, "number"):
@@ -22,6 +22,6 @@ def figure_scraper(block: Any, block_vars: dict[str, Any], gallery_conf: dict[st
 
 
 def _get_sg_image_scraper() -> Any:
-    """What sphinx-gallery asks a module for that it is told as a scraper."""
+    """The scraper, under the name that sphinx-gallery expects."""
     plt.rcParams["savefig.bbox"] = "standard"
     return figure_scraper

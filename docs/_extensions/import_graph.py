@@ -1,4 +1,4 @@
-"""The picture of who imports whom, read from the source whenever the site is built."""
+"""The import graph of the packages, read from the source when the site is built."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEAVES = ("errors", "units", "typing", "elements", "provenance", "quantities")
 
 
 def package_of(module: str) -> str:
-    """The package of a module of mvest; importers and exporters of cases are one of their own."""
+    """The package of a module of mvest; importers and exporters of cases count as one."""
     _, package, *rest = module.split(".")
     with_cases = package == "exchange" and rest[:1] in (["importing"], ["exporting"])
     return "import, export" if with_cases else package
@@ -45,7 +45,7 @@ def import_graph() -> dict[str, set[str]]:
 
 
 def imports_figure() -> Figure:
-    """Packages in layers, each below all that import it; arrows that others imply are left out."""
+    """Packages in layers, each below all that import it, without implied arrows."""
     graph = import_graph()
     users = {
         package: {one for one, names in graph.items() if package in names} for package in graph
@@ -71,7 +71,7 @@ def imports_figure() -> Figure:
     axes = figure.subplots()
     place: dict[str, tuple[float, float]] = {}
     for height, packages in sorted(layers.items()):
-        # Under the middle of those that import it; side by side where that is the same place.
+        # Centred below its importers; side by side if positions coincide.
         above = {
             package: [place[u][0] for u in users[package] if package in arrows[u]]
             for package in packages
@@ -104,7 +104,7 @@ def imports_figure() -> Figure:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Draw it before Sphinx looks for its sources."""
+    """Draw it before Sphinx reads its sources."""
     folder = Path(app.srcdir) / "pictures"
     folder.mkdir(exist_ok=True)
     figure = imports_figure()

@@ -1,9 +1,8 @@
-"""One page for each study, written from what ``conf``, ``results/`` and the notes hold.
+"""One page for each study, written from ``conf``, ``results/`` and the notes.
 
 A page belongs to a table of ``results/``. Its title and commands come from the experiments that
-name that table, its numbers and figures from the files of that name, included as they are. Notes in
-``docs/study_notes/NAME.md`` are optional; their header gives the page a title, a group and its
-place in it (``title``, ``group``, ``order``). No study is listed here.
+name that table, its numbers and figures from the files of that name. Notes in
+``docs/study_notes/NAME.md`` are optional; their header gives ``title``, ``group`` and ``order``.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 ELSEWHERE = ("dashboard",)
-"""Pictures that are shown on other pages."""
+"""Pictures shown on other pages."""
 
 LAST = "Further studies"
-"""The group of pages whose notes name none."""
+"""The group of pages without notes."""
 
 
 @dataclass
 class Experiment:
-    """What a file of ``conf/experiment`` says of itself."""
+    """Description of a file of ``conf/experiment``."""
 
     name: str
     title: str
@@ -37,7 +36,7 @@ class Experiment:
 
 @dataclass
 class Page:
-    """A page in the making."""
+    """Content of one page."""
 
     name: str
     title: str = ""
@@ -49,12 +48,12 @@ class Page:
     pictures: list[str] = field(default_factory=list)
 
     def owns(self, stem: str) -> bool:
-        """Whether a file of ``results/`` is of this page."""
+        """Whether a file of ``results/`` belongs to this page."""
         return stem == self.name or stem.startswith(f"{self.name}_")
 
 
 def comment_of(text: str) -> str:
-    """The comment with which a configuration file begins."""
+    """The leading comment of a configuration file."""
     lines = text.splitlines()
     while lines and lines[0].startswith("# @"):
         lines.pop(0)
@@ -67,7 +66,7 @@ def comment_of(text: str) -> str:
 
 
 def read_experiments(folder: Path) -> dict[str, list[Experiment]]:
-    """Experiments or sweeps by the table that they belong to, inherited or their own."""
+    """Experiments or sweeps by their table, own or inherited."""
     contents = {
         path.stem: (yaml.safe_load(text), text)
         for path in sorted(folder.glob("*.yaml"))
@@ -84,14 +83,14 @@ def read_experiments(folder: Path) -> dict[str, list[Experiment]]:
     found: dict[str, list[Experiment]] = {}
     for name, (data, text) in contents.items():
         many = "-m " if data.get("hydra", {}).get("mode") == "MULTIRUN" else ""
-        command = f"python -m experiments.run {many}{folder.name}={name}"
+        command = f"mvest run {many}{folder.name}={name}"
         made = Experiment(name, inherited(name, "title"), comment_of(text), command)
         found.setdefault(inherited(name, "table") or name, []).append(made)
     return found
 
 
 def read_notes(folder: Path) -> list[Page]:
-    """Pages with notes, their headers read."""
+    """Pages from notes."""
     pages = []
     for path in sorted(folder.glob("*.md")):
         head, _, body = path.read_text(encoding="utf-8").removeprefix("---\n").partition("\n---\n")
@@ -109,7 +108,7 @@ def read_notes(folder: Path) -> list[Page]:
 
 
 def all_pages(root: Path) -> list[Page]:
-    """Every page, with what belongs to it."""
+    """All pages with their experiments, tables and pictures."""
     results = root / "results"
     tables = sorted(path.stem for path in results.glob("*.md"))
     pictures = sorted(path.stem for path in results.glob("*.png") if path.stem not in ELSEWHERE)
@@ -144,7 +143,7 @@ PICTURE = re.compile(r"^!\[(.*)\]\((\w+)\.png\)$", re.MULTILINE)
 
 
 def table_text(path: Path) -> str:
-    """A page of ``results/`` as it is: headings two levels deeper, figures in full size."""
+    """A page of ``results/``: headings two levels deeper, figures in full size."""
     text = path.read_text(encoding="utf-8").strip()
     text = PICTURE.sub(lambda found: picture_text(found[2], found[1]), text)
     return re.sub(r"^(#+) ", r"##\1 ", text, flags=re.MULTILINE)
@@ -169,13 +168,13 @@ def text_of(page: Page, results: Path) -> str:
 
 
 def picture_text(stem: str, caption: str = "") -> str:
-    """A figure of ``results/`` that leads to itself in full size."""
+    """A figure of ``results/``, linked to its full size."""
     options = f":alt: {stem}\n:target: ../_images/{stem}.png"
     return f"```{{figure}} ../../results/{stem}.png\n{options}\n\n{caption}\n```"
 
 
 def question_of(page: Page) -> str:
-    """What a page is about: the first question of its notes, or else their first sentence."""
+    """The first question of the notes, or else their first sentence."""
     text = " ".join((page.notes or "".join(one.about for one in page.experiments)).split())
     sentences = re.findall(r"[^.?]+(?:[.?](?!\s))*[^.?]*[.?](?=\s|$)", text)
     asked = [sentence for sentence in sentences[:4] if sentence.endswith("?")]
@@ -183,13 +182,12 @@ def question_of(page: Page) -> str:
 
 
 def index_of(pages: list[Page]) -> str:
-    """The page that leads to all others, group by group."""
+    """The index of all pages, by group."""
     parts = [
         "# Studies",
-        "Each page holds what a study asks, the command that repeats it, and its tables and "
-        "figures as they lie in `results/`, with the commit and the configuration they came from. "
-        "Everything is simulated, except where a donor valve or the shape of a reference heart is "
-        "named.",
+        "Each page has the question of a study, the command that repeats it, and its tables and "
+        "figures from `results/`, with commit and configuration. Everything is simulated, except "
+        "the donor valve and the shape of the reference heart.",
     ]
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]
@@ -201,7 +199,7 @@ def index_of(pages: list[Page]) -> str:
 
 
 def write_study_pages(root: Path, folder: Path) -> None:
-    """Write all pages into a folder, which then holds nothing else; equal files are left alone."""
+    """Write all pages into a folder and remove others; unchanged files are not touched."""
     folder.mkdir(exist_ok=True)
     pages = all_pages(root)
     texts = {f"{page.name}.md": text_of(page, root / "results") for page in pages}
@@ -216,7 +214,7 @@ def write_study_pages(root: Path, folder: Path) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Write the pages before Sphinx looks for its sources."""
+    """Write the pages before Sphinx reads its sources."""
     docs = Path(app.srcdir)
     write_study_pages(docs.parent, docs / "studies")
     return {"parallel_read_safe": True, "parallel_write_safe": True}

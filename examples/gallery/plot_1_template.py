@@ -3,7 +3,7 @@ A valve and its measures
 ========================
 
 The template is a smooth surface in material coordinates, so every resolution shows the same valve.
-Its parameters are lengths in mm: another anatomy is a few other numbers.
+Its parameters are lengths in mm; other values give another anatomy.
 """
 
 import matplotlib.pyplot as plt
@@ -44,6 +44,6 @@ same_scale(panels[0], drawn[::2], ATRIUM)
 same_scale(panels[1], drawn, SIDE)
 
 # %%
-# Above from the atrium, the anterior leaflet on top; below from the side, with the chordae that run
-# from the two papillary tips to the leaflets. A wider annulus with the same leaflets; a longer
-# posterior leaflet in the same annulus, which leaves a smaller orifice.
+# Above: seen from the atrium, the anterior leaflet on top. Below: from the side, with the chordae
+# from the two papillary tips. The second valve has a wider annulus, the third a longer posterior
+# leaflet, which leaves a smaller orifice.

@@ -2,8 +2,8 @@
 A valve closes
 ==============
 
-Pressure rises to 120 mmHg in 0.3 s while the annulus contracts; then the valve comes to rest. Every
-stored step is a converged equilibrium of inertia, tissue, chordae and contact.
+Pressure rises to 120 mmHg in 0.3 s while the annulus contracts; then the valve comes to rest. In
+every stored step inertia, tissue, chordae and contact are in equilibrium.
 """
 
 import matplotlib.pyplot as plt
@@ -50,5 +50,5 @@ beside.plot(closing.times[:-1], pressure[:-1], "--", color="C3")
 beside.set_ylabel("pressure (mmHg)", color="C3")
 
 # %%
-# The last drawing is the static equilibrium: what is compared with a closed frame. White slits are
-# midsurfaces that lie a thickness apart; thick leaflets leave less.
+# The last drawing is the static equilibrium, which is compared with a closed frame. White slits are
+# gaps between midsurfaces, which are a thickness apart where thick leaflets touch.

@@ -2,8 +2,8 @@
 What a modulus does to the closed valve
 =======================================
 
-Every closure carries its exact derivative by each parameter, from direct differentiation of the
-discrete equations. It says which part of the closed valve informs which modulus.
+Every closure comes with its exact derivative by each parameter, from direct differentiation of the
+discrete equations. It shows which part of the closed valve informs which modulus.
 """
 
 import matplotlib.pyplot as plt

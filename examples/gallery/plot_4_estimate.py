@@ -2,8 +2,8 @@
 Two moduli from a simulated observation
 =======================================
 
-A valve is closed with known moduli, every coordinate gets an error of 0.5 mm, and a filter that is
-not given the truth estimates both moduli from what is left.
+A valve closes with known moduli, every coordinate gets an error of 0.5 mm, and a filter estimates
+both moduli.
 """
 
 import matplotlib.pyplot as plt
@@ -41,6 +41,5 @@ axes.legend(frameon=False)
 print(estimate.mean.round(2), "±", estimate.std.round(2), "MPa;", estimate.reason.value)
 
 # %%
-# The same mesh makes the observation and the estimate, which tests the filter and nothing else.
-# With another mesh for the truth the error is that of the mesh, and no standard deviation contains
-# it.
+# Observation and estimate use the same mesh, which tests the filter alone. With another mesh for
+# the truth the mesh error dominates, and the standard deviation does not contain it.

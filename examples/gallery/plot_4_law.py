@@ -2,9 +2,9 @@
 Two material laws on the same data
 ==================================
 
-Leaflets stiffen when they are stretched; the linear law of the paper does not. A valve of an
-exponential law is closed, and both laws are fitted to what is seen of it. The exponents are those
-usually quoted from May-Newman and Yin (1998) for excised leaflets.
+Leaflets stiffen as they stretch; the linear law of the paper does not. A valve with an exponential
+law closes, and both laws are fitted to its closed frame. The exponents are those usually quoted
+from May-Newman and Yin (1998) for excised leaflets.
 """
 
 import matplotlib.pyplot as plt
@@ -70,6 +70,6 @@ figure.supxlabel("stretch")
 figure.supylabel("nominal stress (MPa)")
 
 # %%
-# The data tell the laws apart: the misfit of the linear law is no chance. The scale c0 is found,
-# the fibre exponent c2 of the posterior leaflet hardly. The `whole study <../studies/law.html>`_
-# has a finer mesh and ten samples of the errors.
+# The data distinguish the laws: the misfit of the linear law is significant. They determine the
+# scale c0, but hardly the fibre exponent c2 of the posterior leaflet. The `whole study
+# <../studies/law.html>`_ has a finer mesh and ten samples of the errors.

@@ -1,9 +1,9 @@
 """
-What data will tell, before any are taken
-=========================================
+Expected information before measuring
+=====================================
 
-The Cramér-Rao bound needs a model and a plan of what is to be observed, but no observation. One
-closure shows how well two moduli can be known from different plans.
+The Cramér-Rao bound needs a model and a planned observation, but no data. One closure shows how
+well different plans determine two moduli.
 """
 
 import matplotlib.pyplot as plt

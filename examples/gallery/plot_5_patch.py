@@ -2,9 +2,9 @@
 A stiff patch of a leaflet
 ==========================
 
-A valve with a stiff patch in the middle of its anterior leaflet is closed on a mesh of its own. The
-estimator does not know of a patch: its modulus is a smooth random field in a few modes, in whose
-span the patch does not lie. They are estimated from one closed frame, together with both moduli.
+A valve with a stiff patch in the middle of its anterior leaflet closes on a separate mesh. The
+estimator does not know of the patch: its modulus is a smooth random field with a few modes, which
+cannot represent the patch exactly. They are estimated from one closed frame, with both moduli.
 """
 
 import matplotlib.pyplot as plt
@@ -44,7 +44,7 @@ estimate = mvest.IteratedFilter(0.05)(
     valve, prior, observed, R=0.25, names=valve.names, transform=logs
 )
 
-# log E_f at the vertices is linear in what the filter estimates: log modulus and modes.
+# log E_f at the vertices is linear in the unknowns: log modulus and modes.
 surface = valve.valve.surface
 of_modes = FieldBasis.of(surface, "anterior", field)(surface.vertices)
 rows = np.column_stack([np.ones(len(of_modes)), np.zeros(len(of_modes)), of_modes])
@@ -66,6 +66,6 @@ grid[0].invert_yaxis()
 print(estimate.reason.value)
 
 # %%
-# The patch is found where it is, and from one frame the stated standard deviation is honest. With
-# fifteen frames of a cycle the modulus is known better than the estimator's mesh allows, and only
-# 65 % of the leaflet lies within two standard deviations (`study <../studies/patch.html>`_).
+# The position of the patch is right, and with one frame so is the stated standard deviation. With
+# fifteen frames of a cycle the mesh error dominates, and only 65 % of the leaflet lies within two
+# standard deviations (`study <../studies/patch.html>`_).

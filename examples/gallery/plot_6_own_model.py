@@ -3,7 +3,7 @@ Your own model behind a filter
 ==============================
 
 A filter knows a model only as a function from parameters to a prediction and its derivatives. Here
-it is a strip of tissue that stiffens as it is stretched, with noisy forces.
+it is a strip of tissue that stiffens as it stretches, with noisy forces.
 """
 
 import matplotlib.pyplot as plt
@@ -42,5 +42,5 @@ axes.set(xlabel="stretch", ylabel="force (N)", ylim=(-0.1, 2.6))
 axes.legend(frameon=False, title=f"truth: {truth[0]:.3f} N, {truth[1]:.1f}", loc="upper left")
 
 # %%
-# Filters that take one step miss the curve; those that linearise anew where they have come to do
-# not. A program in any language takes the same place through files: see the page on own models.
+# Filters with one step miss the curve; those that relinearise do not. A program in any language can
+# be the model through files: see the page on own models.

@@ -40,6 +40,6 @@ axes.set(xlabel="x (mm)", ylabel="z (mm)")
 axes.legend(frameon=False)
 
 # %%
-# Linear tetrahedra resist bending many times too much (they lock), however many there are in the
-# plane. The solid-shell is within some per cent of the converged answer. What bends in a closing
-# valve is the leaflets, so this decides what an estimated modulus is worth.
+# Linear tetrahedra lock: they are many times too stiff in bending, however fine the mesh in the
+# plane. The solid-shell is within a few per cent of the converged answer. Leaflets bend as the
+# valve closes, so the element decides whether an estimated modulus is right.

@@ -2,8 +2,8 @@
 A thin ring, by forces and symmetry
 ===================================
 
-A ring of 0.2 mm, 20 mm across, is pulled apart by two forces. A quarter of it will do: nodes on
-the planes of symmetry keep one coordinate. So thin a body takes small cells.
+A ring of 0.2 mm, 20 mm across, is pulled apart by two forces. By symmetry a quarter suffices:
+nodes on the planes of symmetry keep one coordinate. A body this thin needs small cells.
 """
 
 import matplotlib.pyplot as plt

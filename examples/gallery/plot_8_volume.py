@@ -2,8 +2,8 @@
 A simulated volume and the valve in it
 ======================================
 
-The simulator images a closing valve as transoesophageal echo does. Detectors that were trained on
-other simulated valves look for it: annulus, free edge, leaflets and papillary tips.
+The simulator images a closing valve as transoesophageal echo does. Detectors, trained on other
+simulated valves, find annulus, free edge, leaflets and papillary tips.
 """
 
 import sys
@@ -22,7 +22,7 @@ found = mvest.detect_valve(volume, mvest.default_model())
 figure = montage_figure(volume, found, title="Simulated volume, open and closed frame")
 
 # %%
-# Lines are what was found. What it is off by, known because the volume is simulated:
+# Lines are the detected valve. Its errors are known because the volume is simulated:
 for k, name in enumerate(("open", "closed")):
     off = np.linalg.norm(found.vertices[k] - true.vertices[k], axis=1)
     tips = np.linalg.norm(found.tips[k] - true.tips[k], axis=1)
@@ -30,4 +30,4 @@ for k, name in enumerate(("open", "closed")):
           f" confidence {found.frame_confidence[k]:.2f}")  # fmt: skip
 
 # %%
-# How far the detectors are off in patients is unknown: none was seen in their making.
+# The detectors' errors in patients are unknown: none was in the training set.

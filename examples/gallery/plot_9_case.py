@@ -2,9 +2,9 @@
 A case from its folder to its report
 ====================================
 
-A case is a folder with ``case.yaml`` and surfaces. The one in ``examples/case`` has the least that
-is needed: an open and a closed surface, the papillary tips and the pressures. What is missing is
-derived, and every derivation is stated.
+A case is a folder with ``case.yaml`` and surfaces. ``examples/case`` is minimal: an
+open and a closed surface, the papillary tips and the pressures. The rest is derived, and every
+derivation is listed.
 """
 
 import tempfile
@@ -31,10 +31,10 @@ for axes, frame in zip(panels, case.frames, strict=True):
 same_scale(panels, [frame.vertices for frame in case.frames], ATRIUM)
 
 # %%
-# The closed surface is uneven because it is "seen" with errors of 0.5 mm (simulated).
-# ``mvest.personalise(case)`` takes its settings from `mvest.default_settings`, which include the
-# errors of geometry and law and take some minutes. Here a coarse mesh without these errors takes
-# seconds, so the intervals are too narrow.
+# The closed surface is uneven because of its simulated errors of 0.5 mm. By default
+# ``mvest.personalise(case)`` uses `mvest.default_settings`, which include the errors of geometry
+# and law and take some minutes. Here a coarse mesh without these errors takes seconds, and the
+# intervals are too narrow.
 
 settings = replace(
     mvest.default_settings(case),
@@ -49,8 +49,8 @@ found = mvest.personalise(case, settings)
 print(found)
 
 # %%
-# The report begins with the verdict on the estimate. Its numbers are a record, which your own
-# tables and plots can read.
+# The report begins with the verdict. Its numbers are in a record that your own tables and plots can
+# read.
 
 record = mvest.record_of_case(found)
 print(record.verdict)

@@ -16,31 +16,40 @@ VOLUMES = tuple(volume_variants())
 LABELS = tuple(label_variants())
 MARKUPS = tuple(markup_variants())
 PAGE = ROOT / "docs" / "formats.md"
-HEAD = """# Formats that are read
+HEAD = """# Formats
 
-The tests make each of these files with the libraries that other programs use (VTK, trimesh, meshio,
-SimpleITK, nibabel, pynrrd, pydicom, slicerio), read it, and compare it with what was written. A dot
-separates options that are combined.
+The tests write each of these files with the libraries that other programs use (VTK, trimesh, meshio,
+SimpleITK, nibabel, pynrrd, pydicom, slicerio), read it, and compare the content. A dot separates
+options that are combined.
+
+Importers recognise leaflets by words in names, upper or lower case: `anterior`, `AML`, `AMVL` or `A1` to
+`A3`, and `posterior`, `PML`, `PMVL` or `P1` to `P3`; in `case.yaml` write `anterior` and `posterior`.
 
 | format | variants | files |
 |---|---|---|
 """
 FOOT = """
-[Folders of SlicerHeart](slicer.md) and [FEBio](febio.md) have pages of their own. What a file does
-not state (units, times, which leaflet is which) is asked for in one line. Every file is read by a
-child process whose memory and time are bounded; a damaged one costs one line. This page is made by
-`python -m tests.exchange.variants`.
+[SlicerHeart folders](slicer.md) and [FEBio](febio.md) have pages of their own. If a file does not
+state something (units, times, which leaflet is which), an error of one line asks for it. Files are
+read by a child process with limited memory and time. This page is written by `python -m
+tests.exchange.variants`.
 """
 
 
 def page() -> str:
-    """The page, a line for all variants of a format with the same number of options."""
+    """The page: a line for all variants of a format with the same number of options.
+
+    Formats with the same options share a line.
+    """
     rows: dict[tuple[str, int], list[Variant]] = {}
     for variant in (*SURFACES, *VOLUMES, *LABELS, *MARKUPS):
         rows.setdefault((variant.format, len(variant.options)), []).append(variant)
+    alike: dict[str, tuple[list[str], int]] = {}
+    for (form, _), variants in rows.items():
+        forms, count = alike.get(_options(variants), ([], 0))
+        alike[_options(variants)] = ([*forms, form], count + len(variants))
     lines = [
-        f"| {form} | {_options(variants)} | {len(variants)} |"
-        for (form, _), variants in rows.items()
+        f"| {', '.join(forms)} | {options} | {count} |" for options, (forms, count) in alike.items()
     ]
     return HEAD + "\n".join(lines) + "\n" + FOOT
 

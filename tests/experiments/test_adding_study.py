@@ -14,7 +14,7 @@ from tests.places import ROOT
 SECTION = (ROOT / "docs" / "adding.md").read_text(encoding="utf-8").partition("## A study")[2]
 SECTION = SECTION.partition("\n## ")[0]
 NAME = re.compile(r"`((?:experiments|conf)/[\w/]+\.(?:py|yaml))`")
-COMMAND = re.compile(r"^    python (-m experiments\.run experiment=\w+)$", re.MULTILINE)
+COMMAND = re.compile(r"^    mvest run (experiment=\w+)$", re.MULTILINE)
 
 
 def test_the_page_on_adding_a_study_works_literally(tmp_path):
@@ -35,7 +35,7 @@ def test_the_page_on_adding_a_study_works_literally(tmp_path):
         path.write_text(content, encoding="utf-8")
     (command, *_) = COMMAND.findall(SECTION)
     subprocess.run(
-        [sys.executable, *command.split()],
+        [sys.executable, "-m", "experiments.run", command],
         cwd=tmp_path,
         check=True,
         capture_output=True,
