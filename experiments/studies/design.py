@@ -337,7 +337,7 @@ def summary(results: Results) -> dict[str, Table]:
     if "tried" in rest:
         values = list(TRIED)[2:]
         squares = rest["tried"].frame.dropna().set_index("design")[values].astype(float) ** 2
-        rms = np.sqrt(squares.groupby("design", sort=False).mean()).reset_index()
+        rms = (squares.groupby("design", sort=False).mean() ** 0.5).reset_index()
         about = {name: TRIED[name] for name in values}
         shown["root_mean_squares"] = table(rms, design="", **about)
     return shown

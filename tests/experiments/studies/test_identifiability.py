@@ -168,7 +168,7 @@ def test_each_job_of_a_sweep_says_what_it_will_tell(tmp_path, monkeypatch, capsy
     # Twice the noise, twice the deviation from the data alone.
     stds = [
         [float(line.split()[-1]) for line in part.splitlines() if "E_f." in line and "MPa" in line]
-        for part in said.out.split("what the data will tell")[1:]
+        for part in said.out.split("expected intervals of 95 %")[1:]
     ]
     assert np.array(stds[1]) == pytest.approx(2 * np.array(stds[0]), rel=0.06)
     assert not list(Path(tmp_path).rglob("result.json"))

@@ -18,7 +18,6 @@ from experiments.common.study import Result
 from experiments.studies import case
 from mvest.cases.folder import read_case
 from mvest.closure.model import ClosureModel
-from mvest.estimation import Prediction
 from mvest.exchange.surfaces import write_surface
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.valve.anatomy.dimensions import TemplateParameters
@@ -171,21 +170,6 @@ def test_one_file_for_each_leaflet_is_read_as_labels_are(tmp_path, seen, corresp
         nearest = cKDTree(other.vertices).query(one.vertices)[0]
         # STL holds single precision.
         assert nearest.max() < 1e-4
-
-
-@pytest.mark.parametrize("corresponds", [False, True])
-def test_a_case_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, corresponds):
-    # What is read is tested here, not what a closure would tell of it.
-    monkeypatch.setattr(ClosureModel, "__call__", lambda *_: Prediction.failed("not closed here"))
-    folder = write(tmp_path / "mine", seen, one_file_each, Scanner(3), corresponds)
-    status, out, err = run(folder, "check=true", "figures=false")
-    assert status == 0, err
-    told = "same vertices as the reference" if corresponds else "without correspondence"
-    assert out.count(told) == 1
-    assert "34 chordae from 2 papillary tips" in out
-    assert ("matched to the reference" in out) is not corresponds
-    assert list((tmp_path / "outputs" / "own_valve").glob("*/case.png"))
-    assert "what an estimate could tell is not known: not closed here" in out
 
 
 def test_a_finished_case_is_shown_again_until_its_files_change(run, tmp_path, monkeypatch, seen):

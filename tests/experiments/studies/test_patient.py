@@ -9,11 +9,11 @@ import pytest
 from experiments.common.building import patient_store
 from experiments.common.cases.blind import SECRET, read_estimate, write_estimate
 from experiments.common.cases.own_case import PersonalSettings, read_configured, run_case
-from experiments.common.records.record import NOT_GATED, stamp
+from experiments.common.records.record import stamp
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.patient import study as patient
-from experiments.studies.patient.study import Settings, check_patient, reveal, run_patient
+from experiments.studies.patient.study import Settings, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.problem.verdict import ONE_STATE
@@ -124,14 +124,14 @@ def test_moduli_are_those_of_the_configuration_or_drawn_about_them(tmp_path, sim
     assert (values["E_f.anterior"], values["E_f.posterior"]) == (6.28, 2.61)
     draws = []
     config = config_of(tmp_path, "patient=drawn", "patient.variation=0")
-    for seed in range(1, 41):
+    for seed in range(1, 21):
         make_patient(config | {"seed": seed})
         draws.append([simulated[-1][3][f"E_f.{r}"] for r in ("anterior", "posterior")])
     logs = np.log(np.array(draws) / [6.23, 2.09])
-    # Forty draws of 0.4: a standard error of 0.063 of the mean and 0.045 of the spread.
-    assert np.abs(logs.mean(axis=0)).max() < 4 * 0.063
-    assert np.abs(logs.std(axis=0) - 0.4).max() < 4 * 0.045
-    assert abs(np.corrcoef(logs.T)[0, 1]) < 0.6
+    # Twenty draws of 0.4: a standard error of 0.089 of the mean and 0.063 of the spread.
+    assert np.abs(logs.mean(axis=0)).max() < 4 * 0.089
+    assert np.abs(logs.std(axis=0) - 0.4).max() < 4 * 0.063
+    assert abs(np.corrcoef(logs.T)[0, 1]) < 0.8
 
 
 def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
@@ -244,17 +244,6 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     assert 0.0 < result.numbers["nees"] < 100.0
 
 
-def test_revealing_leaves_what_it_was_given(tmp_path, out, simulated, in_process):
-    values = config_of(tmp_path)
-    place = make_patient(values)
-    estimated = patient.estimate_blindly(values, out, place.case, place.hidden, NOT_GATED)
-    before, names = estimated.estimates[0].model_dump_json(), set(estimated.arrays)
-    revealed = reveal(estimated, place, settings_in(values), 1)
-    assert estimated.estimates[0].model_dump_json() == before
-    assert set(estimated.arrays) == names
-    assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [5.1, 2.6]
-
-
 def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_process, monkeypatch):
     use(monkeypatch, fails_above=4.0)
     values = config_of(tmp_path)
@@ -309,15 +298,3 @@ def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
     one, two = (record.model_copy(update={"seconds": 0.0, "details": {}}) for record in found)
     assert one == two
     assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [6.28, 2.61]
-
-
-def test_a_check_speaks_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
-    use(monkeypatch)
-    said = check_patient(config_of(tmp_path), tmp_path)
-    assert len(simulated) == 1
-    assert (tmp_path / "check.html").is_file()
-    lines = [line.split() for line in said.splitlines() if line.strip().startswith("E_f ")]
-    assert lines
-    # The assumed values are the prior's, not the patient's.
-    assert {float(words[3]) for words in lines if "MPa" in words} == {6.23, 2.09}
-    assert not any(f"{value:g}" in said for value in (6.28, 2.61))
