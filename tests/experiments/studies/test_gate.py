@@ -89,7 +89,6 @@ def test_a_verdict_is_looked_up_by_the_anatomy_and_not_by_its_name(tmp_path):
     assert gate_of(settings("template", "mesh.columns=40"), path).startswith("passed")
     wider = settings("template", "valve.annulus.anteroposterior_half_axis=15.0")
     assert gate_of(wider, path) == NOT_GATED
-    assert gate_of(settings("half_open"), path) == NOT_GATED
     assert gate_of(settings("template"), tmp_path / "none") == NOT_GATED
 
 
@@ -121,8 +120,6 @@ def test_what_has_not_passed_says_so_before_its_results():
     assert passed.caution == none.caution == ""
     assert "did NOT pass the gate (NOT passed on 54 x 6 hex18)" in failed.caution
     assert "experiment=gate" in never.caution
-    assert failed.line.endswith("seed 1; gate of the anatomy: NOT passed on 54 x 6 hex18")
-    assert "gate of" not in none.line
     # Of several, those that it is said of are named.
     assert cautions([failed]) == [failed.caution]
     assert cautions([passed, failed]) == [f"on NOT passed on 54 x 6 hex18: {failed.caution}"]
@@ -131,7 +128,6 @@ def test_what_has_not_passed_says_so_before_its_results():
 
 def test_each_case_changes_its_own_setting_only():
     config = plain(composed("experiment=gate", "mesh.columns=12", "mesh.rows=2"))
-    base = closure_model(config)
 
     def described(model: ClosureModel) -> dict:
         settings = model.settings
@@ -142,34 +138,18 @@ def test_each_case_changes_its_own_setting_only():
             "activation": settings.contact.activation_distance,
             "sampling": len(model.contact_valve.surface.vertices),
             "mesh": model.mesh.sha256,
-            "guided": model.guide is not None,
             "perturbed": None if model.perturbation is None else float(model.perturbation.sum()),
             "start": model.continuation,
             "rest": (settings.tissue, settings.damping, model.names, model.anchors),
-            "observed": model.valve.surface.vertices.shape,
         }
 
-    reference = described(base)
-    changed = {}
+    reference, usual = described(closure_model(config)), GateCase("x")
     for case in GATE_CASES:
         varied = described(closure_model(config, case))
-        changed[case.name] = {k for k, v in varied.items() if v != reference[k]}
-    unchanged = GateCase("x")
-    for case in GATE_CASES:
-        asked = {k for k in unchanged.__slots__ if getattr(case, k) != getattr(unchanged, k)} - {
-            "name"
-        }
+        changed = {key for key, value in varied.items() if value != reference[key]}
+        slots = {k for k in usual.__slots__ if getattr(case, k) != getattr(usual, k)}
         # No mesh is coarser than that of 24 x 3 cells which guides are on.
-        assert changed[case.name] == asked - {"guided"}
-    (finer,) = (closure_model(config, c).mesh for c in GATE_CASES if c.mesh != 1)
-    assert len(finer.elements) == 18 * 3
-    (guided,) = (c for c in GATE_CASES if c.guided)
-    usual = plain(composed("experiment=gate"))
-    assert closure_model(usual).guide is None
-    assert len(closure_model(usual, guided).guide.mesh.elements) < 54 * 6
-    assert closure_model(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(
-        0.5 * reference["dt"]
-    )
+        assert changed == slots - {"name", "guided"}
 
 
 def test_the_gate_study_records_every_case(run):

@@ -8,9 +8,7 @@ import pytest
 
 from experiments.common.records.record import Record, read_record
 from experiments.common.schema import build
-from experiments.results.published import publish, regenerate
 from experiments.run import main
-from experiments.studies.imaging import study as imaging
 from experiments.studies.imaging.detectors import ImagingSettings, ImagingStore
 from experiments.studies.imaging.study import Settings, calibrated, error_rows, judge, kind_rows
 from mvest.errors import InputError
@@ -81,7 +79,6 @@ def test_the_study_says_how_far_detectors_are_off(done: Path):
     )
     errors = {(row["error"], row["kind"]): row for row in record.table_of("errors").rows}
     assert errors["annulus_area", "shifted"]["unit"] == "%"
-    assert errors["surface_open", "sequence"]["volumes"] == 2
     assert ("surface", "calibration") not in errors
     coverage = record.table_of("coverage").rows
     assert [(row["kind"], row["frame"]) for row in coverage] == [
@@ -91,12 +88,6 @@ def test_the_study_says_how_far_detectors_are_off(done: Path):
         assert min(row["within_95"], row["within_95_handed_on"]) >= 0
         assert max(row["within_95"], row["within_95_handed_on"]) <= 100
         assert min(row["rms_handed_on"], row["stated_handed_on"]) > 0
-    # The shapes of the valves as found go with the detectors, each in its own axes.
-    shapes = load_model(done / "run" / "tee.npz").accuracy.shapes
-    annulus = shapes[:, :, :16]
-    assert shapes.shape == (2, 2, 16 * 5, 3)
-    np.testing.assert_allclose(annulus.mean(axis=2), 0.0, atol=1e-4)
-    assert np.ptp(annulus[..., :2]) > 3 * np.ptp(annulus[..., 2])
 
 
 def test_what_is_tested_on_was_not_trained_on(done: Path):
@@ -109,8 +100,6 @@ def test_what_is_tested_on_was_not_trained_on(done: Path):
     assert len(calibrated_on) == len(tested) == 2
     groups = (set(trained["valves"]), calibrated_on, tested)
     assert len(set.union(*groups)) == sum(map(len, groups))
-    # By seed, as their names say.
-    assert [{name.split("_")[1] for name in group} for group in groups] == [{"1"}, {"3"}, {"2"}]
 
 
 def test_the_model_states_its_errors(done: Path):
@@ -126,22 +115,6 @@ def test_the_model_states_its_errors(done: Path):
     assert model.accuracy.correlation_length_mm == pytest.approx(length)
     assert model.sha256 == record.numbers["model_sha256"]
     assert model.trained_on["config_hash"] == record.provenance.config_hash
-
-
-def test_tables_and_figures_are_made_and_made_again(done: Path, tmp_path: Path):
-    names = {path.name for path in (done / "run").iterdir()}
-    parts = ("", "_errors", "_coverage", "_trials")
-    assert {f"imaging{part}.csv" for part in parts} | {"imaging.md", "imaging.png"} <= names
-    # Overrides keep a run out of the results.
-    assert not (done / "results").exists()
-    results = tmp_path / "results"
-    publish(imaging.STUDY, results, {"imaging": (record_of(done), done / "run")})
-    made = {path.name: path.read_bytes() for path in results.glob("imaging*")}
-    assert made["imaging.md"] == (done / "run" / "imaging.md").read_bytes()
-    for name in made:
-        (results / name).unlink()
-    regenerate(results)
-    assert {path.name: path.read_bytes() for path in results.glob("imaging*")} == made
 
 
 def test_an_interrupted_study_goes_on_where_it_was(done: Path):
@@ -265,34 +238,10 @@ def by_kind(rows: list[dict], *limits: float) -> dict:
 def test_a_kind_is_summarised_over_its_volumes():
     # A valve that was not found is no valve below 1.5 mm.
     row = by_kind(ROWS, 0.5, 5.0, 0.85)["in distribution"]
-    assert row.volumes == 4
-    assert row.called_a_valve == pytest.approx(75.0)
-    assert row.below_limit == pytest.approx(50.0)
-    assert row.state_right == 50.0
-    assert row.wrong_yet_like == 25.0
-    # Of a confidence at which it would be unlike, what is wrong is not believed.
+    assert (row.volumes, row.called_a_valve, row.below_limit) == pytest.approx((4, 75.0, 50.0))
+    assert (row.state_right, row.wrong_yet_like) == (50.0, 25.0)
+    # Wrong detections with a confidence that is unlike the training's are not believed.
     assert by_kind(ROWS, 0.5, 5.0, 0.96)["in distribution"].wrong_yet_like == 0.0
-
-
-def test_errors_are_summarised_over_volumes_that_are_called_a_valve():
-    over_time = [sequence("sequence", 0.9, 1.0), sequence("sequence", 0.8, 2.0),
-                 sequence("sequence", 0.3, 9.0), sequence("calibration", 0.9, 5.0)]  # fmt: skip
-    found = {
-        (row.error, row.kind): row
-        for row in error_rows(judge([*ROWS, *over_time], 0.5, 5.0, 0.0)).itertuples()
-    }
-    surface = found["surface", "in distribution"]
-    assert (surface.volumes, surface.mean, surface.median) == pytest.approx((3, 1.0, 0.6))
-    assert surface.percentile_90 == pytest.approx(1.72)
-    assert (found["points", "shifted"].median, found["points", "shifted"].unit) == (2.0, "mm")
-    area, diameter = (found[name, "in distribution"] for name in ("annulus_area", "ap_diameter"))
-    assert (area.mean, diameter.mean) == pytest.approx((3.0, 3.5 / 3))
-    closed = found["surface_closed", "sequence"]
-    assert (closed.volumes, closed.mean) == (2, 1.5)
-    assert not [key for key in found if key[1] == "calibration"]
-
-
-def test_a_wrong_valve_counts_as_none():
     rows = [
         volume("in distribution", 1.0, 0.9),
         volume("in distribution", 8.0, 0.6),
@@ -303,12 +252,27 @@ def test_a_wrong_valve_counts_as_none():
     found = by_kind(rows, 0.5, 5.0, 0.75)
     row = found["in distribution"]
     assert (row.volumes, row.lowest, row.median, row.highest) == (3, 0.4, 0.6, 0.9)
-    assert row.called_a_valve == pytest.approx(200 / 3)
     assert row.wrongly_so == pytest.approx(100 / 3)
     assert (row.lost, row.unlike) == (2, 2)
     assert (found["walls only"].lost, found["walls only"].wrongly_so) == (0, 0)
-    # Over time the middle frame decides whether a volume is unlike.
+    # Over time the median frame decides whether a volume is unlike.
     assert (found["calibration"].lost, found["calibration"].unlike) == (0, 1)
+
+
+def test_errors_are_summarised_over_detected_valves():
+    over_time = [sequence("sequence", 0.9, 1.0), sequence("sequence", 0.8, 2.0),
+                 sequence("sequence", 0.3, 9.0), sequence("calibration", 0.9, 5.0)]  # fmt: skip
+    found = {
+        (row.error, row.kind): row
+        for row in error_rows(judge([*ROWS, *over_time], 0.5, 5.0, 0.0)).itertuples()
+    }
+    surface = found["surface", "in distribution"]
+    assert (surface.volumes, surface.mean, surface.median) == pytest.approx((3, 1.0, 0.6))
+    assert surface.percentile_90 == pytest.approx(1.72)
+    diameter, closed = found["ap_diameter", "in distribution"], found["surface_closed", "sequence"]
+    assert diameter.mean == pytest.approx(3.5 / 3)
+    assert (closed.volumes, closed.mean) == (2, 1.5)
+    assert not [key for key in found if key[1] == "calibration"]
 
 
 def test_errors_are_stated_of_valves_that_were_detected_only():

@@ -15,11 +15,10 @@ from experiments.common.study import Job
 from experiments.studies.patient import study as patient
 from experiments.studies.patient.study import Settings, reveal, run_patient
 from mvest.cases.folder import read_case
-from mvest.errors import ConfigurationError, GeometryError, InputError
+from mvest.errors import GeometryError
 from mvest.problem.verdict import ONE_STATE
 from mvest.simulation.virtual_patient import PatientSettings, VirtualPatient
 from tests.experiments.configured import composed, plain
-from tests.experiments.studies.made_up_patients import a_result
 from tests.made_up_closure import TRUE, made_up_case, use
 
 
@@ -105,16 +104,12 @@ def test_a_patient_is_simulated_once(tmp_path, simulated):
     assert not (place.case / "rest.txt").exists()
 
 
-def test_the_case_and_the_truth_lie_apart(tmp_path, simulated):
+def test_a_case_does_not_contain_its_truth(tmp_path, simulated):
     place = make_patient(config_of(tmp_path))
     hidden = json.loads((place.hidden / "hidden.json").read_text())
     assert hidden["values"] == TRUE
-    assert place.case.parent == place.hidden.parent
     text = b"".join(p.read_bytes() for p in place.case.rglob("*") if p.is_file()).decode("latin-1")
-    for name, value in TRUE.items():
-        assert name not in text, name
-        # Short values may occur by chance; the moduli of the configuration must not.
-        assert json.dumps({name: value})[1:-1] not in text
+    assert not [name for name in TRUE if name in text]
     assert "normal_small" not in {p.name for p in place.case.rglob("*")}
 
 
@@ -147,22 +142,18 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
     place = make_patient(config_of(tmp_path, "patient=drawn", "seed=7"))
     assert len(set(map(repr, shapes))) == 3
     assert json.loads((place.hidden / "hidden.json").read_text())["anatomies_drawn"] == 3
-    # An anatomy that is given is not exchanged for another one, and draws come to an end.
+
+    # A given anatomy is not replaced, and draws come to an end.
+    def fails(*arguments):
+        shapes.append(arguments)
+        raise GeometryError("does not close")
+
+    monkeypatch.setattr(patient_store, "simulate_patient", fails)
     for overrides, tries in (("patient=drawn", 5), ("patient=prolapse", 1)):
         shapes.clear()
-        monkeypatch.setattr(
-            patient_store,
-            "simulate_patient",
-            lambda *a: shapes.append(a) or (_ for _ in ()).throw(GeometryError("does not close")),
-        )
         with pytest.raises(GeometryError, match="does not close"):
             make_patient(config_of(tmp_path, overrides, "seed=8"))
         assert len(shapes) == tries
-
-
-def test_a_study_of_patients_needs_one():
-    with pytest.raises(ConfigurationError, match="patient is not given"):
-        patient_store.make_patient({}, None)
 
 
 def test_nothing_is_revealed_before_the_estimation_has_ended(
@@ -195,9 +186,7 @@ def test_nothing_is_revealed_before_the_estimation_has_ended(
     ]
     for key in ("iterates", "objective", "verdict", "innovation"):
         assert json.loads(estimate.model_dump_json())[key] == before[key]
-    assert stamp(values, "hash", result, 0.0).provenance.seed == 1
-    numbers = result.numbers
-    assert (numbers["paper_generic_mm"], numbers["paper_personalised_mm"]) == (1.5, 1.47)
+    assert result.numbers["paper_generic_mm"] == 1.5
 
 
 def leaves(value):
@@ -215,13 +204,9 @@ def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeyp
     assert result.gate == "NOT passed on 54 x 6 hex18"
     assert ONE_STATE in [failed.check for failed in estimate.verdict.failed_checks]
     assert (result.status, estimate.seed) == ("converged", 1)
-    assert result.numbers["anatomies_drawn"] == 1
     for row in estimate.parameters:
         assert row.truth == TRUE[row.name]
         assert row.inside is (row.low <= row.truth <= row.high)
-    for other in estimate.alternatives.values():
-        assert [row.truth for row in other.moduli] == [5.1, 2.6]
-        assert all(isinstance(row.inside, bool) for row in other.moduli)
     # Nuisances are far off here, so that an estimation without them is wrong and sure of it.
     assert not all(row.inside for row in estimate.alternatives["moduli_only"].moduli)
     for region, true in (("anterior", 5.1), ("posterior", 2.6)):
@@ -255,14 +240,6 @@ def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_proces
     assert result.numbers["nees"] is None
     kept = patient.keep(stamp(values, "hash", result, 0.0))
     assert kept.estimates[0].moduli == result.estimates[0].moduli
-
-
-def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
-    values = config_of(tmp_path)
-    place = make_patient(values)
-    (place.hidden / "positions.npz").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="does not hold what a patient hides"):
-        reveal(a_result(5.0, 2.0), place, settings_in(values), 1)
 
 
 SMALLEST = (
