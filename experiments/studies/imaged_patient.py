@@ -301,7 +301,8 @@ def _bias(groups: Mapping[str, Sequence[Unknown]]) -> Table:
         rows.append(row)
     bias = Column(digits=".2f", std="bias SE", label="mean error of the logarithm ± SE")
     slope = Column(digits=".2f", std="slope SE", label="slope over the truth's ± SE")
-    return table(rows, **{"estimated from": "", "n": "", "bias": bias, "slope": slope})
+    first = {"estimated from": Column(), "n": Column()}
+    return table(rows, **first, bias=bias, slope=slope)
 
 
 def _chordae(results: Results) -> Table:
