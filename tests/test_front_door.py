@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mvest
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume

@@ -123,7 +123,6 @@ IMPORTERS: dict[str, tuple[Enter, Makers]] = {
     ),
     "surface": (surface, of(
         "VTP: text, plain, UInt32, LittleEndian, Int64",
-        "VTP: base64, zlib, UInt64, LittleEndian, Int64",
         "VTP: appended, LZMA, UInt32, BigEndian, Int32",
         "VTU: text, plain, UInt32, LittleEndian, Int64",
         "VTU: appended, LZ4, UInt64, LittleEndian, Int32",

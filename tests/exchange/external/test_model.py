@@ -155,7 +155,6 @@ def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
     [
         ("sys.exit('out of licences')", "exit status 1; its last words: out of licences"),
         ("time.sleep(60)", "stopped at the time limit of 0.5 s"),
-        ("response.unlink()", "response.json is missing"),
         ("observation.write_text('x,y,z\\n1,2,3\\n4,nan,6\\n')", "'nan'"),
         ("jacobian.write_text('k1\\n' + '1\\n' * 6)", "jacobian.csv: columns k1"),
     ],
@@ -196,9 +195,7 @@ def test_parameters_without_a_size_need_a_floor(tmp_path):
     [
         ({"scheme": "exact"}, "central, forward"),
         ({"relative_step": 0.0}, "relative_step"),
-        ({"relative_step": float("nan")}, "relative_step"),
         ({"floor": -1.0}, "floor"),
-        ({"processes": 0}, "processes"),
     ],
 )
 def test_inadmissible_differences_are_refused(settings, message):
@@ -217,14 +214,6 @@ def test_an_inadmissible_model_is_refused_before_anything_runs(tmp_path):
         ProcessModel(command, tmp_path / "file" / "runs", NAMES, 2)
     with pytest.raises(InputError, match="1 parameters"):
         ProcessModel(command, tmp_path, NAMES, 2)(np.ones(1))
-
-
-def test_a_run_without_a_place_is_a_reason_and_no_run(tmp_path):
-    program = model(tmp_path)
-    (tmp_path / "runs").rmdir()
-    (tmp_path / "runs").touch()
-    assert "Not a directory" in program(M).reason
-    assert (program.runs, program.reused) == (0, 0)
 
 
 def counted(monkeypatch, tmp_path, *arguments: str) -> int:

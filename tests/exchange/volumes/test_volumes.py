@@ -62,13 +62,10 @@ SAME: dict[str, Callable[[Path], Path]] = {
     "frames along the second axis": lambda folder: v.write_nrrd(
         folder / "a.nrrd", v.nrrd_fields(1) | {"encoding": "gzip"}, v.nrrd_voxels(1)
     ),
-    "a name of another format": lambda folder: nrrd(folder, name="a.nii.gz"),
     "left, anterior, superior": las,
     "the space stated twice": lambda folder: nrrd(folder, "space: left-posterior-superior\n"),
-    "the space stated in two ways": lambda folder: nrrd(folder, "space: LPS\n"),
     "carriage returns": crlf,
     "a line and bytes skipped": lambda folder: skipped(folder, line_skip="1", byte_skip="5"),
-    "all but the last bytes skipped": lambda folder: skipped(folder, byteskip="-1"),
 }
 
 
@@ -82,17 +79,13 @@ def test_the_same_volume(tmp_path: Path, what: str) -> None:
 LEFT: dict[str, Callable[[Path], Path]] = {
     "NRRD": lambda folder: v.write_nrrd(folder / "a.nrrd", v.nrrd_fields(direction=v.MIRRORED)),
     "mha": lambda folder: by_itk(folder / "a.mha", direction=v.MIRRORED),
-    "mhd": lambda folder: by_itk(folder / "a.mhd", direction=v.MIRRORED),
-    **{
-        of: lambda folder, of=of: nifti(folder / "a.nii", "NIfTI-1", "uint8", of, v.MIRRORED)
-        for of in ("sform only", "qform only")
-    },
+    "NIfTI": lambda folder: nifti(folder / "a.nii", "NIfTI-1", "uint8", "qform only", v.MIRRORED),
 }
 
 
 @pytest.mark.parametrize("what", LEFT)
 def test_a_left_handed_volume_stays_left_handed(tmp_path: Path, what: str) -> None:
-    unit = {"time_unit": "s"} if what in ("mha", "mhd") else {}
+    unit = {"time_unit": "s"} if what == "mha" else {}
     times = v.TIMES if what == "NRRD" else EVEN
     expected = VolumeSequence(v.frames(), v.SPACING, v.MIRRORED, v.ORIGIN, times)
     v.assert_same(read(LEFT[what](tmp_path), **unit), expected)
@@ -122,14 +115,6 @@ def test_time_as_an_axis_of_the_world(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.frames, v.frames())
 
 
-def without_unit(folder: Path) -> Path:
-    path = nifti(folder / "a.nii", "NIfTI-1", "uint8")
-    image = nibabel.load(path)
-    image.header.set_xyzt_units("mm", "unknown")
-    nibabel.save(image, folder / "b.nii")
-    return folder / "b.nii"
-
-
 def without_times(folder: Path) -> Path:
     path = nifti(folder / "a.nii", "NIfTI-1", "uint8")
     content = path.read_bytes()
@@ -143,13 +128,9 @@ PHASES = {"axis 0 index type=": "text", TIMES: "ED%20frame mid ES"}
 UNTIMED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "NRRD": (lambda folder: nrrd(folder, units=None), f"{VALUES}: times without a unit"),
     "phases by name": (lambda folder: nrrd(folder, **PHASES), "index type: no times of frames"),
-    "NRRD by ITK": (
-        lambda folder: by_itk(folder / "a.nrrd"), "space directions: times without a unit"
-    ),
     "MetaImage": (lambda folder: by_itk(folder / "a.mha"), "ElementSpacing: times without a unit"),
-    "NIfTI": (without_unit, r"pixdim\[4\].*: times without a unit"),
     "NIfTI of no interval": (without_times, r"pixdim\[4\].*: no times of frames"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", UNTIMED)
@@ -169,9 +150,7 @@ def test_times_without_a_unit_take_the_users(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stored", "endian", "kind", "first"),
     [
-        ("int8", "little", "int16", -50),
         ("int16", "big", "int16", -50),
-        ("uint16", "little", "int16", 0),
         ("int32", "big", "int16", -50),
         ("float64", "little", "float32", -50),
         ("uint16", "little", "float32", 60000),
@@ -210,7 +189,7 @@ def test_a_recording_lies_where_slicerheart_places_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "before"),
     [(v.SHAPE, b"\x07" * 64), ((3, 17, 19, 21), b""), ((4, 32, 32, 32), b"")],
-    ids=["the last bytes", "an odd number", "beyond what is kept in memory"],
+    ids=["the last bytes", "an odd number", "not kept in memory"],
 )
 def test_voxels_of_a_recording(tmp_path: Path, shape: tuple[int, ...], before: bytes) -> None:
     data = dataset(shape, before)
@@ -274,104 +253,60 @@ def steps(text: str) -> dict[str, str]:
 PLACE, PATH = "space directions", "file in the same folder"
 BAD: dict[str, Bad] = {
     "colour": of_nrrd("kinds", "one grey value", kinds="RGB-color domain domain domain"),
-    "five axes": of_nrrd("dimension", "3 (one volume) or 4", dimension="5"),
     "sizes and dimension": of_nrrd("dimension", "3 (one volume) or 4", sizes="3 20 24"),
-    "no sizes": of_nrrd("sizes", "a number for each axis", sizes=None),
     "no spacing": of_nrrd(PLACE, "a vector in mm", **{PLACE: None}),
     "no origin": of_nrrd("space origin", "centre of the first voxel", **{"space origin": None}),
-    "no space": of_nrrd("space", "left-posterior-superior", space=None),
     "unknown space": of_nrrd("space", "left-posterior-superior", space="scanner-xyz"),
     "all axes in space": of_nrrd(
         PLACE, "three, and 'none' for the frames", **{PLACE: "(1,0,0) (0,1,0) (0,0,1) (1,1,0)"}),
     "no right angles": of_nrrd(PLACE, "right angles", **steps("(1,0,0) (0.1,1,0) (0,0,1)")),
     "spacing in cm": of_nrrd(PLACE, "0.05 to 5 mm", **steps("(0.04,0,0) (0,0.04,0) (0,0,0.04)")),
     "small extent": of_nrrd(PLACE, "20 to 500 mm", **steps("(0.1,0,0) (0,0.1,0) (0,0,0.1)")),
-    "few voxels": of_nrrd("sizes", "at least 16", sizes="3 16 17 8"),
     "no frames": of_nrrd("sizes", "at least one frame", sizes="0 16 17 21"),
     "origin far away": of_nrrd(
         "space origin", "coordinates in mm", **{"space origin": "(1e6,0,0)"}),
-    "units of length": of_nrrd("units", "mm", units='"s" "deg" "" ""'),
     "space units": of_nrrd(
         "space units", "mm, cm, m or um", **{"space units": '"mm" "inch" "mm"'}),
     "time runs back": of_nrrd(VALUES, "increasing times", **{TIMES: "0 0.05 0.03"}),
     "ms taken for s": of_nrrd(VALUES, "less than 1 s", **{TIMES: "0 30 60"}),
     "s taken for ms": of_nrrd(VALUES, "at least 0.002 s", units='"ms" "" "" ""'),
     "a time is missing": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 0.03"}),
-    "a time is no number": of_nrrd(VALUES, "numbers", **{TIMES: "0 0.03 end"}),
     "a time is nan": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 nan 0.03"}),
     "percent of a beat": of_nrrd(
         VALUES, "times in s or ms", units='"%" "" "" ""', **{TIMES: "0 5 10"}),
     "a segmentation": of_nrrd("Segment0_ID", "an image", **{"Segment0_ID=": "Leaf"}),
-    "a label map": of_nrrd(
-        "DataNodeClassName", "an image", **{"DataNodeClassName=": "vtkMRMLLabelMapVolumeNode"}),
     "unknown modality": of_nrrd(
         "mvest.modality", "ultrasound, ct, mr", **{"mvest.modality=": "pet"}),
-    "other encoding": of_nrrd("damaged", "", encoding="zrl"),
-    "unknown type": of_nrrd("header", "", type="block"),
-    "no order of bytes": of_nrrd("header", "", endian=None, type="short"),
-    "a number that is none": of_nrrd("header", "", sizes="3 16 x 21"),
-    "more voxels than bytes": of_nrrd("damaged", "", sizes="3 16 17 22"),
     "fewer voxels than bytes": of_nrrd("damaged", "", sizes="3 16 17 20"),
     "data elsewhere": of_nrrd("data file", PATH, **{"data file": "../a.raw"}),
-    "data at an absolute path": of_nrrd("data file", PATH, **{"data file": "/etc/hostname"}),
-    "data in several files": of_nrrd("data file", PATH, **{"data file": "LIST"}),
     "another space": (lambda f: nrrd(f, "space: right-anterior-superior\n"), "header: ", "fields"),
-    "other sizes": (lambda f: nrrd(f, "sizes: 3 16 21 17\n"), "header: ", "fields and keys"),
-    "no field": (lambda f: nrrd(f, "no field\n"), "header: ", "fields and keys"),
     "a header without end": (lambda f: nrrd(f, "# more\n" * 200_000), "header: no end in 1048", ""),
     "MetaImage: no spacing": of_metaimage(r"ElementSpacing = .*\n", "", "ElementSpacing"),
-    "no direction": of_metaimage(r"TransformMatrix = .*\n", "", "TransformMatrix"),
     "no offset": of_metaimage(r"Offset = .*\n", "", "Offset"),
-    "no field at all": of_metaimage(r"Offset = ", "Offset ", "Offset"),
     "a spacing missing": of_metaimage(r"(ElementSpacing = \S+) .*", r"\1", "ElementSpacing"),
-    "negative": of_metaimage(r"ElementSpacing = ", "ElementSpacing = -", "ElementSpacing"),
-    "a vector of two": of_metaimage(r"TransformMatrix = \S+", "TransformMatrix = 2", "Transform"),
     "space and time": of_metaimage(r"(TransformMatrix = .*) 0 1\n", r"\1 0.5 1\n", "Transform"),
-    "two axes": of_metaimage(r"NDims = 4", "NDims = 2", "NDims"),
     "more voxels": of_metaimage(r"DimSize = 16", "DimSize = 17", "ElementDataFile"),
-    "fewer voxels": of_metaimage(r" 21 3\n", " 20 3\n", "ElementDataFile"),
     "channels": of_metaimage(r"ElementType", "ElementNumberOfChannels = 3\nElementType", "Element"),
-    "text": of_metaimage(r"BinaryData = True", "BinaryData = False", "damaged"),
     "an offset of data": of_metaimage(r"ElementType", "HeaderSize = 12\nElementType", "HeaderSize"),
     "a file elsewhere": of_metaimage(r"LOCAL", "../a.raw", "ElementDataFile"),
-    "an absolute path": of_metaimage(r"LOCAL", "/etc/hostname", "ElementDataFile"),
-    "several files": of_metaimage(r"LOCAL", "LIST", "ElementDataFile"),
     "stated twice": of_metaimage(r"Offset = ", "Offset = 1 2 3 4\nOffset = ", "Offset"),
     "NIfTI: no direction": of_nifti(
         lambda h: h.set_sform(None, "unknown"), "sform_code", "a direction"),
     "two spacings": of_nifti(
         lambda h: h["pixdim"].__setitem__(2, 2.5), "pixdim", "the spacing of sform"),
-    "metres": of_nifti(
-        lambda h: h.set_xyzt_units("meter", "msec"), "sform or qform", "0.05 to 5 mm"),
     "hertz": of_nifti(
         lambda h: h.set_xyzt_units("mm", "hz"), "xyzt_units", "a fourth axis of time"),
-    "40 s": of_nifti(lambda h: h.set_xyzt_units("mm", "sec"), "pixdim[4] with", "less than 1 s"),
-    "an axis more": of_nifti(
-        lambda h: h.set_data_shape((16, 17, 21, 1, 3)), "dim", "3 or 4 axes"),
-    "truncated": of_nifti(
-        lambda h: h.set_data_shape((16, 17, 22, 3)), "data", "bytes that the header"),
     "longer": of_nifti(
         lambda h: h.set_data_shape((16, 17, 21, 2)), "data", "bytes that the header"),
     "RGB": of_nifti(lambda h: h.set_data_dtype("RGB"), "data", "no colour"),
-    "complex": of_nifti(lambda h: h.set_data_dtype(np.complex64), "data", "no colour"),
-    "offset": of_nifti(
-        lambda h: h.__setitem__("vox_offset", 1e9), "data", "bytes that the header"),
     "two files": of_nifti(lambda h: h.__setitem__("magic", b"ni1"), "magic", "one file"),
-    "datatype 77": of_nifti(lambda h: h.__setitem__("datatype", 77), "damaged", ""),
     "CT": of_dicom("SOPClassUID", "1.2.840.10008.5.1.4.1.1.2", "SOPClassUID", "3D Slicer"),
-    "no slices": of_dicom((0x3001, 0x1001), None, "(3001,1001)", "a number"),
     "no slice spacing": of_dicom((0x3001, 0x1003), None, "(3001,1003)", "a number"),
-    "no delta": of_dicom("PhysicalDeltaX", None, "PhysicalDeltaX", "a number"),
     "no cm": of_dicom("PhysicalUnitsXDirection", 4, "PhysicalUnitsXDirection", "which is cm"),
-    "no cm between slices": of_dicom((0x3001, 0x1002), 4, "(3001,1002)", "which is cm"),
     "no frame time": of_dicom("FrameTime", None, "FrameTime", "a number"),
-    "no number of frames": of_dicom("NumberOfFrames", None, "NumberOfFrames", "a number"),
-    "samples": of_dicom("SamplesPerPixel", 3, "SamplesPerPixel", "one grey value"),
     "two bytes": of_dicom("BitsAllocated", 16, "BitsAllocated", "one grey value of a byte"),
-    "mm in place of cm": of_dicom("PhysicalDeltaX", 1.5, "PhysicalDeltaX", "0.05 to 5 mm"),
     "mirrored spacing": of_dicom("PhysicalDeltaX", -0.15, "PhysicalDeltaX", "positive lengths"),
     "more frames than bytes": of_dicom("NumberOfFrames", 4, "PixelData", "22848 bytes"),
-    "no pixels": of_dicom("PixelData", None, "PixelData", "the voxels"),
 }  # fmt: skip
 
 

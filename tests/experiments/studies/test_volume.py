@@ -14,7 +14,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.from_images.detector_errors import valve_axes
 from mvest.errors import InputError
 from mvest.exchange.markups import PointList, write_markups
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.files import sha256_of
 from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
