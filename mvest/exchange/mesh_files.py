@@ -23,9 +23,9 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
 Arrays = Mapping[str, NDArray[np.generic]]
-LINES, STRIPS, POLYGONS = (3, 4), (6,), (5, 7, 9)
-FLAT = (1, 2, *LINES, *STRIPS, *POLYGONS)
-"""VTK's numbers of cell types; 1 and 2 are single vertices."""
+STRIPS, POLYGONS = (6,), (5, 7, 9)
+FLAT = (1, 2, 3, 4, *STRIPS, *POLYGONS)
+"""VTK's numbers of cell types; 1 and 2 are single vertices, 3 and 4 lines."""
 STL_HEADER = 84
 STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -53,8 +53,6 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
                 raise InputError(
                     f"data {name!r} has {len(values)} rows, expected {len(count)} {what}"
                 )
-    owner = np.repeat(np.arange(len(types)), sizes)
-    onward = (owner[:-1] == owner[1:]) & np.isin(types[owner[:-1]], LINES)
     numbers, counts = np.unique(types[~np.isin(types, FLAT)], return_counts=True)
     name_of = vtk_module("vtkCommonDataModel").vtkCellTypes.GetClassNameFromTypeId
     names = [name_of(number).removeprefix("vtk").lower() for number in numbers.tolist()]
@@ -64,7 +62,6 @@ def read_cells(path: Path, suffix: str) -> dict[str, Any]:
     return {
         "vertices": points,
         "triangles": triangles,
-        "segments": np.column_stack([corners[:-1], corners[1:]])[onward],
         "others": dict(zip(names, counts.tolist(), strict=True)),
         "point_data": at_points,
         "cell_data": {name: values[rows] for name, values in at_cells.items()},

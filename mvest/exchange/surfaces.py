@@ -57,9 +57,6 @@ class Surface:
         Name of the group or object of each triangle (OBJ, GLB); empty without any.
     region
         ``(m,)`` index into the regions of a case; None without labels.
-    segments
-        ``(k, 2)`` points of the line segments of a file, in their direction; None after a change of
-        the vertices.
     others
         Number of cells of each other type, by its name in VTK ("tetra", "wedge"), without single
         vertices.
@@ -73,13 +70,12 @@ class Surface:
     cell_data: Data = field(default_factory=dict)
     groups: Sequence[str] = ()
     region: IntArray | None = None
-    segments: IntArray | None = None
     others: Mapping[str, int] = field(default_factory=dict)
     space: str | None = None
 
 
 def read_mesh(path: Path | str) -> Surface:
-    """Read the points, triangles and lines of a file.
+    """Read the points and triangles of a file.
 
     Raises
     ------
@@ -209,7 +205,6 @@ def merged(surface: Surface) -> Surface:
         vertices=surface.vertices[keep],
         triangles=rank[inverse].reshape(-1, 3),
         point_data={name: values[keep] for name, values in surface.point_data.items()},
-        segments=None,
     )
 
 

@@ -130,7 +130,7 @@ IMPORTERS: dict[str, tuple[Enter, Makers]] = {
         "VTK: 5.1, text, float64, a field", "VTK: triangle strips, 5.1, binary",
         "STL: VTK text", "STL: VTK binary", "GLB: objects that nodes place",
         "PLY: labels of points, ascii", "PLY: labels of faces, binary little endian",
-        "OBJ: groups of an object", "OBJ: lines and comments",
+        "OBJ: groups of an object", "OBJ: Latin-1 comment",
     )),
     "volume": (volume, of(
         "NRRD by pynrrd: .seq.nrrd, frames first, raw, uint8", "NRRD: milliseconds",

