@@ -83,7 +83,7 @@ def required(fields: Mapping[str, Any], name: str, expected: str) -> Any:
     return fields[name]
 
 
-def beside(path: Path, where: str, name: str) -> Path:
+def neighbour_file(path: Path, where: str, name: str) -> Path:
     """The data file of a header, which must lie in the same folder."""
     other = path.parent / name
     inside = name.isprintable() and other.resolve().parent == path.parent.resolve()
@@ -205,7 +205,7 @@ def metaimage(path: Path, head: bytes) -> Opened:
         required(fields, "BinaryDataByteOrderMSB", "the order of bytes")
     name = fields["ElementDataFile"]
     local = name.upper() == "LOCAL"
-    source = path if local else beside(path, "ElementDataFile", name)
+    source = path if local else neighbour_file(path, "ElementDataFile", name)
 
     def load() -> Voxels:
         content = source.read_bytes()[end if local else 0 :]

@@ -24,9 +24,9 @@ from mvest.exchange._images import (
     Segment,
     Stated,
     Voxels,
-    beside,
     check,
     fault,
+    neighbour_file,
     required,
 )
 from mvest.typing import FloatArray
@@ -79,7 +79,7 @@ def nrrd_file(path: Path, head: bytes) -> Opened:
     shape = (1, *sizes) if axis is None else (sizes.pop(axis), *sizes)
     data_file = fields.pop("datafile", fields.get("data file", ""))
     if data_file:
-        fields["data file"] = str(beside(path, "data file", data_file))
+        fields["data file"] = str(neighbour_file(path, "data file", data_file))
     check(data_file or end, "header", f"no end in {len(head)} bytes", "an empty line")
     lines_to_skip = int(fields.get("line skip", fields.get("lineskip", 0)))
     check(lines_to_skip <= MAX_LINES, "line skip", lines_to_skip, f"at most {MAX_LINES}")

@@ -45,7 +45,7 @@ from mvest.typing import FloatArray
 MAX_BYTES = 4 * 2**30
 """Largest decoded size of all frames: twenty frames of CT, 512 x 512 x 300 voxels of two bytes,
 have 2.9 GiB."""
-MAX_UNASKED, MAX_RATIO = 2**28, 1000
+MAX_UNCHECKED, MAX_RATIO = 2**28, 1000
 """Decoded bytes that any file may have, and largest compression ratio beyond that: images of the
 heart have ratios of 1.5 to 20, label maps of some hundred."""
 COPIES = 3
@@ -242,7 +242,7 @@ def _read(path: Path, labels: bool, *options: Any) -> dict[str, Any]:
     found: dict[str, Any] = in_child(describe, path, labels, *options)
     size, files = found.pop("bytes"), _files(path, found.pop("data_file"))
     stored = sum(file.stat().st_size for file in files)
-    if size > max(MAX_UNASKED, MAX_RATIO * stored):
+    if size > max(MAX_UNCHECKED, MAX_RATIO * stored):
         raise InputError(
             f"{path}: data: {size} bytes compressed to {stored}, expected at most {MAX_RATIO} "
             "times as many; save it without compression"
@@ -381,7 +381,7 @@ def _times(stated: Stated, frame_interval_s: float | None, time_unit: str | None
     if frame_interval_s is not None:
         known = given is not None and unit is not None
         check(not known, "frame_interval_s", frame_interval_s, f"none: {field} states the times")
-        check(time_unit is None, "frame_interval_s", "beside time_unit", "one of the two")
+        check(time_unit is None, "frame_interval_s", "given with time_unit", "one of the two")
         positive = np.isfinite(frame_interval_s) and frame_interval_s > 0
         check(positive, "frame_interval_s", frame_interval_s, "a positive number")
         given, unit = np.arange(count, dtype=np.float64), frame_interval_s

@@ -65,7 +65,9 @@ def read_npz(
         if missing := ", ".join(name for name in wanted if name not in sizes):
             raise InputError(f"{where}: arrays {one_line(missing, 120)} are missing")
         if exact and (more := ", ".join(name for name in sizes if name not in wanted)):
-            raise InputError(f"{where}: holds arrays {one_line(more, 120)} beside those needed")
+            raise InputError(
+                f"{where}: holds arrays {one_line(more, 120)} in addition to those needed"
+            )
         total = sum(sizes[name] for name in wanted)
         if total > MAX_BYTES:
             raise InputError(f"{where}: {total} bytes of arrays, expected at most {MAX_BYTES}")

@@ -7,7 +7,7 @@ with what was written. Nothing of the readers takes part.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 
 import meshio
@@ -278,9 +278,10 @@ def glb(path: Path, what: str) -> None:
 def surface_variants() -> Iterator[Variant]:
     """All of them; those without labels hold ``labels=False``."""
     modes = ("text", "base64", "appended", "appended base64")
-    ways = product(modes, COMPRESSION, ("UInt32", "UInt64"), ("LittleEndian", "BigEndian"))
-    for kind, (way, ids) in product(("vtp", "vtu"), product(ways, ("Int32", "Int64"))):
-        yield Variant(kind.upper(), (*way, ids), f"a.{kind}", lambda p, o=(*way, ids): xml(p, *o))
+    types = cycle(product(("UInt64", "UInt32"), ("LittleEndian", "BigEndian"), ("Int64", "Int32")))
+    for kind, *way in product(("vtp", "vtu"), modes, COMPRESSION):
+        options = (*way, *next(types))
+        yield Variant(kind.upper(), options, f"a.{kind}", lambda p, o=options: xml(p, *o))
     for what in ("single precision", "int8 labels", "labels of points", "boundary lines",
                  "triangle strips", "quads"):  # fmt: skip
         yield Variant("VTP", (what,), "a.vtp", lambda p, w=what: more_xml(p, w))

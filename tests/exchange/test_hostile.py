@@ -245,7 +245,7 @@ def test_scenes_that_are_damaged_or_packed_otherwise(name: str, tmp_path: Path) 
 
 
 CUT = (
-    *("VTP: base64, zlib, UInt64, LittleEndian, Int64", "GLB: one mesh"),
+    *("VTP: base64, zlib, UInt32, LittleEndian, Int32", "GLB: one mesh"),
     *("VTK: 4.2, text, int32, scalars", "VTK: 5.1, binary, int32, scalars"),
     *("STL: VTK binary", STL, PLY, "PLY: binary little endian, float, uchar"),
     *(NRRD, META, "MetaImage: .mha, 4D, uint8, plain", NIFTI, DICOM, "Markups: 1.0.3, LPS"),

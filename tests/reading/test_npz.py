@@ -121,7 +121,7 @@ def test_arrays_that_are_missing_or_too_many_are_named(tmp_path):
     path = packed(tmp_path / "a.npz", npy(), names=("a.npy", "b.npy"))
     with pytest.raises(InputError, match="arrays c are missing"):
         read_npz(path, ["a", "c"])
-    with pytest.raises(InputError, match="holds arrays b beside"):
+    with pytest.raises(InputError, match="holds arrays b in addition"):
         read_npz(path, ["a"], exact=True)
 
 

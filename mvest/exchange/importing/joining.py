@@ -253,7 +253,7 @@ def _facing_ventricle(
     commissures: FloatArray,
     contour: FloatArray | None,
     down: FloatArray,
-    beside_mm: float,
+    seam_mm: float,
 ) -> tuple[Leaflet, IntArray, IntArray]:
     """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
     turned = replace(leaflet, triangles=leaflet.triangles[:, ::-1], loop=leaflet.loop[::-1])
@@ -265,12 +265,12 @@ def _facing_ventricle(
         annulus = arcs[int(np.argmax(away) if contour is None else np.argmin(away))]
         ring = np.vstack([candidate.vertices[annulus], other.curve.mean(0)])
         if loop_vector_area(ring) @ down > 0:
-            return candidate, *_cornered(candidate, annulus, other, beside_mm)
+            return candidate, *_cornered(candidate, annulus, other, seam_mm)
     raise GeometryError("a leaflet lies in the axis of the annulus, to neither side of the other")
 
 
 def _cornered(
-    leaflet: Leaflet, rough: IntArray, other: Leaflet, beside_mm: float
+    leaflet: Leaflet, rough: IntArray, other: Leaflet, seam_mm: float
 ) -> tuple[IntArray, IntArray]:
     """Arcs of annulus and free edge, split at the corners of the leaflet.
 
@@ -289,7 +289,7 @@ def _cornered(
         along = _along(leaflet.vertices[way])
         off = np.linalg.norm(closest_on_loop(leaflet.vertices[way], other.curve)[2], axis=1)
         distance = np.where(np.abs(along - expected) <= reach, off, np.inf)
-        first = int(np.argmax(distance <= max(beside_mm, float(distance.min()))))
+        first = int(np.argmax(distance <= max(seam_mm, float(distance.min()))))
         window = (along >= along[first]) & (along <= along[first] + CORNER)
         settled = distance <= distance[window].min() + SETTLED
         ends.append(way[first + int(np.argmax(settled[first:]))])

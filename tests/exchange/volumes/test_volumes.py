@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import nibabel
+import nrrd
 import numpy as np
 import pytest
 from pydicom.dataset import Dataset
@@ -18,66 +19,83 @@ from pydicom.dataset import Dataset
 from mvest.errors import InputError
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
-from tests.exchange.volume_variants import by_itk, dataset, nifti, philips
+from tests.exchange.volume_variants import by_itk, dataset, directions, header, nifti, philips
 from tests.exchange.volumes import volumes as v
 
 VALUES = "axis 0 index values"
 TIMES = f"{VALUES}="
 EVEN = np.array([0.0, 0.04, 0.08])
+SEQUENCE = VolumeSequence(v.frames(), v.SPACING, v.ROTATION, v.ORIGIN, EVEN)
 
 
 def read(path: Path, **given: Any) -> VolumeSequence:
     return read_volume(path, **{"modality": Modality.ULTRASOUND} | given)
 
 
-def nrrd(folder: Path, extra: str = "", name: str = "a.nrrd", **changes: str | None) -> Path:
-    """A file with fields in place of some, or without those that are None."""
-    fields = {k: x for k, x in (v.nrrd_fields() | changes).items() if x is not None}
-    return v.write_nrrd(folder / name, fields, extra=extra)
+def made(folder: Path, extra: str = "", **changes: str | None) -> Path:
+    """A file of pynrrd with other lines of its header, or without those that are None.
+
+    Names of key/value pairs end in "=".
+    """
+    path = folder / "a.nrrd"
+    nrrd.write(str(path), v.frames(), header(0, "raw"))
+    head, _, voxels = path.read_bytes().partition(b"\n\n")
+    first, *lines = [line for line in head.decode().split("\n") if line[0] != "#"]
+    pairs = [line.replace(":=", "=:", 1).split(":", 1) for line in lines]
+    fields = {name: value.strip() for name, value in pairs} | {"type": "uint8"} | changes
+    lines = [
+        f"{name[:-1]}:={value}" if name.endswith("=") else f"{name}: {value}"
+        for name, value in fields.items()
+        if value is not None
+    ]
+    path.write_bytes("\n".join([first, *lines, f"{extra}\n"]).encode() + voxels)
+    return path
 
 
 def crlf(folder: Path) -> Path:
-    text = v.nrrd_text(v.nrrd_fields()).replace(b"\n", b"\r\n")
-    (folder / "a.nrrd").write_bytes(text + v.nrrd_voxels())
-    return folder / "a.nrrd"
+    path = made(folder)
+    head, end, voxels = path.read_bytes().partition(b"\n\n")
+    path.write_bytes((head + end).replace(b"\n", b"\r\n") + voxels)
+    return path
 
 
 def skipped(folder: Path, **skips: str) -> Path:
-    (folder / "a.raw").write_bytes(b"one line\n12345" + v.nrrd_voxels())
-    fields = v.nrrd_fields() | {"data file": "a.raw"}
-    (folder / "a.nhdr").write_bytes(
-        v.nrrd_text(fields | {k.replace("_", " "): x for k, x in skips.items()})
-    )
+    skips = {name.replace("_", " "): value for name, value in skips.items()}
+    path = made(folder, **{"data file": "a.raw"} | skips)
+    head, end, voxels = path.read_bytes().partition(b"\n\n")
+    (folder / "a.raw").write_bytes(b"one line\n12345" + voxels)
+    (folder / "a.nhdr").write_bytes(head + end)
     return folder / "a.nhdr"
 
 
-def las(folder: Path) -> Path:
-    signs = np.array([1, -1, 1])
-    fields = v.nrrd_fields(direction=v.ROTATION * signs[:, None])
-    fields |= {"space": "LAS", "space origin": v.vector(v.ORIGIN * signs)}
-    return v.write_nrrd(folder / "a.nrrd", fields)
+def other(folder: Path, axis: int = 0, frames: np.ndarray | None = None, **fields: Any) -> Path:
+    """A file of pynrrd with the frames along an axis, and other fields."""
+    frames = v.frames() if frames is None else frames
+    nrrd.write(str(folder / "a.nrrd"), np.moveaxis(frames, 0, axis), header(axis) | fields)
+    return folder / "a.nrrd"
 
 
+LAS = np.array([1, -1, 1])
 SAME: dict[str, Callable[[Path], Path]] = {
-    "frames along the second axis": lambda folder: v.write_nrrd(
-        folder / "a.nrrd", v.nrrd_fields(1) | {"encoding": "gzip"}, v.nrrd_voxels(1)
-    ),
-    "left, anterior, superior": las,
-    "the space stated twice": lambda folder: nrrd(folder, "space: left-posterior-superior\n"),
+    "frames along the second axis": lambda folder: other(folder, 1),
+    "left, anterior, superior": lambda folder: other(
+        folder, **{"space": "LAS", "space directions": directions(0) * LAS,
+                   "space origin": v.ORIGIN * LAS}),
+    "the space stated twice": lambda folder: made(folder, "space: left-posterior-superior\n"),
     "carriage returns": crlf,
     "a line and bytes skipped": lambda folder: skipped(folder, line_skip="1", byte_skip="5"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", SAME)
 def test_the_same_volume(tmp_path: Path, what: str) -> None:
     found = read(SAME[what](tmp_path))
-    v.assert_same(found, v.sequence())
+    v.assert_same(found, SEQUENCE)
     assert found.frames.flags.c_contiguous
 
 
 LEFT: dict[str, Callable[[Path], Path]] = {
-    "NRRD": lambda folder: v.write_nrrd(folder / "a.nrrd", v.nrrd_fields(direction=v.MIRRORED)),
+    "NRRD": lambda folder: by_itk(folder / "a.nrrd", direction=v.MIRRORED),
     "mha": lambda folder: by_itk(folder / "a.mha", direction=v.MIRRORED),
     "NIfTI": lambda folder: nifti(folder / "a.nii", "NIfTI-1", "uint8", "qform only", v.MIRRORED),
 }
@@ -85,14 +103,13 @@ LEFT: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.parametrize("what", LEFT)
 def test_a_left_handed_volume_stays_left_handed(tmp_path: Path, what: str) -> None:
-    unit = {"time_unit": "s"} if what == "mha" else {}
-    times = v.TIMES if what == "NRRD" else EVEN
-    expected = VolumeSequence(v.frames(), v.SPACING, v.MIRRORED, v.ORIGIN, times)
+    unit = {} if what == "NIfTI" else {"time_unit": "s"}
+    expected = VolumeSequence(v.frames(), v.SPACING, v.MIRRORED, v.ORIGIN, EVEN)
     v.assert_same(read(LEFT[what](tmp_path), **unit), expected)
 
 
 def test_the_hash_is_that_of_all_files(tmp_path: Path) -> None:
-    one = read(nrrd(tmp_path))
+    one = read(made(tmp_path))
     assert one.source == "a.nrrd"
     assert one.sha256 == hashlib.sha256((tmp_path / "a.nrrd").read_bytes()).hexdigest()
     both = [skipped(tmp_path, byteskip="-1").read_bytes(), (tmp_path / "a.raw").read_bytes()]
@@ -100,19 +117,18 @@ def test_the_hash_is_that_of_all_files(tmp_path: Path) -> None:
 
 
 def test_time_as_an_axis_of_the_world(tmp_path: Path) -> None:
-    fields = v.nrrd_fields(3)
-    vectors = [v.vector(np.append(step, 0.0)) for step in (v.ROTATION * v.SPACING).T]
-    for name in ("units", "axis 3 index values=", "axis 3 index type="):
-        del fields[name]
-    fields |= {
+    vectors = np.zeros((4, 4))
+    vectors[:3, :3], vectors[3, 3] = (v.ROTATION * v.SPACING).T, 40
+    fields = header(3) | {
         "space": "left-posterior-superior-time",
-        "space directions": " ".join([*vectors, "(0,0,0,40)"]),
-        "space units": '"mm" "mm" "mm" "ms"',
-        "space origin": v.vector(np.append(v.ORIGIN, 0.0)),
+        "space directions": vectors,
+        "space units": ["mm", "mm", "mm", "ms"],
+        "space origin": np.append(v.ORIGIN, 0.0),
     }
-    found = read(v.write_nrrd(tmp_path / "a.nrrd", fields, v.nrrd_voxels(3)))
-    np.testing.assert_allclose(found.times, EVEN)
-    np.testing.assert_array_equal(found.frames, v.frames())
+    for name in ("units", "axis 3 index values", "axis 3 index type"):
+        del fields[name]
+    nrrd.write(str(tmp_path / "a.nrrd"), np.moveaxis(v.frames(), 0, 3), fields)
+    v.assert_same(read(tmp_path / "a.nrrd"), SEQUENCE)
 
 
 def without_times(folder: Path) -> Path:
@@ -126,8 +142,8 @@ def without_times(folder: Path) -> Path:
 
 PHASES = {"axis 0 index type=": "text", TIMES: "ED%20frame mid ES"}
 UNTIMED: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "NRRD": (lambda folder: nrrd(folder, units=None), f"{VALUES}: times without a unit"),
-    "phases by name": (lambda folder: nrrd(folder, **PHASES), "index type: no times of frames"),
+    "NRRD": (lambda folder: made(folder, units=None), f"{VALUES}: times without a unit"),
+    "phases by name": (lambda folder: made(folder, **PHASES), "index type: no times of frames"),
     "MetaImage": (lambda folder: by_itk(folder / "a.mha"), "ElementSpacing: times without a unit"),
     "NIfTI of no interval": (without_times, r"pixdim\[4\].*: no times of frames"),
 }
@@ -143,24 +159,17 @@ def test_times_that_are_not_stated_are_those_that_are_given(tmp_path: Path, what
 
 
 def test_times_without_a_unit_take_the_users(tmp_path: Path) -> None:
-    path = nrrd(tmp_path, units=None, **{TIMES: "0 30 80"})
-    np.testing.assert_allclose(read(path, time_unit="ms").times, v.TIMES)
+    path = made(tmp_path, units=None, **{TIMES: "0 30 80"})
+    np.testing.assert_allclose(read(path, time_unit="ms").times, [0, 0.03, 0.08])
 
 
 @pytest.mark.parametrize(
-    ("stored", "endian", "kind", "first"),
-    [
-        ("int32", "big", "int16", -50),
-        ("float64", "little", "float32", -50),
-        ("uint16", "little", "float32", 60000),
-    ],
+    ("stored", "kind", "first"),
+    [(">i4", "int16", -50), ("<f8", "float32", -50), ("<u2", "float32", 60000)],
 )
-def test_types_of_voxels(tmp_path: Path, stored: str, endian: str, kind: str, first: int) -> None:
+def test_types_of_voxels(tmp_path: Path, stored: str, kind: str, first: int) -> None:
     expected = v.frames("int32") + first
-    dtype = np.dtype(stored).newbyteorder("<" if endian == "little" else ">")
-    fields = v.nrrd_fields() | {"type": stored.replace("float64", "double"), "endian": endian}
-    voxels = expected.astype(dtype).tobytes(order="F")
-    found = read(v.write_nrrd(tmp_path / "a.nrrd", fields, voxels))
+    found = read(other(tmp_path, frames=expected.astype(stored)))
     assert found.frames.dtype == kind
     np.testing.assert_array_equal(found.frames, expected)
 
@@ -193,7 +202,7 @@ Bad = tuple[Callable[[Path], Path], str, str]
 
 
 def of_nrrd(field: str, words: str, **changes: str | None) -> Bad:
-    return lambda folder: nrrd(folder, **changes), f"{field}: ", words
+    return lambda folder: made(folder, **changes), f"{field}: ", words
 
 
 def of_metaimage(pattern: str, by: str, field: str) -> Bad:
@@ -269,8 +278,8 @@ BAD: dict[str, Bad] = {
         "mvest.modality", "ultrasound, ct, mr", **{"mvest.modality=": "pet"}),
     "fewer voxels than bytes": of_nrrd("damaged", "", sizes="3 16 17 20"),
     "data elsewhere": of_nrrd("data file", PATH, **{"data file": "../a.raw"}),
-    "another space": (lambda f: nrrd(f, "space: right-anterior-superior\n"), "header: ", "fields"),
-    "a header without end": (lambda f: nrrd(f, "# more\n" * 200_000), "header: no end in 1048", ""),
+    "another space": (lambda f: made(f, "space: right-anterior-superior\n"), "header: ", "fields"),
+    "a header without end": (lambda f: made(f, "# more\n" * 200_000), "header: no end in 1048", ""),
     "MetaImage: no spacing": of_metaimage(r"ElementSpacing = .*\n", "", "ElementSpacing"),
     "no offset": of_metaimage(r"Offset = .*\n", "", "Offset"),
     "a spacing missing": of_metaimage(r"(ElementSpacing = \S+) .*", r"\1", "ElementSpacing"),
@@ -323,14 +332,13 @@ def test_a_frame_that_shows_nothing_is_refused(tmp_path: Path, value: float) -> 
     voxels[2] = value
     if value:
         voxels[2, :10] = 1.0
-    fields = v.nrrd_fields() | {"type": "float"}
-    path = v.write_nrrd(tmp_path / "a.nrrd", fields, voxels.tobytes(order="F"))
+    path = other(tmp_path, frames=voxels)
     with pytest.raises(InputError, match=r"a\.nrrd: data: .* frame 2 (are 0|that are no)"):
         read(path)
 
 
 def test_what_the_file_states_is_not_contradicted(tmp_path: Path) -> None:
-    path = nrrd(tmp_path, **{"mvest.modality=": "ct"})
+    path = made(tmp_path, **{"mvest.modality=": "ct"})
     assert read_volume(path).modality is Modality.CT
     for given, words in (
         ({"modality": Modality.MR}, "modality: mr, expected ct"),
@@ -340,7 +348,7 @@ def test_what_the_file_states_is_not_contradicted(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=rf"a\.nrrd: {words}"):
             read_volume(path, **given)
     with pytest.raises(InputError, match=r"a\.nrrd: modality: not stated .* ultrasound, ct, mr"):
-        read_volume(nrrd(tmp_path))
+        read_volume(made(tmp_path))
     with pytest.raises(InputError, match=r"a\.dcm: modality: ct, expected ultrasound"):
         read_volume(philips(tmp_path / "a.dcm"), modality=Modality.CT)
 
