@@ -175,22 +175,23 @@ class ProcessModel:
         self.own_jacobian = first.differentiated
         if not first.converged or first.differentiated:
             return first
-        return self.by_differences(m, first.y)
+        found = self.by_differences(m, first.y)
+        return Prediction.failed(found) if isinstance(found, str) else Prediction(first.y, found)
 
-    def by_differences(self, m: FloatArray, y: FloatArray) -> Prediction:
-        """The prediction ``y (3 n,)`` mm at ``m (p,)`` with derivatives by differences."""
+    def by_differences(self, m: FloatArray, y: FloatArray) -> FloatArray | str:
+        """Derivatives ``(3 n, p)`` of the prediction ``y (3 n,)`` mm, or why there are none."""
         if self.differences is None:
-            return Prediction.failed("no derivatives: jacobian.csv is missing, differences=none")
+            return "no derivatives: jacobian.csv is missing, differences=none"
         try:
             points = self.differences.neighbours(m)
         except InputError as error:
-            return Prediction.failed(str(error))
+            return str(error)
         found = self._predictions(points, jacobian=False)
         for at, one in zip(points, found, strict=True):
             if not one.converged:
                 values = ", ".join(f"{n} = {v:g}" for n, v in zip(self.names, at, strict=True))
-                return Prediction.failed(f"run for a difference at {values}: {one.reason}")
-        return Prediction(y, self.differences.jacobian(m, y, [one.y for one in found]))
+                return f"run for a difference at {values}: {one.reason}"
+        return self.differences.jacobian(m, y, [one.y for one in found])
 
     def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
         rows = zip(self.names, m.tolist(), self.units or [""] * len(self.names), strict=True)

@@ -173,19 +173,22 @@ def papillary_tip(muscle: FloatArray, leaflets: FloatArray) -> FloatArray:
     return np.asarray(muscle[along >= along.max() - HEAD_MM].mean(axis=0))
 
 
-def check_tips_of(surface: Midsurface, tips: FloatArray) -> None:
-    """Refuse tips in other axes than the leaflets.
+def check_tips_of(surface: Midsurface, tips: FloatArray, *, handedness: bool = True) -> None:
+    """Raise where tips have other axes than the leaflets, or the valve is its own mirror image.
 
     Parameters
     ----------
     surface
     tips
-        ``(2, 3)`` mm, LPS.
+        ``(2, 3)`` mm, LPS, the antero-lateral one first.
+    handedness
+        Whether a mirror image is refused.
 
     Raises
     ------
     GeometryError
-        The tips are farther from the leaflets than in any heart.
+        Seen from the atrium, the antero-lateral tip is not on the left of the anterior leaflet, or
+        tips are farther from the leaflets than any.
     """
     centre = surface.vertices.mean(axis=0)
     away, turned = (
@@ -196,4 +199,20 @@ def check_tips_of(surface: Midsurface, tips: FloatArray) -> None:
         raise GeometryError(
             f"tips: {away:.0f} mm from the leaflets, expected at most {MAX_AWAY:g} mm"
             + (hint if turned < MAX_AWAY else "")
+        )
+    halves = [
+        surface.vertices[surface.triangles[surface.region == k]].mean(axis=(0, 1)) for k in (0, 1)
+    ]
+    sides = np.stack([tips[0] - tips[1], halves[0] - halves[1], tips.mean(axis=0) - centre])
+    if handedness and np.linalg.det(sides) < 0:
+        exchanged = surface.heights[1] > TALLER * surface.heights[0]
+        raise GeometryError(
+            "seen from the atrium the first tip, the antero-lateral one, is on the right of the "
+            "anterior leaflet, as in a mirror: "
+            + (
+                "exchange the leaflets, the posterior one is the taller one"
+                if exchanged
+                else "give the antero-lateral tip first, if no axis is turned"
+            )
+            + " (mirrored=true takes it as it is)"
         )
