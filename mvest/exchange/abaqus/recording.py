@@ -70,16 +70,21 @@ class Recording:
     pressure_share: FloatArray
 
     def positions(self, triangle: IntArray, weights: FloatArray, frame: int) -> FloatArray:
-        """Recorded positions ``(k, 3)`` mm of material points in one frame.
+        """Recorded positions ``(k, 3)`` mm in one frame of material points of the midsurface.
 
-        ``triangle (k,)`` and barycentric ``weights (k, 3)`` are those of
-        :class:`mvest.valve.mesh.remesh.Remeshed`; frame 0 is the reference, -1 the closed one.
+        Parameters
+        ----------
+        triangle, weights : ndarray
+            ``(k,)`` and ``(k, 3)``: triangles and barycentric weights, as those of
+            :class:`mvest.valve.mesh.remesh.Remeshed`.
+        frame : int
+            0 is the reference; -1 the last, closed one.
         """
         corner = self.frames[frame][self.valve.surface.triangles[triangle]]
         return np.einsum("ij,ijk->ik", weights, corner)
 
     def remeshed(self, count: int) -> tuple[Remeshed, Valve]:
-        """The midsurface with ``count`` vertices, and the valve on it."""
+        """The midsurface with so many vertices, and the valve on it."""
         fine = self.valve
         coarse = remesh(fine.surface, fine.annulus, fine.free_edge, count)
         own = coarse.annulus
