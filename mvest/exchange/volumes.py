@@ -15,7 +15,6 @@ import gzip
 import hashlib
 import io
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,12 +98,8 @@ class LabelMap:
         Its columns are the unit vectors of i, j and k; orthonormal, perhaps left-handed.
     origin : (3,) mm
         Centre of voxel (0, 0, 0).
-    times : (F,) s or None
-        None if the file states none that are plausible for a beating heart.
     segments : tuple of Segment
         Segments that a ``.seg.nrrd`` names; empty for other files.
-    sha256 : str
-        Of the file and its data file.
     """
 
     frames: NDArray[np.integer]
@@ -112,9 +107,7 @@ class LabelMap:
     spacing: FloatArray
     direction: FloatArray
     origin: FloatArray
-    times: FloatArray | None
     segments: tuple[Segment, ...]
-    sha256: str
 
 
 def read_volume(
@@ -164,8 +157,8 @@ def read_labels(path: Path | str) -> LabelMap:
         As `read_volume`; an image, no labels, or values that are not whole numbers.
     """
     found = _read(Path(path), True)
-    segments = tuple(Segment(*segment) for segment in found["segments"])
-    return LabelMap(**found | {"segments": segments})
+    del found["sha256"]
+    return LabelMap(**found | {"segments": tuple(Segment(*one) for one in found["segments"])})
 
 
 def sequence_path(path: Path | str) -> Path:
@@ -276,12 +269,7 @@ def describe(
         result["times"] = _times(stated, frame_interval_s, time_unit)
         return result | {"modality": _modality(stated.modality, modality)}
     check(not stated.modality, "modality", stated.modality, "a label map, no image")
-    result |= {"times": None, "segments": stated.segments, "is_layers": stated.is_layers}
-    # Programs that know no times may write implausible ones.
-    with suppress(InputError):
-        if stated.times is not None and not stated.is_layers:
-            result["times"] = _times(stated, None, None)
-    return result
+    return result | {"segments": stated.segments, "is_layers": stated.is_layers}
 
 
 def read_voxels(path: Path, labels: bool) -> Voxels:
