@@ -23,7 +23,7 @@ from mvest.reading.text import (
     refusing,
 )
 
-ODD = ("", ".", "1e", "1_0", "0x10", "1:30", "nan", "-Infinity", "1e309", "9" * 5000, "2e9", "٣",
+ODD = ("", ".", "1e", "1_0", "0x10", "1:30", "nan", "-Infinity", "1e309", "9" * 5000, "-2e9", "٣",
        "1,5", "1 2", "1\n2", "1\0")  # fmt: skip
 
 

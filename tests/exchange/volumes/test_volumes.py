@@ -268,6 +268,7 @@ BAD: dict[str, Bad] = {
         "space units", "mm, cm, m or um", **{"space units": '"mm" "inch" "mm"'}),
     "time runs back": of_nrrd(VALUES, "increasing times", **{TIMES: "0 0.05 0.03"}),
     "ms taken for s": of_nrrd(VALUES, "less than 1 s", **{TIMES: "0 30 60"}),
+    "a second between frames": of_nrrd(VALUES, "less than 1 s", **{TIMES: "0 1 2"}),
     "s taken for ms": of_nrrd(VALUES, "at least 0.002 s", units='"ms" "" "" ""'),
     "a time is missing": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 0.03"}),
     "a time is nan": of_nrrd(VALUES, "each of 3 frames", **{TIMES: "0 nan 0.03"}),
