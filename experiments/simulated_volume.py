@@ -22,7 +22,7 @@ from experiments.common.schema import from_words
 from experiments.console import Parser
 from mvest.cases.from_images.measures import write_landmarks, write_surfaces
 from mvest.errors import ConfigurationError
-from mvest.exchange.segmentations import checked_path, write_sequence_nrrd
+from mvest.exchange.volumes import sequence_path, write_sequence_nrrd
 from mvest.files import write_atomically
 from mvest.imaging.simulator.acquisition import Acquisition, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
@@ -94,7 +94,7 @@ def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Pa
     MvestError
         An unknown name, an inadmissible value, or a valve that does not close.
     """
-    checked_path(target, SUFFIX)
+    sequence_path(target)
     configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
     own = [word for word in words if word not in configured]
     options = from_words("simulate", SimulatedVolumeOptions, own, CONFIGURED)

@@ -41,7 +41,6 @@ VALUE_OBJECTS = (
 FILES = (
     "mvest.exchange.surfaces",
     "mvest.exchange.volumes",
-    "mvest.exchange.segmentations",
     "mvest.exchange.markups",
 )
 """Of the exchange of files, what cases are read by."""

@@ -19,7 +19,7 @@ from experiments.run import main
 from experiments.studies.imported import DonorSettings, recorded_valve
 from mvest.cases.folder import write_case
 from mvest.exchange.external.contract import write_points
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.documents import read_mapping
 from tests.cases.from_images.test_imaged_case import sequence

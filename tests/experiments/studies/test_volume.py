@@ -13,7 +13,7 @@ import pytest
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.detector_errors import valve_axes
 from mvest.errors import InputError
-from mvest.exchange.segmentations import write_sequence_nrrd
+from mvest.exchange.volumes import write_sequence_nrrd
 from mvest.files import sha256_of
 from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
@@ -100,7 +100,7 @@ def test_settings_of_the_frames_are_used(run, tmp_path):
         "imaged.min_confidence=0.1", pressure=False,
     )  # fmt: skip
     assert status == 0, err
-    assert run.told == [(0.1, None)]
+    assert run.told == [0.1]
     (case,) = (tmp_path / "outputs" / "volume").glob("*/case")
     case = read_case(case)
     assert case.frames[-1].pressure_mmHg == pytest.approx(96.0)
