@@ -57,13 +57,10 @@ def test_settings_are_those_of_the_configuration(config):
     assert not any(u.fixed for u in settings.unknowns)
     assert (settings.moduli_only, settings.confirm, settings.paper) == (True, True, None)
     assert settings.mesh.source == "automatic"
-    assert settings.correspondence
     given = plain(
         composed(
             *OWN, "personal=imaged", "personal.tolerance=0.03", "personal.max_iterations=4",
-            "personal.largest_change=0.3", "personal.correspondence=false",
-            "personal.confirm=false",
-            "personal.moduli_only=false",
+            "personal.largest_change=0.3", "personal.confirm=false", "personal.moduli_only=false",
         )
     )  # fmt: skip
     given["personal"]["paper"] = {"P0": 1.0, "Q": 0.1, "R": 0.25, "max_iterations": 3}
@@ -72,7 +69,7 @@ def test_settings_are_those_of_the_configuration(config):
     assert "turn.x" in fixed
     assert "E_f.posterior" not in fixed
     assert (settings.tolerance, settings.max_iterations, settings.largest_change) == (0.03, 4, 0.3)
-    assert (settings.correspondence, settings.confirm, settings.moduli_only) == (False,) * 3
+    assert (settings.confirm, settings.moduli_only) == (False, False)
     assert settings.paper.R == 0.25
 
 
