@@ -149,23 +149,10 @@ class FrameErrors:
         learned: LearnedNoise | None = None,
         *,
         without: Collection[str] = (),
-        beside: FloatArray | None = None,
     ) -> ObservationNoise:
-        """Noise of the observation except for error samples.
-
-        Parameters
-        ----------
-        learned : LearnedNoise, optional
-            Default: as stated.
-        without : collection of str
-            Sources to leave out.
-        beside : (k, q), optional
-            Further columns.
-        """
+        """Noise of the observation except for error samples and the sources ``without``."""
         base = self.single_noise(learned)
         columns = [own for name, own in self.columns(learned).items() if name not in without]
-        if beside is not None:
-            columns.append(beside)
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
     def weighing(

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.cases.case import ValveCase
+from mvest.cases.case import Role, ValveCase
+from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, OnIterate
@@ -36,7 +37,7 @@ from mvest.personalisation.joint import JointPosterior, damped_step
 from mvest.personalisation.model import (
     CaseClosure,
     build_model,
-    frames_model,
+    held_state,
     with_pressures,
 )
 from mvest.personalisation.settings import STIFFENS, PersonaliseSettings, Prior
@@ -151,7 +152,8 @@ class CaseProblem:
         Raises
         ------
         InputError
-            If the case lacks an unknown, or has error samples and several fitted frames.
+            If the case lacks an unknown, has error samples and several fitted frames, or errors of
+            pressures are unknown but their common factor is not.
         """
         settings = with_pressures(case, settings)
         if case.fitted and case.error_samples is not None:
@@ -170,7 +172,13 @@ class CaseProblem:
         transform = Log(tuple(u.is_positive for u in unknowns))
         # Filters start here; the last bit may differ from the prior's mean.
         start = transform.inverse(transform.forward(prior.mean))
-        several = frames_model(case, settings, model)
+        several = None
+        if case.fitted:
+            closed = case.frame(Role.CLOSED)
+            ordered = sorted(case.fitted, key=lambda f: abs(f.pressure_mmHg - closed.pressure_mmHg))
+            states = {frame.name: held_state(model, frame) for frame in ordered}
+            errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
+            several = FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
         stated = CaseClosure.of(model, several, tuple(u.name for u in unknowns), start)
         names = None if several is None else several.frames
         fitted = FittedFrames(case, settings, model.valve, names)
@@ -385,14 +393,11 @@ def _nearer(
 
     ``point`` itself if it is as good.
     """
-    filtered, observation = result.filtered, result.observation
+    filtered, residual = result.filtered, result.residual
     posterior = joint(problem, result, point.errors)
-    if posterior is None or observation is None:
+    if posterior is None or filtered is None or residual is None:
         return result.reason
-    assert filtered is not None
-    assert filtered.prediction is not None
     z, H = filtered.transformed.mean, slopes(filtered)
-    residual = observation.y - filtered.prediction.y
     # A filter stops before its last small step; this step takes it.
     end = posterior.step(z, residual, H)
     residual = residual - H @ (end - z)

@@ -32,12 +32,8 @@ from mvest.valve.measure.strain import mean_strains
 REACH = 1.959963984540054
 """Standard deviations from the mean of a normal distribution to the ends of its 95 % interval."""
 
-IMAGES, SINGLE, DOUBT, MODULI = (
-    "errors of the images",
-    "errors of single points",
-    "size of the errors",
-    "prior of the moduli",
-)
+IMAGES, SINGLE = "errors of the images", "errors of single points"
+DOUBT, MODULI = "size of the errors", "prior of the moduli"
 """Sources of variance besides the unknowns and the errors of geometry and law."""
 
 STEP = 1e-3
@@ -415,14 +411,10 @@ def geometry_shifts(problem: CaseProblem, estimate: CaseEstimate) -> Iterator[Ro
     known, or described by error samples.
     """
     errors, result = estimate.point.errors, estimate.result
-    posterior, filtered = joint(problem, result, errors), result.filtered
-    if posterior is None or errors.samples is not None:
+    posterior, residual = joint(problem, result, errors), result.residual
+    if posterior is None or residual is None or errors.samples is not None:
         return
-    assert filtered is not None
-    assert filtered.prediction is not None
-    assert result.observation is not None
-    expected = posterior.expected(result.observation.y - filtered.prediction.y)
-    scales = errors.geometry_sizes(filtered.learned)
+    expected, scales = posterior.expected(residual), errors.geometry_sizes(posterior.learned)
     for source, modes, scale in zip(errors.geometry, expected, scales, strict=True):
         assert source.modes is not None
         # Later parts follow from the first, as rest lengths follow from the tips.
@@ -442,17 +434,17 @@ def law_share(estimate: CaseEstimate) -> float | None:
     without an estimate.
     """
     errors, result = estimate.point.errors, estimate.result
-    filtered = result.filtered
+    filtered, residual = result.filtered, result.residual
     rows = [source.rows for source in errors.sources if source.name == LAW]
-    if not rows or filtered is None or filtered.prediction is None:
+    if not rows or filtered is None or residual is None:
         return None
-    assert result.observation is not None
-    way, samples = rows[0].sum(axis=1), errors.samples
-    beside = None if samples is None else samples.columns
-    noise = errors.noise(filtered.learned, without=(LAW,), beside=beside)
+    way = rows[0].sum(axis=1)
+    noise = errors.noise(filtered.learned, without=(LAW,))
+    if errors.samples is not None:
+        noise = low_rank_noise(noise, errors.samples.columns)
     prior, z = to_filter(filtered.transform, filtered.prior), filtered.transformed.mean
     H = slopes(filtered)
-    innovation = result.observation.y - filtered.prediction.y + H @ (z - prior.mean)
+    innovation = residual + H @ (z - prior.mean)
 
     def misfit(e: FloatArray) -> float:
         return kalman_update(prior, e, H, noise).nis

@@ -16,7 +16,7 @@ from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.errors import InputError
 from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.valve_system import HeldState, check_parameters
-from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior
+from mvest.personalisation.settings import CaseMesh, PersonaliseSettings
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import Band
@@ -34,33 +34,6 @@ def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> Personalis
     frames = (case.frame(Role.CLOSED).name, *(frame.name for frame in case.fitted))
     own = [u for u in settings.unknowns if not is_frame_pressure(u.name)]
     return replace(settings, unknowns=(*own, *settings.pressures.unknowns(frames)))
-
-
-def frames_model(
-    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel
-) -> FramesModel | None:
-    """Model of all fitted closed frames, those nearest in pressure first; None for a single one.
-
-    Parameters
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-        From `with_pressures`.
-    model : ClosureModel
-        Of the case.
-
-    Raises
-    ------
-    InputError
-        If errors of pressures are unknown but their common factor is not.
-    """
-    if not case.fitted:
-        return None
-    closed = case.frame(Role.CLOSED)
-    ordered = sorted(case.fitted, key=lambda f: abs(f.pressure_mmHg - closed.pressure_mmHg))
-    states = {frame.name: held_state(model, frame) for frame in ordered}
-    errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
-    return FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
 
 
 def held_state(model: ClosureModel, frame: Frame) -> HeldState:
@@ -105,7 +78,19 @@ def build_coarse(
     mechanical = [
         u for u in settings.unknowns if not (u.name in REGISTRATION or is_frame_pressure(u.name))
     ]
-    _check_unknowns(case, settings, mechanical)
+    others = [u.name for u in mechanical if not u.is_modulus]
+    try:
+        check_parameters(others, case.valve, settings.mechanics)
+    except InputError as error:
+        raise InputError(f"unknowns: {error}; or some of {', '.join(REGISTRATION)}") from error
+    regions, given = case.surface.region_names, {u.name for u in mechanical if u.is_modulus}
+    needed = {f"E_f.{region}" for region in regions}
+    if given != needed:
+        raise InputError(
+            f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
+            f"{', '.join(regions)}: expected {', '.join(sorted(needed))}, or "
+            "leaflets named as the unknowns are"
+        )
     protocol = settings.mechanics.protocol
     if case.closed is not None:
         protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
@@ -123,25 +108,6 @@ def build_coarse(
         repeat=False,
         largest_change=settings.largest_change,
     )
-
-
-def _check_unknowns(
-    case: ValveCase, settings: PersonaliseSettings, mechanical: list[Prior]
-) -> None:
-    regions = case.surface.region_names
-    others = [u.name for u in mechanical if not u.is_modulus]
-    try:
-        check_parameters(others, case.valve, settings.mechanics)
-    except InputError as error:
-        raise InputError(f"unknowns: {error}; or some of {', '.join(REGISTRATION)}") from error
-    needed = {f"E_f.{region}" for region in regions}
-    given = {u.name for u in mechanical if u.is_modulus}
-    if given != needed:
-        raise InputError(
-            f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
-            f"{', '.join(regions)}: expected {', '.join(sorted(needed))}, or "
-            "leaflets named as the unknowns are"
-        )
 
 
 def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:

@@ -164,6 +164,13 @@ class StudyResult:
         return None if self.filtered is None or self.estimate is None else self.filtered.std
 
     @property
+    def residual(self) -> FloatArray | None:
+        """Observed minus predicted ``(k,)`` at the estimate; None if there is none."""
+        if self.filtered is None or self.filtered.prediction is None or self.observation is None:
+            return None
+        return self.observation.y - self.filtered.prediction.y
+
+    @property
     def distance(self) -> FloatArray | None:
         """Distance (mm) from fitted to observed in the last observed frame.
 

@@ -9,7 +9,7 @@ from mvest.cases.case import ErrorSamples, Role
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.errors import InputError
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalisation import PressureErrors, expect_case, personalise
+from mvest.personalisation import PressureErrors, personalise
 from mvest.problem.registration import REGISTRATION, displace
 from tests.made_up_closure import (
     CLOSED_ANNULUS,
@@ -96,18 +96,6 @@ def test_with_one_frame_errors_of_pressures_add_no_unknown(monkeypatch):
     same = personalise(made_up_case(), settings(pressures=PRESSURES))
     assert same.result.parameters == plain.result.parameters
     np.testing.assert_array_equal(same.result.estimate, plain.result.estimate)
-
-
-def test_errors_of_pressures_widen_the_intervals(monkeypatch):
-    use(monkeypatch)
-    case = with_fitted(made_up_case(std_mm=2.0), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
-    calibrated = [replace(u, std=0.005) if u.name == "pressure_scale" else u for u in unknowns()]
-    known = expect_case(case, settings(*calibrated))
-    doubted = expect_case(case, settings(*calibrated, pressures=PressureErrors(0.0, 5.0)))
-    names = [{unknown["name"] for unknown in one.unknowns} for one in (known, doubted)]
-    assert names[1] - names[0] == {f"{ERROR}.early", f"{ERROR}.closed"}
-    for before, after in zip(known.unknowns[:2], doubted.unknowns[:2], strict=True):
-        assert after["width"] > 1.02 * before["width"]
 
 
 def test_errors_of_each_frame_are_learned(monkeypatch):

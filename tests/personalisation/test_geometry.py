@@ -371,19 +371,6 @@ def test_a_point_at_the_mode_leaves_nothing_unaccounted(monkeypatch, steps):
         assert found is expected or found == expected
 
 
-def test_rough_steps_end_where_exact_ones_do(monkeypatch):
-    case, known = bent_case(monkeypatch, curve=1.0)
-    others = [u for u in unknowns(fixed=True, **known) if u.name != "pressure_scale"]
-    geometry = NuisanceGeometry(renewals=6)
-    scale = replace(unknowns()[2], std=0.3)
-    given = settings(scale, *others, nuisance_geometry=geometry, tolerance=1e-9)
-    rough = personalise(case, given).result.filtered.transformed
-    monkeypatch.setattr(estimation, "ROUGH", 0.0)
-    exact = personalise(case, given).result.filtered.transformed
-    np.testing.assert_allclose(rough.mean, exact.mean, atol=0.02 * exact.std.min())
-    np.testing.assert_allclose(rough.std, exact.std, rtol=0.02)
-
-
 def test_all_closed_frames_are_displaced_as_their_derivatives_say():
     model = model_of(GENTLE, **SMALL)
     motion = model.contact_valve.motion
@@ -407,15 +394,13 @@ def test_all_closed_frames_are_displaced_as_their_derivatives_say():
 def test_columns_of_a_displaced_valve_are_by_the_errors_that_displaced_it():
     model = model_of(GENTLE, **SMALL)
     surface = model.valve.surface
-    n, count, regions = len(surface.vertices), len(model.valve.chordae), len(surface.region_names)
+    n = len(surface.vertices)
     smooth = smooth_modes(surface.vertices, 10.0, 0.9)[2]
     modes = [
         GeometryModes("open shape", {"shape": 0.3 * smooth[None, :, None] * UP}),
-        GeometryModes("rest lengths", {"rest_lengths": np.full((1, count), 0.05)}),
         GeometryModes("thickness", {"thickness": np.full((1, n), 0.2)}),
-        GeometryModes("fibres", {"fibres": np.full((1, regions), np.deg2rad(10.0))}),
     ]
-    far, step = np.array([2.0, -1.0, 1.0, 1.0]), 0.02
+    far, step = np.array([2.0, 1.0]), 0.02
     seen = Observation(("closed",), np.zeros((1, n, 3)), np.array(1.0))
 
     def closed(sizes):
@@ -425,7 +410,7 @@ def test_columns_of_a_displaced_valve_are_by_the_errors_that_displaced_it():
 
     noise = observation_noise(1e-6, 3 * n)
     sources = geometry_sources(modes, closed(far), seen, noise, model)
-    for row, way in zip((source.rows for source in sources), step * np.eye(4), strict=True):
+    for row, way in zip((source.rows for source in sources), step * np.eye(2), strict=True):
         above, below = (closed(far + sign * way).predicted.reshape(2, -1)[1] for sign in (1, -1))
         central = (above - below) / (2.0 * step)
         np.testing.assert_allclose(row[:, 0], central, atol=0.02 * np.abs(central).max())

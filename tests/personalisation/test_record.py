@@ -58,14 +58,6 @@ def test_a_truth_is_added_to_all_moduli_and_alternatives(record):
         assert other.unknown("E_f.anterior").truth == 5.0
 
 
-def test_derived_moduli_follow_by_their_ratios(record):
-    for region, tissue in TISSUE.items():
-        own, other = (record.unknown(f"{name}.{region}") for name in ("E_f", "E_perp"))
-        for key in ("estimate", "std", "low", "high"):
-            assert getattr(other, key) == pytest.approx(getattr(own, key) / tissue.ratio)
-        assert own.low < own.estimate < own.high
-
-
 def test_every_frame_is_measured_as_observed_and_as_predicted(record):
     rows = record.details["measurements"]
     assert [(row["frame"], row["shape"]) for row in rows] == [
