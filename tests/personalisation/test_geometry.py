@@ -34,9 +34,10 @@ from mvest.personalisation.geometry import (
     smooth_modes,
 )
 from mvest.personalisation.model import CaseClosure
-from mvest.personalisation.sources import ClosedValve, geometry_sources
+from mvest.personalisation.sources import ClosedValve, geometry_sources, sample_frames
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.problem.verdict import CHECKS
+from mvest.valve.anatomy.band import Band
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 from tests.made_up_closure import (
@@ -414,6 +415,36 @@ def test_columns_of_a_displaced_valve_are_by_the_errors_that_displaced_it():
         above, below = (closed(far + sign * way).predicted.reshape(2, -1)[1] for sign in (1, -1))
         central = (above - below) / (2.0 * step)
         np.testing.assert_allclose(row[:, 0], central, atol=0.02 * np.abs(central).max())
+
+
+def test_samples_of_frames_move_the_valve_as_a_displaced_geometry_does(monkeypatch):
+    model = model_of(GENTLE, **SMALL)
+    valve, surface = model.valve, model.valve.surface
+    rng = np.random.default_rng(5)
+    shape_, closed = 0.02 * smooth_modes(surface.vertices, 10.0, 0.9)[1:3, :, None] * UP
+    tips = rng.normal(0.0, 0.2, (2, len(valve.papillary_tips), 3))
+    samples = SimpleNamespace(vertices=np.stack([shape_, closed])[None], tips=tips[None])
+    roles = (Role.REFERENCE, Role.CLOSED)
+    case = case_of(model, error_samples=samples, annulus=valve.annulus)
+    case.frames = tuple(SimpleNamespace(role=role) for role in roles)
+    registered = RegisteredModel(model, model.names)
+    # Chordae of this valve are slack, so its tips are only recorded.
+    used, of_tips = [], RestGeometry.tips
+    monkeypatch.setattr(RestGeometry, "tips", lambda *given: used.append(given) or of_tips(*given))
+    found = sample_frames(case, ClosedValve(registered, AT, registered(AT).y))
+    np.testing.assert_array_equal(used[0][1], tips[None, 1])
+    geometry = RestGeometry(model)
+    band, rest = Band(valve), surface.vertices[valve.annulus]
+    phi = 360.0 * np.arange(len(model.contact_valve.annulus)) / len(model.contact_valve.annulus)
+    moved = band.annulus_positions(phi, rest + closed[valve.annulus])
+    annulus = moved - band.annulus_positions(phi, rest)
+    parts = {"shape": shape_, "annulus": annulus, "tips": tips[1]}
+    variation = geometry.variation({name: part[None] for name, part in parts.items()})
+    expected = geometry.change(AT, variation)[1, ..., 0]
+    assert np.abs(expected).max() > 0.01
+    np.testing.assert_allclose(found.predicted[0], expected, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_array_equal(found.seen[0], closed)
+    np.testing.assert_array_equal(found.opened[0], shape_)
 
 
 def test_held_out_frames_have_the_displaced_boundary(monkeypatch):

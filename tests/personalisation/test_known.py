@@ -1,16 +1,19 @@
 """Derived quantities, sources of variance and advice, against dense linear algebra."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
-from mvest.estimation.transform import to_filter
+from mvest.cases.case import ErrorSamples, Role
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.transform import Identity, to_filter
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import personalise
 from mvest.personalisation.geometry import GeometryModes, NuisanceGeometry
-from mvest.personalisation.known import EXACTLY, PRESSURE_MMHG, REACH, SINGLE
+from mvest.personalisation.known import EXACTLY, PRESSURE_MMHG, REACH, SINGLE, data_alone
+from mvest.personalisation.sources import FrameSamples
 from mvest.valve.measure.strain import mean_strains
 from tests.made_up_closure import (
     FIELDS,
@@ -140,16 +143,17 @@ def test_a_wrong_pressure_moves_the_moduli_and_not_their_ratio(monkeypatch):
     assert own < 0.7 * 2 * REACH * fit.result.filtered.transformed.std[1]
 
 
-def test_data_alone_are_the_estimate_without_the_prior_of_that_modulus(monkeypatch):
-    fit, given = fitted(monkeypatch), unknowns()
-    assert len(fit.details["data_alone"]) == 2
-    for k, alone in enumerate(fit.details["data_alone"]):
-        wide = [replace(u, std=1e3 * u.mean) if j == k else u for j, u in enumerate(given)]
-        other = fitted(monkeypatch, *wide).result
-        # The formula is curved, and the prior's mean differs: to first order.
-        assert np.log(alone["estimate"]) == pytest.approx(np.log(other.estimate[k]), abs=0.05)
-        width = 2 * REACH * other.filtered.transformed.std[k]
-        assert np.log(alone["high"] / alone["low"]) == pytest.approx(width, rel=0.1)
+def test_data_alone_are_what_the_prior_was_updated_by():
+    prior, data = Gaussian.from_variance([1.0], 2.0**2), Gaussian.from_variance([3.0], 1.5**2)
+    precision = 1 / 2.0**2 + 1 / 1.5**2
+    after = Gaussian.from_variance([(1.0 / 2.0**2 + 3.0 / 1.5**2) / precision], 1 / precision)
+    filtered = SimpleNamespace(
+        names=("E_f.a",), transform=Identity(), prior=prior, transformed=after
+    )
+    (row,) = data_alone(filtered)
+    ends = data.mean + REACH * data.std * np.array([0.0, -1.0, 1.0])
+    assert np.log([row["estimate"], row["low"], row["high"]]) == pytest.approx(ends)
+    assert row["prior_stds"] == pytest.approx((3.0 - 1.0) / 2.0)
 
 
 def test_strains_are_those_of_the_fitted_valve_with_the_spread_of_its_posterior(monkeypatch):
@@ -168,3 +172,26 @@ def test_strains_are_those_of_the_fitted_valve_with_the_spread_of_its_posterior(
     np.testing.assert_allclose(stds, 100 * values.std(axis=0), rtol=0.15)
     true = 100 * mean_strains(surface.vertices, shape(TRUE), surface).ravel()
     assert np.all(np.abs([row["estimate"] for row in strains] - true) < 3 * stds)
+
+
+def test_an_error_that_the_moduli_undo_hardly_changes_the_strain(monkeypatch):
+    # Samples move the prediction as the anterior modulus does. The estimate follows the frame.
+    use(monkeypatch)
+    case = made_up_case(0.05, noise=np.random.default_rng(2), displaced=False)
+    # They are small against the prior, so nearly all of them is undone.
+    moved = 0.05 * np.random.default_rng(4).standard_normal((12, 1, 1)) * FIELDS["E_f.anterior"]
+    monkeypatch.setattr(
+        "mvest.personalisation.errors.sample_frames",
+        lambda *_: FrameSamples(moved, 0.0 * moved, 0.0 * moved),
+    )
+    n, f = len(case.surface.vertices), len(case.frames)
+    samples = ErrorSamples(np.zeros((12, f, n, 3)), np.zeros((12, f, 2, 3)))
+    wanted = settings(*unknowns(fixed=True))
+    plain, wider = (personalise(c, wanted) for c in (case, replace(case, error_samples=samples)))
+    assert wider.result.std[0] > 3.0 * plain.result.std[0]
+    widths = [
+        [row["high"] - row["low"] for row in fit.details["known"] if row["unit"] == "%"][:2]
+        for fit in (plain, wider)
+    ]
+    # Without the compensation it would be sixteen times.
+    assert np.all(np.array(widths[1]) < 8.0 * np.array(widths[0]))

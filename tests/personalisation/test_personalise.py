@@ -201,12 +201,18 @@ def test_surfaces_are_compared_without_correspondence():
 
 
 def test_points_between_leaflets_belong_to_either():
-    problem = CaseProblem.of(made_up_case(0.3, corresponds=False), settings())
-    (seen,) = problem.fitted.observation().seen
+    case = made_up_case(2.0, corresponds=False)
+    (seen,) = CaseProblem.of(case, settings()).fitted.observation().seen
     column = np.arange(len(seen.region)) % 32
     np.testing.assert_array_equal(seen.region == UNKNOWN, (column == 0) | (column == 16))
     assert set(seen.region[(column > 0) & (column < 16)]) == {0}
     assert set(seen.region[column > 16]) == {1}
+    # The free edge has no leaflet within three standard deviations of that line.
+    line = case.frame(Role.CLOSED).vertices[seen.region == UNKNOWN]
+    near = np.linalg.norm(seen.free_edge[:, None] - line, axis=2).min(axis=1) < 6.0
+    assert 2 < near.sum() < 16
+    edge = np.where(near, UNKNOWN, (np.arange(32) > 16).astype(int))
+    np.testing.assert_array_equal(seen.free_edge_region, edge)
 
 
 def test_very_many_vertices_are_thinned_evenly():
@@ -415,5 +421,7 @@ def test_learned_errors_and_error_samples_widen_together(geometry):
     wider = personalise(with_samples(case, std=1.2), wanted)
     assert wider.result.filtered.learned.quantities[-1].name == "error samples"
     assert np.all(wider.result.std > 1.5 * plain.result.std)
+    now = [row["std_now"] for row in wider.details["narrower"][:2]]
+    np.testing.assert_allclose(now, wider.result.filtered.transformed.std, rtol=1e-6)
     rough = [r.result.filtered.learned.quantities[2].learned.median for r in (plain, wider)]
     np.testing.assert_allclose(rough, np.hypot(0.3, 0.3), rtol=0.1)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.problem.fields import case_fields
@@ -48,14 +49,27 @@ def test_it_is_plain_data_without_a_truth(fit, record):
 
 
 def test_a_truth_is_added_to_all_moduli_and_alternatives(record):
-    known = record.with_truth({"E_f.anterior": 5.0, "shift.x": 0.1})
-    ratio = 6.23 / 2.35
-    assert known.unknown("E_perp.anterior").truth == pytest.approx(5.0 / ratio)
-    assert known.unknown("shift.x").truth == 0.1
-    assert known.unknown("E_f.posterior").truth is None
+    known = record.with_truth({"E_f.posterior": 3.0, "shift.x": 0.1})
+    truth = {one.name: one.truth for one in known.unknowns if one.truth is not None}
+    assert truth.pop("G.posterior") == pytest.approx(3.0 / (2 * 1.488))
+    assert truth == {
+        "E_f.posterior": 3.0,
+        "E_perp.posterior": pytest.approx(3.0 / TISSUE["posterior"].ratio),
+        "shift.x": 0.1,
+    }
     assert set(known.alternatives) == {"moduli_only", "paper"}
     for other in known.alternatives.values():
-        assert other.unknown("E_f.anterior").truth == 5.0
+        assert other.unknown("E_f.posterior").truth == 3.0
+
+
+def test_learned_errors_have_rows():
+    fit = personalised(*unknowns(fixed=True), errors=ErrorBeliefs())
+    rows = record_of_case(fit).details["errors"]
+    for row, quantity in zip(rows, fit.result.filtered.learned.quantities, strict=True):
+        assert row["believed"] == quantity.believed.median
+        assert (row["believed_low"], row["believed_high"]) == quantity.believed.interval()
+        assert row["learned"] == quantity.learned.median
+        assert (row["low"], row["high"]) == quantity.learned.interval()
 
 
 def test_every_frame_is_measured_as_observed_and_as_predicted(record):
