@@ -54,17 +54,13 @@ def test_settings_are_those_of_the_configuration(config):
     assert list(about)[:2] == ["E_f.anterior", "E_f.posterior"]
     assert (about["E_f.anterior"].mean, about["E_f.anterior"].std) == (6.23, 3.1)
     assert not any(u.fixed for u in settings.unknowns)
-    given = plain(
-        composed(
-            *OWN, "personal=imaged", "personal.tolerance=0.03", "personal.correspondence=false"
-        )
-    )
+    given = plain(composed(*OWN, "personal=imaged", "personal.tolerance=0.03"))
     given["personal"]["paper"] = {"P0": 1.0, "Q": 0.1, "R": 0.25, "max_iterations": 3}
     settings = personalising(given)
     fixed = {u.name for u in settings.unknowns if u.fixed}
     assert "turn.x" in fixed
     assert "E_f.posterior" not in fixed
-    assert (settings.tolerance, settings.correspondence, settings.paper.R) == (0.03, False, 0.25)
+    assert (settings.tolerance, settings.paper.R) == (0.03, 0.25)
 
 
 def test_settings_without_a_configuration_are_those_of_the_commands():
