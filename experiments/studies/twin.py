@@ -205,7 +205,7 @@ STUDY = Study(
         "valve": "The fitted closed valve by its distance from the observed one. Simulated.",
     },
     latex=("table1",),
-    checks=lambda: (expect_twin,),
+    check=expect_twin,
     require=require_twin,
     keeps_failures=True,
 )

@@ -21,11 +21,11 @@ strain is the linear one in a frame that turns with the element, which takes the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mvest._compiling import announce_compilation
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
@@ -40,6 +40,8 @@ from mvest.mechanics.law import Law, Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
+
+announce_compilation()
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Entries of a symmetric tensor that the components of a six-vector are."""
@@ -287,12 +289,6 @@ def _polar(a: FloatArray) -> FloatArray:
     u, _, v = np.linalg.svd(a)
     u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
     return u @ v
-
-
-def kernels_are_compiled() -> bool:
-    """Whether the machine code of the kernels lies in numba's cache; if not, first use makes it."""
-    place = add_tangents.stats.cache_path
-    return place is not None and any(Path(place).glob("element.add_tangents-*.nbi"))
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:

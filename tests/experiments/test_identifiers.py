@@ -99,6 +99,7 @@ def test_no_name_of_a_file_is_in_a_run_or_its_store(tmp_path: Path, monkeypatch)
     assert leaks(tmp_path / "here") == []
 
 
+@pytest.mark.slow
 def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypatch) -> None:
     patient = tmp_path / "DOE_JANE" / NUMBER
     patient.mkdir(parents=True)

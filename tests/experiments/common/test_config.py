@@ -1,54 +1,13 @@
 import numpy as np
 import pytest
 
-from experiments.common.building.filters import build_filter
 from experiments.common.building.twin import build_twin, truth_mesh
 from experiments.common.config import hash_of
-from experiments.common.schema import build
 from experiments.results.published import as_published
-from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
 from tests.experiments.configured import composed, plain
-from tests.places import CONF
 
-HAVING = {
-    "personal": "own_valve",
-    "patient": "patients",
-    "imaging": "imaging",
-    "misspecification": "calibration",
-    "arrival": "surfaces",
-}
 """Group that only some studies have -> an experiment of one that has it."""
-
-EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes_and_names_its_table(name: str) -> None:
-    config = plain(composed(f"experiment={name}"))
-    assert config["name"] == name
-    assert config["title"]
-    assert config["row"]
-    assert config["table"]
-    if config["study"] == "twin":
-        build(MechanicsSettings, config["mechanics"])
-        build_filter(config["filter"], tuple(config["parameters"]))
-        assert len(config["truth"]["values"]) == len(config["parameters"])
-    if name.startswith("table1"):
-        assert config["paper"]["table"] == "Table 1"
-        assert config["paper"]["estimate"] == [6.02, 2.13]
-
-
-@pytest.mark.parametrize(
-    ("group", "name"),
-    [
-        (path.parent.name, path.stem)
-        for path in sorted(CONF.glob("*/*.yaml"))
-        if path.parent.name not in ("experiment", "hydra")
-    ],
-)
-def test_every_part_can_be_chosen(group: str, name: str) -> None:
-    plain(composed(f"experiment={HAVING.get(group, 'table1')}", f"{group}={name}"))
 
 
 def test_a_hash_depends_on_what_changes_the_result_only() -> None:
@@ -157,11 +116,6 @@ def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
     steps = (twin.truth_model.settings.protocol.dt, twin.model.settings.protocol.dt)
     assert steps[0] == pytest.approx(steps[1] / 4)
     assert twin.truth_model.mesh.sha256 != twin.model.mesh.sha256
-
-
-def test_the_default_observation_has_3248_vertices() -> None:
-    observation = plain(composed("experiment=table1"))["observation"]
-    assert observation["columns"] * observation["rows"] == 3248
 
 
 def test_a_population_is_drawn_from_what_its_estimator_states() -> None:

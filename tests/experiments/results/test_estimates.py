@@ -11,7 +11,6 @@ from pandas import read_csv, read_parquet
 from experiments.cli import main
 from experiments.common.records.record import write_record
 from experiments.results.estimates import COLUMNS, estimate_table, write_estimates
-from experiments.results.published import write_records
 from experiments.sweeps.collected import write_sweep_file
 from mvest.errors import InputError
 from mvest.problem.record import EstimateRecord, Unknown
@@ -78,16 +77,6 @@ def test_a_sweep_stands_for_its_jobs(tmp_path: Path) -> None:
     # Two parameters of two seeds of the first job, and the lost second one.
     assert list(table["seed"]) == [1, 1, 2, 2, 1]
     assert list(table["parameter"].isna()) == [False] * 4 + [True]
-
-
-def test_published_records_and_sweeps_are_read_together(tmp_path: Path) -> None:
-    (tmp_path / "records").mkdir()
-    (tmp_path / "sweeps").mkdir()
-    kept = {name: made_up(estimates=(made_up_estimate(),)) for name in ("a", "b")}
-    write_records(tmp_path, "t", kept)
-    write_sweep_file(tmp_path / "sweeps" / "x.json", swept())
-    places = list(dict.fromkeys(estimate_table(tmp_path)["record"]))
-    assert places == ["records/t.jsonl#a", "records/t.jsonl#b", "sweeps/x.json"]
 
 
 def test_both_forms_hold_the_same_and_the_dictionary_all_columns(tmp_path: Path, capsys) -> None:

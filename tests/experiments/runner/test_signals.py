@@ -29,18 +29,16 @@ STATUS = {
 }  # fmt: skip
 """Signals -> exit status."""
 
-STAGES = "planning", "simulating", "estimating", "writing", "collecting", "logging", "drawing"
-QUICK = {
-    ("planning", "HUP"), ("simulating", "KILL"), ("estimating", "TERM"), ("writing", "KILL"),
-    ("drawing", "INT INT"),
-}  # fmt: skip
-"""One signal for each stage that takes no database; all others are slow by their number."""
-
 CASES = [
-    pytest.param(stage, signals, marks=() if (stage, signals) in QUICK else pytest.mark.slow)
-    for stage in STAGES
-    for signals in STATUS
+    ("simulating", "KILL"),
+    pytest.param("planning", "HUP", marks=pytest.mark.slow),
+    pytest.param("estimating", "TERM", marks=pytest.mark.slow),
+    pytest.param("writing", "KILL", marks=pytest.mark.slow),
+    pytest.param("collecting", "TERM", marks=pytest.mark.slow),
+    pytest.param("logging", "INT", marks=pytest.mark.slow),
+    pytest.param("drawing", "INT INT", marks=pytest.mark.slow),
 ]
+"""Stages of a sweep and the signals that it gets there."""
 
 
 def start(folder: Path, *more: str) -> subprocess.Popen[str]:
@@ -151,6 +149,7 @@ def test_a_signal_leaves_nothing_behind(stage, signals, undisturbed, tmp_path, r
         assert [run.info.status for run in runs] == ["FINISHED"] * 5, "four jobs and the sweep"
 
 
+@pytest.mark.slow
 def test_a_forced_sweep_that_is_killed_leaves_the_former_results(tmp_path):
     finished(tmp_path, UNTRACKED)
     before = answer(tmp_path)
@@ -170,6 +169,7 @@ def test_a_forced_sweep_that_is_killed_leaves_the_former_results(tmp_path):
     assert (tmp_path / "runs").read_text() == computed
 
 
+@pytest.mark.slow
 def test_the_time_limit_of_a_job_ends_the_programs_that_it_started(tmp_path):
     (tmp_path / "hold").write_text("simulating")
     one = ("filter.initial=[5,3]", "sweep.small.seed=1")

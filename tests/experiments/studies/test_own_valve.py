@@ -185,7 +185,7 @@ def test_a_case_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, correspon
     assert "34 chordae from 2 papillary tips" in out
     assert ("matched to the reference" in out) is not corresponds
     assert list((tmp_path / "outputs" / "own_valve").glob("*/case.png"))
-    assert "what an estimate could tell is not known: not closed here" in out
+    assert "how well moduli could be estimated is not known: not closed here" in out
 
 
 def test_a_finished_case_is_shown_again_until_its_files_change(run, tmp_path, monkeypatch, seen):

@@ -272,7 +272,7 @@ def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
     values = config_of(tmp_path)
     place = make_patient(values)
     (place.hidden / "positions.npz").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="does not hold what a patient hides"):
+    with pytest.raises(InputError, match="does not hold a patient's truth"):
         reveal(a_result(5.0, 2.0), place, settings_in(values), 1)
 
 

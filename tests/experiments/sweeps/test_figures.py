@@ -3,7 +3,6 @@
 import pytest
 
 from experiments.sweeps.figures import figures_of
-from mvest.reporting.figures import plain_number
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,
     failed_run,
@@ -87,10 +86,3 @@ def test_nothing_to_draw_gives_no_figure():
     assert set(figures_of(one_factor)) == {""}
     assert figures_of(sweep("x", [job({"a": 1}, [run(1, TRUTH, [0.1, 0.1])])])) == {}
     assert figures_of(lost(starts())) == {}
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0, "0"), (0.0004, "4e-4"), (0.012, "0.012"), (2.25, "2.2"), (73.4, "73")]
-)
-def test_numbers_on_axes_are_short(value: float, text: str):
-    assert plain_number(value) == text

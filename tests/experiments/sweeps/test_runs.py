@@ -51,15 +51,6 @@ def test_errors_by_hand():
     assert (found["forward solves"], found["forward solves, max"]) == (3, 3)
 
 
-def test_what_a_failed_run_left_behind_is_no_estimate():
-    astray = failed_run(2, "too many rounds", estimate=[60.0, 20.0], std=[0.1, 0.1])
-    whole = sweep("x", [job({}, [run(1, TRUTH, [0.1, 0.1]), astray])])
-    found = by_setting(whole).rows[0]
-    assert (found["runs"], found["failed"], found["largest error"]) == (1, 1, 0.0)
-    # The tidy table keeps it.
-    assert runs_of(whole).frame["estimate"].max() == 60.0
-
-
 def test_without_a_bound_or_a_run_there_is_no_ratio():
     assert group([0.1], bound=None)["RMSE / bound"] is None
     nothing = group([], failed=3)
@@ -106,11 +97,6 @@ def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
     assert (posterior["true value"], posterior["start"]) == (2.09, 3.0)
     # Of a lost run only its factors are known.
     assert (rows[-1]["noise"], rows[-1]["true value"], rows[-1]["estimate"]) == (1.0, None, None)
-
-
-def test_seeds_of_a_killed_job_are_counted_where_some_left_an_estimate():
-    killed = job({"a": 1}, [run(4, [6.2, 2.0], [0.1, 0.1])], "killed", seed=3, repeats=3)
-    assert [(one.seed, one.converged) for one in killed.runs] == [(4, True), (3, False), (5, False)]
 
 
 def test_the_file_is_plain_and_free_of_times():

@@ -11,7 +11,6 @@ from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
     closure_model,
-    template_of,
     upright,
 )
 from experiments.common.building.gate import anatomy_digest
@@ -173,8 +172,3 @@ def test_what_is_wrong_is_one_line(folder, overrides, error, message):
     with pytest.raises(error, match=message) as raised:
         anatomy_of(values)
     assert "\n" not in str(raised.value)
-
-
-def test_studies_that_vary_the_template_refuse_a_folder(folder):
-    with pytest.raises(ConfigurationError, match="varies the template's parameters"):
-        template_of(values_of(folder, experiment="design"))

@@ -49,13 +49,6 @@ def test_another_key_or_other_parameters_are_another_truth(tmp_path, change):
     assert model.calls == 2
 
 
-def test_a_failure_is_not_stored(tmp_path):
-    failing = Model("it buckled")
-    assert StoredModel(failing, tmp_path, "key")(AT).reason == "it buckled"
-    assert not list(tmp_path.glob("*.npz"))
-    assert StoredModel(Model(), tmp_path, "key")(AT).converged
-
-
 VALUES = {"mesh": {"columns": 72, "rows": 8}, "element": "hex27", "dt_factor": 0.25}
 
 
