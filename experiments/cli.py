@@ -275,8 +275,8 @@ def experiments_in(folder: Path) -> dict[str, str]:
 
 def _sentence(path: Path) -> str:
     text = path.read_text(encoding="utf-8")
-    comment = re.match(r"(#.*\n)*", text)
-    lines = [line.lstrip("# ") for line in comment[0].splitlines() if "@package" not in line]
+    (comment,) = re.findall(r"\A(?:#.*\n)*", text)
+    lines = [line.lstrip("# ") for line in comment.splitlines() if "@package" not in line]
     if found := re.match(r".+?[.?!](?=\s|$)", " ".join(lines)):
         return found[0]
     title = re.search(r"^title: *(.*)$", text, re.M)

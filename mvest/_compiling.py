@@ -55,12 +55,12 @@ def announce_compilation() -> None:
     """Say in one line when numba first compiles something in this process: it takes a while."""
     from numba.core import event
 
-    class Announcement(event.Listener):  # type: ignore[misc]
+    class Announcement(event.Listener):
         def on_start(self, _: object) -> None:
-            event.unregister(KIND, self)
+            event.unregister(KIND, self)  # type: ignore[no-untyped-call]
             print(NOTE, file=sys.stderr, flush=True)
 
         def on_end(self, _: object) -> None:
             pass
 
-    event.register(KIND, Announcement())
+    event.register(KIND, Announcement())  # type: ignore[no-untyped-call]

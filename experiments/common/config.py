@@ -223,10 +223,7 @@ class Config:
 def plain(config: DictConfig) -> dict[str, Any]:
     """A configuration, without Hydra's part, as resolved plain data.
 
-    Raises
-    ------
-    ConfigurationError
-        If an override has deleted a setting.
+    Raises a `ConfigurationError` if an override has deleted a setting.
     """
     found: dict[str, Any] = {}
     for key in map(str, config):

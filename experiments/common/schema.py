@@ -272,7 +272,7 @@ def _default(field: dataclasses.Field[Any], kind: Any) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return _config_value(field.default_factory())
     if field.default is dataclasses.MISSING:
-        return kind() if dataclasses.is_dataclass(kind) else MISSING
+        return kind() if isinstance(kind, type) and dataclasses.is_dataclass(kind) else MISSING
     return _config_value(field.default)
 
 

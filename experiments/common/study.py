@@ -82,10 +82,7 @@ class Results:
     def table(self, name: str = "") -> Table:
         """One table of all records; of several records a first column ``run`` names each.
 
-        Raises
-        ------
-        KeyError
-            If no record has it.
+        Raises a `KeyError` if no record has it.
         """
         parts = {one.row: one.table_of(name) for one in self.records.values() if name in one.tables}
         if not parts:
@@ -154,10 +151,7 @@ def study_names() -> tuple[str, ...]:
 def load_study(name: str) -> Study[Any]:
     """The study of that name; no other study is imported.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is none.
+    Raises a `ConfigurationError` if there is none.
     """
     if name not in study_names():
         raise ConfigurationError(f"study = {name!r}, expected one of {', '.join(study_names())}")

@@ -73,10 +73,7 @@ def estimate_table(folder: Path) -> DataFrame:
     A file that is unreadable, foreign or changed costs a line of warning. MLflow's copies are left
     out.
 
-    Raises
-    ------
-    InputError
-        If there is none.
+    Raises an `InputError` if there is none.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder")

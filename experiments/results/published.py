@@ -151,10 +151,7 @@ def publish(
 def regenerate(results: Path) -> list[Path]:
     """Write every table, figure and page of published records and sweeps again.
 
-    Raises
-    ------
-    InputError
-        If there is no record, or one is damaged or was changed.
+    Raises an `InputError` if there is no record, or one is damaged or was changed.
     """
     paths = sorted((results / RECORDS).glob("*.jsonl"))
     sweeps = read_sweeps(results)
@@ -176,10 +173,7 @@ def regenerate(results: Path) -> list[Path]:
 def records_of(results: Path, table: str) -> Results | None:
     """The published records of a table, the one of its name first; None if there is none.
 
-    Raises
-    ------
-    InputError
-        If one is damaged.
+    Raises an `InputError` if one is damaged.
     """
     path = results / RECORDS / f"{table}.jsonl"
     if not path.is_file():

@@ -51,10 +51,7 @@ from mvest.reading.text import one_line
 def require_admissible(values: Mapping[str, Any]) -> None:
     """Refuse settings that no job could run with.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible; the message names it.
+    Raises an `MvestError` if a setting is inadmissible; the message names it.
     """
     require_no_password(values["tracking"]["uri"])
     mechanics_of(values)
@@ -64,10 +61,7 @@ def require_admissible(values: Mapping[str, Any]) -> None:
 def check_of(values: Mapping[str, Any]) -> Callable[[Mapping[str, Any], Path], str]:
     """The check of a study, for ``check=true``.
 
-    Raises
-    ------
-    ConfigurationError
-        If studies of this kind have none.
+    Raises a `ConfigurationError` if studies of this kind have none.
     """
     check = load_study(values["study"]).check
     if check is None:
@@ -84,10 +78,7 @@ def run_job(request: Request) -> Record:
 
     It runs in this process unless it has a time limit.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible or a file cannot be written.
+    Raises an `MvestError` if a setting is inadmissible or a file cannot be written.
     """
     values, folder = request.values, request.folder
     record = usable_record(request)

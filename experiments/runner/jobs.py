@@ -183,10 +183,7 @@ def attempt(
 def lock(folder: Path) -> AcquireReturnProxy[FileLock]:
     """Lock the folder until the context or this process ends; prints a note if it has to wait.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be locked.
+    Raises an `InputError` if the folder cannot be locked.
     """
     held = FileLock(folder / LOCK)
     try:
@@ -259,10 +256,7 @@ def failed_record(request: Request, reason: str) -> Record:
 def write_hydra(request: Request) -> None:
     """Write the resolved configuration and the overrides where Hydra's users expect them.
 
-    Raises
-    ------
-    InputError
-        If they cannot be written.
+    Raises an `InputError` if they cannot be written.
     """
     place = request.folder / HYDRA
     place.mkdir(exist_ok=True)

@@ -160,10 +160,7 @@ def collect_sweep(folder: Path) -> int:
 
     Returns the exit status: 1 if a job has no estimate.
 
-    Raises
-    ------
-    MvestError
-        If nothing is planned in the folder, or the results cannot be written.
+    Raises an `MvestError` if nothing is planned in the folder, or the results cannot be written.
     """
     plan = Plan.read(folder)
     found = finish(plan, {})
@@ -174,10 +171,7 @@ def collect_sweep(folder: Path) -> int:
 def finish(plan: Plan, ended: Mapping[str, Record]) -> Sweep:
     """Write, show and publish the results of a sweep.
 
-    Raises
-    ------
-    MvestError
-        If the results cannot be written.
+    Raises an `MvestError` if the results cannot be written.
     """
     found = collected(plan, ended)
     print(text_of(found))

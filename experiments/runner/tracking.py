@@ -310,10 +310,7 @@ def last_sweep(outputs: Path) -> tuple[str, str, str]:
     The page compares the plausible runs. It lists them if there are too many to compare, and shows
     the sweep as a whole if there are none.
 
-    Raises
-    ------
-    InputError
-        If there is no sweep, or it has not been logged.
+    Raises an `InputError` if there is no sweep, or it has not been logged.
     """
     plans = sorted(outputs.glob(f"*/{PLAN}"), key=lambda path: path.stat().st_mtime)
     if not plans:
@@ -346,10 +343,7 @@ def serving(
 ) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Run MLflow's server for this machine only; yields its address and its process.
 
-    Raises
-    ------
-    InputError
-        If the port is taken, or the server does not start.
+    Raises an `InputError` if the port is taken, or the server does not start.
     """
     try:
         with socket.create_server(("127.0.0.1", port)) as probe:

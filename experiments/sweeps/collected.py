@@ -113,10 +113,7 @@ def head_of(record: Record) -> Record:
 def write_sweep_file(path: Path, sweep: Sweep) -> None:
     """Write a collected sweep with a digest of its content, atomically.
 
-    Raises
-    ------
-    InputError
-        If it cannot be written.
+    Raises an `InputError` if it cannot be written.
     """
     jobs = [job.model_dump(mode="json", exclude_defaults=True) for job in sweep.jobs]
     content = sealed({**sweep.model_dump(mode="json", exclude={"jobs"}), "jobs": jobs})
@@ -127,10 +124,7 @@ def write_sweep_file(path: Path, sweep: Sweep) -> None:
 def read_sweep(path: Path) -> Sweep:
     """The collected sweep in a file.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, is no sweep of this version, or was changed.
+    Raises an `InputError` if it cannot be read, is no sweep of this version, or was changed.
     """
     data = read_mapping(path)
     sweep = validated(Sweep, {k: v for k, v in data.items() if k != "sha256"}, str(path))

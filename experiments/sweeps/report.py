@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.common.progress import WIDTH
 from experiments.common.records.writer import LONGEST, write_page
 from experiments.sweeps.collected import Sweep
 from mvest.errors import InputError
@@ -274,12 +275,15 @@ def _coverage(good: DataFrame) -> tuple[float | None, float | None, float | None
 
 def text_of(sweep: Sweep) -> str:
     """The table of a sweep for a terminal, at most 100 characters wide."""
+    from pandas import DataFrame
+
     table = by_setting(sweep)
     if len(table) > LONGEST:
         return f"{len(table)} settings and parameters: too many for a terminal"
     shown = {name: table.values[name] for name in (*SHOWN, "SD over runs")}
     label = {"estimate": replace(table.columns["estimate"], label="estimate ± SD")}
-    return replace(table, values=shown, columns={**table.columns, **label}).text()
+    readable = replace(table, values=shown, columns={**table.columns, **label}).readable()
+    return str(DataFrame(readable).to_string(index=False, line_width=WIDTH))
 
 
 def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
@@ -288,10 +292,7 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
     ``sweep_NAME.csv`` has a row for each run, ``sweep_NAME_table.csv`` and ``.tex`` a row for each
     setting, ``sweep_NAME.md`` is the page.
 
-    Raises
-    ------
-    InputError
-        If its name cannot name a file, or a file cannot be written.
+    Raises an `InputError` if its name cannot name a file, or a file cannot be written.
     """
     if not re.fullmatch(r"[\w-]+", sweep.name):
         raise InputError(f"a sweep's name must be letters, digits, - and _, not {sweep.name!r}")

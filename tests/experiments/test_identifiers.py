@@ -9,19 +9,12 @@ import nibabel
 import numpy as np
 import pytest
 
-from experiments.common.config import hash_of, without_places
-from experiments.common.records.record import stamp, write_record
-from experiments.common.schema import build
-from experiments.common.study import Job
-from experiments.studies.case import STUDY, Settings
+from experiments.common.config import without_places
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
-from mvest.provenance import write_json
 from tests.exchange import volume_variants
 from tests.exchange.volumes import volumes as v
-from tests.experiments.common.test_inputs import own_case, own_program, own_volume, typed
-from tests.experiments.configured import composed, plain
-from tests.made_up_closure import use
+from tests.experiments.common.test_inputs import own_program, own_volume, typed
 
 NAME, NUMBER, DATE = "DOE^JANE", "MRN0815", "19700131"
 SECRETS = (NAME, "DOE_JANE", NUMBER, DATE)
@@ -97,24 +90,6 @@ def test_no_name_of_a_file_is_in_a_run_or_its_store(tmp_path: Path, monkeypatch)
     names = {path.name for path in (tmp_path / "here").rglob("*")}
     assert names >= {"config.json", "result.json", "mlflow.db"}
     assert leaks(tmp_path / "here") == []
-
-
-@pytest.mark.slow
-def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypatch) -> None:
-    patient = tmp_path / "DOE_JANE" / NUMBER
-    patient.mkdir(parents=True)
-    use(monkeypatch)
-    out = tmp_path / "out"
-    out.mkdir()
-    values = plain(composed(*own_case(patient), f"paths.outputs={out}"))
-    result = STUDY.run(Job(values, build(Settings, values), out))
-    record = stamp(values, hash_of(values), result, 0.0)
-    write_json(out / "config.json", without_places(values))
-    write_record(out / "result.json", record, result.arrays)
-    names = {path.name for path in STUDY.files(out, record)}
-    assert "report.html" in names
-    assert leaks(out) == []
-    assert "DOE_JANE" in json.dumps(values)
 
 
 def test_what_a_configuration_says_of_files_is_their_content(tmp_path: Path) -> None:

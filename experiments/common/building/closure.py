@@ -59,10 +59,7 @@ def folder_hash(folder: str | None) -> str | None:
 def anatomy_of(config: Values) -> Anatomy:
     """The configured anatomy.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible, or the case is faulty.
+    Raises an `MvestError` if a setting is inadmissible, or the case is faulty.
     """
     given = config["valve"]
     if given.get("folder") is None:
@@ -81,10 +78,7 @@ def anatomy_of(config: Values) -> Anatomy:
 def template_of(config: Values) -> Template:
     """The configured template.
 
-    Raises
-    ------
-    ConfigurationError
-        If the anatomy is that of a case folder.
+    Raises a `ConfigurationError` if the anatomy is that of a case folder.
     """
     if config["valve"].get("folder") is not None:
         raise ConfigurationError(

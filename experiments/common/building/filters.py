@@ -44,10 +44,7 @@ def build_filter(
 def filter_of(method: Values) -> Filter:
     """The filter that ``_target_`` names, with its settings.
 
-    Raises
-    ------
-    ConfigurationError
-        If there is no such filter, or it has no such setting.
+    Raises a `ConfigurationError` if there is no such filter, or it has no such setting.
     """
     target, settings = method.get("_target_"), {k: v for k, v in method.items() if k != "_target_"}
     module, _, name = str(target).rpartition(".")

@@ -40,10 +40,7 @@ class PatientPlace:
     def truth(self) -> tuple[dict[str, Any], dict[str, FloatArray]]:
         """The truth, and frame -> ``(n, 3)`` mm, the true positions of its vertices.
 
-        Raises
-        ------
-        InputError
-            If it is not there.
+        Raises an `InputError` if it is not there.
         """
         try:
             return read_mapping(self.hidden / HIDDEN), read_npz(self.hidden / POSITIONS)
@@ -54,10 +51,7 @@ class PatientPlace:
 def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
     """Simulate the configured patient, unless it is cached; returns its folders.
 
-    Raises
-    ------
-    ConfigurationError
-        If none is configured.
+    Raises a `ConfigurationError` if none is configured.
     """
     if patient is None:
         raise ConfigurationError("patient is not given; expected one of conf/patient")

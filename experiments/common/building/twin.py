@@ -191,10 +191,7 @@ class Twin:
 def build_twin(config: Values) -> Twin:
     """A synthetic study from its configuration.
 
-    Raises
-    ------
-    MvestError
-        If a setting is inadmissible; the message names it.
+    Raises an `MvestError` if a setting is inadmissible; the message names it.
     """
     parameters, truth = tuple(config["parameters"]), config["truth"]
     settings, R = mechanics_of(config), config["filter"]["R"]

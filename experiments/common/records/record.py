@@ -176,13 +176,7 @@ class Result(Frozen):
         return type(self)(**{**known, **values})
 
     def table_of(self, name: str = "") -> Table:
-        """One of its tables.
-
-        Raises
-        ------
-        KeyError
-            If it has none of this name.
-        """
+        """One of its tables; raises a `KeyError` if it has none of this name."""
         return Table.of_plain(self.tables[name], f"table {name!r}")
 
     @property
@@ -289,8 +283,9 @@ _source = cache(provenance)  # read once: a later checkout does not change what 
 def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
     """The provenance of what this process writes now."""
     finished = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    own = {"config_hash": config_hash, "mesh_hash": mesh_hash, "seed": seed, "finished": finished}
-    return Provenance(**_source(), **own)
+    return Provenance(
+        **_source(), config_hash=config_hash, mesh_hash=mesh_hash, seed=seed, finished=finished
+    )
 
 
 ARRAYS = "arrays_sha256"
@@ -305,10 +300,7 @@ def write_record(path: Path, record: Record, arrays: Mapping[str, Any] | None = 
 
     A former record and its arrays are replaced only when the new ones are on disk.
 
-    Raises
-    ------
-    InputError
-        If they cannot be written; the former ones are then still there.
+    Raises an `InputError` if they cannot be written; the former ones are then still there.
     """
     new = path.with_name(NEW_FIELDS)
     new.unlink(missing_ok=True)

@@ -29,10 +29,7 @@ def write_results(folder: Path, study: Study[Any], results: Results) -> list[Pat
 
     ``folder`` exists. Files have the name of the table that the records belong to.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    Raises an `InputError` if a file cannot be written.
     """
     drawn = None if study.figure is None or results.is_empty else study.figure(results)
     figures = drawn if isinstance(drawn, Mapping) else {"": drawn} if drawn else {}

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from experiments.common.building.twin import build_twin, truth_mesh
+from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of
 from experiments.results.published import as_published
 from mvest.observation.errors import WhiteNoise
@@ -106,16 +106,6 @@ def test_guides_are_coarser_down_to_the_coarsest() -> None:
     # The truth is not guided, nor is who does not want to be.
     assert twin.truth_model.guide is None
     assert build_twin(plain(composed("guided=false"))).model.guide is None
-
-
-def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
-    config = plain(composed("experiment=debug", "truth=independent"))
-    twin = build_twin(config)
-    assert twin.truth_model.mesh.element_type == "tet10"
-    assert truth_mesh(config["mesh"], config["truth"])["columns"] == 2 * config["mesh"]["columns"]
-    steps = (twin.truth_model.settings.protocol.dt, twin.model.settings.protocol.dt)
-    assert steps[0] == pytest.approx(steps[1] / 4)
-    assert twin.truth_model.mesh.sha256 != twin.model.mesh.sha256
 
 
 def test_a_population_is_drawn_from_what_its_estimator_states() -> None:

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from experiments.cli import main
@@ -39,18 +38,6 @@ def test_tables_grow_with_the_records_and_need_nothing_else(tmp_path) -> None:
         (tmp_path / name).unlink()
     regenerate(tmp_path)
     assert before == files(tmp_path, "table1")
-
-
-def test_each_table_takes_its_own_records_and_failures_stay_rows(tmp_path) -> None:
-    kept(tmp_path, "table1", made_up_twin())
-    kept(tmp_path, "meshes-a", made_up_twin(None, table="meshes", row="a"))
-    own, meshes = (pd.read_csv(tmp_path / f"{t}.csv", comment="#") for t in ("table1", "meshes"))
-    assert list(own["run"]) == ["same model"]
-    assert list(meshes["run"]) == ["a"]
-    assert list(meshes["status"]) == ["failed"]
-    assert "no prediction" in meshes["reason"][0]
-    assert np.isnan(meshes["estimate E_f.anterior [MPa]"][0])
-    assert meshes["truth E_f.anterior [MPa]"][0] == 6.23
 
 
 @pytest.mark.parametrize(

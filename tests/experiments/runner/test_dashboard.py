@@ -102,15 +102,6 @@ def test_only_its_own_page_is_answered(address, host, origin, status) -> None:
     assert asked(address, host=host, origin=origin.replace("its own", address)) == status
 
 
-def test_no_module_of_the_working_folder_is_run(outputs, tmp_path, monkeypatch) -> None:
-    place, _, _ = tracking.last_sweep(outputs)
-    for name in ("mlflow", "uvicorn", "fastapi", "sqlalchemy", "click", "filelock", "json", "ssl"):
-        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
-    monkeypatch.chdir(tmp_path)
-    with tracking.serving(place, 0, quiet=True):
-        assert not (tmp_path / "ran").exists()
-
-
 def listening(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0

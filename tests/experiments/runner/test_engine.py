@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -96,22 +95,6 @@ def test_the_job_of_a_killed_worker_is_run_again_by_itself(sweep, tmp_path):
     assert running.returncode == 0, out
     assert "8 of 8 jobs done" in out
     assert sorted(set(runs())) == list(range(8))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_nothing_runs_on_when_the_command_is_ended(sweep, tmp_path, number):
-    # In compiled code, which holds the interpreter's lock.
-    Path("hold-3").touch()
-    running = sweep()
-    until(lambda: 3 in runs())
-    os.kill(running.pid, number)
-    out, _ = running.communicate(timeout=60)
-    assert running.returncode == (130 if number == signal.SIGINT else -9), out
-    until(lambda: not living(tmp_path))
-    begun = runs()
-    time.sleep(1.0)
-    assert runs() == begun
 
 
 def _dask_workers(folder: Path, client: int) -> set[int]:

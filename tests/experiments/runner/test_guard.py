@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from experiments.common.records.record import VERSION, Record, stamp, write_record
@@ -160,12 +159,6 @@ def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
     assert not is_done(tmp_path)
 
 
-def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
-    converged(request(tmp_path), "1" * 64)
-    mark_done(tmp_path)
-    assert run_in(worker, request(tmp_path, exit=3)).status == "failed"
-
-
 def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_path, capsys):
     asked = request(tmp_path)
     converged(asked)
@@ -178,14 +171,6 @@ def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_pat
         f"note: {tmp_path / 'result.json'}: its content is not what was written (SHA-256 does not "
         "match); it is computed again"
     ]
-
-
-def test_other_arrays_beside_a_result_are_not_its_own(tmp_path):
-    converged(request(tmp_path), x=np.ones(3))
-    mark_done(tmp_path)
-    assert last_record(tmp_path, "0" * 64) is not None
-    np.savez(tmp_path / "fields.npz", x=np.zeros(3))
-    assert last_record(tmp_path, "0" * 64) is None
 
 
 def test_a_converged_record_without_its_mark_is_no_result(tmp_path):

@@ -203,28 +203,6 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     assert again == kept
 
 
-def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of_closing) -> None:
-    calls = []
-
-    def counted(m, rest) -> Prediction:
-        calls.append(m)
-        return shrinking(m, rest)
-
-    instead_of_closing(counted)
-    usual = ("experiment=debug", "tracking.enabled=false")
-    status, first, err = run(*usual)
-    assert status == 0, err
-    (folder,) = (tmp_path / "outputs" / "debug").iterdir()
-    assert (folder / "done").exists()
-    once = len(calls)
-    status, again, _ = run(*usual)
-    assert (status, len(calls)) == (0, once)
-    assert "force=true runs it again" in again
-    assert again.splitlines()[:5] == first.splitlines()[:5]
-    assert run(*usual, "force=true")[0] == 0
-    assert len(calls) > once
-
-
 def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
     run, tmp_path, instead_of_closing
 ) -> None:

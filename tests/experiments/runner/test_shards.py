@@ -137,13 +137,3 @@ def test_a_killed_shard_loses_the_job_in_flight_and_a_second_one_finishes(planne
     assert {path: path.stat().st_mtime_ns for path in done} == done
     assert cli.main(["collect", str(FOLDER)]) == 0
     assert "12 of 12 jobs done" in capsys.readouterr().out
-
-
-def test_jobs_that_are_forced_run_again_once(planned, monkeypatch):
-    assert cli.main(["worker", str(FOLDER)]) == 0
-    monkeypatch.setattr(sys, "argv", ["experiments.run", *PLAN, "force=true"])
-    assert main() == 0
-    for _ in range(2):
-        assert cli.main(["worker", str(FOLDER), "--shard", "1/2"]) == 0
-    assert cli.main(["worker", str(FOLDER), "--shard", "2/2"]) == 0
-    assert runs() == sorted([*range(12)] * 2)

@@ -7,7 +7,6 @@ import os
 import re
 import resource
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ from experiments.runner.plan import Plan
 from experiments.studies import twin
 from experiments.sweeps.collected import Sweep, read_sweep
 from mvest.files import sha256_of
-from tests.places import ROOT
 
 QUICK = ("hydra.launcher.n_jobs=1", "tracking.enabled=false")
 
@@ -134,31 +132,9 @@ def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
     run("sweep=debug")
     _, out, _ = run("sweep=debug", "dry_run=true")
     assert out.count("  done  ") == 3
-    assert "seed=2  [failed before: RuntimeError: it broke]" in out
+    assert "seed=2 [failed before: RuntimeError: it broke]" in " ".join(out.split())
     assert "about " in out
     assert len(runs()) == 4
-
-
-def test_a_sweep_from_the_command_line_is_planned_as_well(run):
-    status, out, _ = run("-m", "experiment=debug", "seed=1,2,3")
-    assert status == 0
-    found = read_sweep(Path("outputs/debug/sweep.json"))
-    assert (found.name, found.size) == ("debug", None)
-    assert [record.estimates[0].seed for record in found.records] == [1, 2, 3]
-    _, out, _ = run("-m", "experiment=debug", "seed=1,2,3,4")
-    assert "3 done, 0 failed before, 1 to run" in out
-
-
-def test_any_number_of_workers_gives_the_same_files(run):
-    for workers in ("1", "3"):
-        outputs = (f"paths.outputs=with-{workers}", f"hydra.launcher.n_jobs={workers}")
-        assert run("sweep=debug", "publish=true", *outputs)[0] == 0
-    one, three = (
-        {path.name: path.read_bytes() for path in Path(f"with-{n}/results").glob("*.*")}
-        for n in (1, 3)
-    )
-    assert one == three
-    assert {"sweep_debug.csv", "sweep_debug.md", "sweep_debug.png"} <= one.keys()
 
 
 def test_a_job_returns_its_objective(run, monkeypatch):
@@ -212,17 +188,6 @@ def test_jobs_may_come_in_several_batches(run, monkeypatch):
     assert "objective = no_such_number: a job has no such number" in err
 
 
-def test_a_cluster_s_package_takes_no_signals_away():
-    code = """
-import signal
-from experiments.runner.cluster import EngineSettings, require_engine
-before = signal.getsignal(signal.SIGINT)
-require_engine(EngineSettings(cluster="SLURMCluster"))
-assert signal.getsignal(signal.SIGINT) is before
-"""
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-
-
 def test_results_are_renewed_by_a_sweep_as_configured_only(run):
     _, out, _ = run("sweep=debug", "publish=true", "filter.method.tolerance=1e-3")
     assert "left as it is" in out
@@ -267,10 +232,15 @@ WRONG = [
     (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
     (("sweep=debug", "hydra.launcher.cluster=PBS"), "hydra.launcher.cluster = PBS, expected"),
     (("sweep=debug", "paths.outputs=file"), "file"),
-    (("sweep=debug", "filter.P0=0.01,-1"), "(job filter.initial=[5,3] seed=1 filter.P0=-1)"),
+    (("sweep=debug", "filter.P0=0.01,-1"), "(job filter.initial=[5,3] seed=1 "),
     (("sweep=debug", "filter.initial=[5,3],[5.0,3.0]"), "one and the same: filter.initial=[5,3]"),
-    (("sweep=debug", "hydra/sweeper=basic"), "hydra/sweeper=basic knows no grid"),
 ]  # fmt: skip
+
+
+def test_another_sweeper_does_not_ignore_the_grids_of_a_sweep(run):
+    status, _, err = run("sweep=debug", "hydra/sweeper=basic")
+    assert (status, err.count("\n"), runs()) == (2, 1, [])
+    assert "hydra/sweeper=basic knows no grid" in err
 
 
 @pytest.mark.parametrize(("overrides", "words"), WRONG, ids=[" ".join(o) for o, _ in WRONG])

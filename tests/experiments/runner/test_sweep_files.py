@@ -19,7 +19,6 @@ from experiments.runner.jobs import TIME_LIMIT_S
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin import Settings, run_twin
 from mvest.errors import MvestError
-from mvest.problem.record import EstimateRecord
 from mvest.simulation.virtual_patient import PatientSettings
 from tests.places import CONF
 
@@ -145,31 +144,13 @@ def test_a_job_of_a_sweep_runs(configuration, tmp_path, name: str) -> None:
     assert result.estimates[0].reason == result.reason
 
 
-def test_seeds_give_the_same_alone_and_in_a_batch(configuration, tmp_path) -> None:
-    settings = ("sweep=noise", "observation.noise_mm=0.01", *DEBUG, f"paths.outputs={tmp_path}")
-
-    def run(seed: int, repeats: int) -> list[EstimateRecord]:
-        result = ran((*settings, f"seed={seed}", f"repeats={repeats}"), tmp_path)
-        return [entry.model_copy(update={"seconds": None}) for entry in result.estimates]
-
-    together = run(3, 3)
-    assert run(4, 1) == together[1:2]
-    assert run(4, 2) == together[1:]
-    assert len({one.moduli for one in together}) == 3
-
-
 @pytest.mark.parametrize(
     ("override", "words"),
     [
         ("truth.reading=Z", "expected one of A, C"),
         ("+truth.ratio.septal=1.0", "region 'septal'"),
         ("+truth.fixed.presure_scale=1.1", "truth.fixed: unknown parameter 'presure_scale'"),
-        ("observation.noise_mm=-1", "noise std = -1.0, expected >= 0"),
-        ("observation.correlated_mm=-1", "noise std = -1.0, expected >= 0"),
         ("observation.dropout_mm=-1", "drop-out distance = -1.0, expected >= 0"),
-        ("observation.annulus_offset_mm=[1,2]", "three finite numbers"),
-        ("filter.R_correlation_mm=-1", "correlation length = -1.0, expected > 0"),
-        ("continuation_reach=-1", "reach of a continuation = -1.0"),
     ],
 )
 def test_a_wrong_setting_is_refused_before_anything_runs(configuration, override, words) -> None:

@@ -268,22 +268,6 @@ def test_a_run_that_was_cut_short_is_made_anew(tmp_path, monkeypatch, capsys) ->
     assert (run.info.status, run.info.run_id == cut.info.run_id) == ("FINISHED", False)
 
 
-def test_what_is_not_to_be_logged_is_not(tmp_path) -> None:
-    log_run(make_job(tmp_path, "a"), make_config(tmp_path, tracking={"enabled": False}))
-    (make_job(tmp_path, "b") / "done").unlink()  # killed before everything was on disk
-    log_run(tmp_path / "debug" / "b", make_config(tmp_path))
-    log_run(tmp_path / "debug" / "c", make_config(tmp_path))
-    assert stored(tmp_path) == []
-
-
-def test_a_failed_run_is_told_with_its_reason(tmp_path) -> None:
-    killed = {"status": "failed", "reason": "killed by signal 9", "estimates": ()}
-    log_run(make_job(tmp_path, **killed), make_config(tmp_path))
-    (run,) = stored(tmp_path)
-    assert (run.info.status, run.data.tags["reason"]) == ("FAILED", "killed by signal 9")
-    assert run.data.tags["plausible"] == "no: failed"
-
-
 # --- a sweep ------------------------------------------------------------------------------------
 
 
@@ -352,18 +336,6 @@ def test_the_comparison_hides_what_failed_or_makes_no_sense(tmp_path, monkeypatc
 
 
 # --- `mvest sync`, and stores that fail ---------------------------------------------------------
-
-
-def test_sync_brings_a_new_store_to_the_state_of_the_folders(tmp_path, capsys) -> None:
-    make_job(tmp_path, "alone")
-    make_sweep(tmp_path, a=started(5.0, 3.0), b=started(4.0, 3.0))
-    assert main(["sync", str(tmp_path)]) == 0
-    assert "4 runs added to MLflow, 0 were there" in capsys.readouterr().out
-    jobs = jobs_in(tmp_path)
-    parents = {name: run.data.tags.get("mlflow.parentRunId") for name, run in jobs.items()}
-    assert parents == dict.fromkeys("ab", whole_of(tmp_path).info.run_id) | {"alone": None}
-    assert main(["sync", str(tmp_path)]) == 0
-    assert "0 runs added to MLflow, 4 were there" in capsys.readouterr().out
 
 
 def test_sync_says_what_it_cannot_read(tmp_path, capsys) -> None:
@@ -441,6 +413,7 @@ with opened(None, Path("fresh"), "debug"):
 """
 
 
+@pytest.mark.slow
 def test_processes_that_open_a_fresh_store_at_once_do_not_break_it(tmp_path) -> None:
     place = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     environment = os.environ | {"PYTHONPATH": place}

@@ -51,13 +51,6 @@ def test_errors_by_hand():
     assert (found["forward solves"], found["forward solves, max"]) == (3, 3)
 
 
-def test_without_a_bound_or_a_run_there_is_no_ratio():
-    assert group([0.1], bound=None)["RMSE / bound"] is None
-    nothing = group([], failed=3)
-    assert (nothing["runs"], nothing["failed"]) == (0, 3)
-    assert nothing["RMSE"] is nothing["largest error"] is nothing["coverage"] is None
-
-
 def test_coverage_by_hand():
     # Half width 1.9600 standard deviations of 0.1.
     found = group([0.1, -0.1, 0.3, -0.3], failed=1)
@@ -67,13 +60,6 @@ def test_coverage_by_hand():
     assert found["coverage, high"] == pytest.approx(50 + 34.996, abs=1e-3)
     assert group([0.1959])["coverage"] == 100.0
     assert group([0.1961])["coverage"] == 0.0
-
-
-def test_an_interval_that_the_record_states_counts():
-    stated = run(1, TRUTH, [0.1, 0.1])
-    ends = [one.model_copy(update={"low": 7.0, "high": 8.0}) for one in stated.unknowns]
-    whole = sweep("x", [job({"a": 1}, [stated.model_copy(update={"unknowns": tuple(ends)})])])
-    assert by_setting(whole).rows[0]["coverage"] == 0.0
 
 
 def test_every_run_has_its_rows_with_factors_first_and_failures_kept():
