@@ -28,7 +28,7 @@ TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the first guess of what is left."""
 
 QUICK_S = 1.0
-"""A forward solve that ends sooner than this after the last line gets no line."""
+"""What ends sooner than this after the last line gets no line."""
 
 
 def duration(seconds: float) -> str:
@@ -211,8 +211,8 @@ class PartBar:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._lines.end()
-        if kind is None:
-            say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
+        if kind is None and (spent := time.monotonic() - self._began) > QUICK_S:
+            say(f"{self._title}: done in {duration(spent)}")
 
     def step(self, total: int | None = None, seconds: float | None = None) -> None:
         """One more piece is done, of ``total`` if given; it took ``seconds``, if given."""

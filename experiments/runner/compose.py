@@ -19,9 +19,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
-from tqdm import tqdm
 
 from experiments.common.config import hash_of, plain
+from experiments.common.progress import PartBar
 from experiments.results.published import as_configured, publish_as
 from experiments.runner.jobs import HASH_DIGITS, TIME_LIMIT_S, Request
 from experiments.runner.plan import Plan, earlier
@@ -90,44 +90,49 @@ def make_plan(
     is_group = cache(lambda name: bool(loader.get_group_options(name)))
     merged: dict[tuple[str, ...], DictConfig] = {}
     planned: list[Request] = []
-    for number, overrides in enumerate(tqdm(jobs, "composing", disable=None, leave=False), first):
-        parsed = {one.get_key_element(): one for one in map(parse, overrides)}
-        # Merging files takes Hydra a tenth of a second. Jobs that set the same settings share the
-        # merged configuration, and only their values are set in it.
-        settings = [
-            one for one in parsed.values() if _sets_value(one) and not is_group(one.key_or_group)
-        ]
-        kind = tuple(
-            str(one.key_or_group if one in settings else one.input_line) for one in parsed.values()
-        )
-        if kind in merged:
-            for one in settings:
-                OmegaConf.update(merged[kind], one.key_or_group, one.value())
-        else:
-            merged[kind] = loader.load_sweep_config(config, list(overrides))
-            HydraConfig.instance().set_config(merged[kind])
-        composed = merged[kind]
-        values = plain(composed)
-        # Null removes the limit; without an override the default holds.
-        if values["time_limit_s"] is None and "time_limit_s" not in parsed:
-            values["time_limit_s"] = TIME_LIMIT_S
-        values["factors"] = {
-            **{key: _factor(one) for key, one in parsed.items() if key in varied},
-            **values["factors"],
-        }
-        # Equal parts are shared, so that many configurations fit into memory.
-        shared = planned[0].values if planned else {}
-        for key in values.keys() & shared.keys():
-            # As JSON, because 1 equals 1.0.
-            if json.dumps(values[key]) == json.dumps(shared[key]):
-                values[key] = shared[key]
-        config_hash = hash_of(values)
-        with read_write(composed.hydra), open_dict(composed.hydra):
-            composed.hydra.job.id = composed.hydra.job.num = number
-        subdir = config_hash[:HASH_DIGITS] if by_hash else str(composed.hydra.sweep.subdir)
-        folder = Path(str(composed.hydra.sweep.dir)) / subdir
-        published = publish_as(values, overrides, swept)
-        planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
+    with PartBar(f"{config.name}, composing", len(jobs), "job") as bar:
+        for number, overrides in enumerate(jobs, first):
+            bar.step()
+            parsed = {one.get_key_element(): one for one in map(parse, overrides)}
+            # Merging files takes Hydra a tenth of a second. Jobs that set the same settings share
+            # the merged configuration, and only their values are set in it.
+            settings = [
+                one
+                for one in parsed.values()
+                if _sets_value(one) and not is_group(one.key_or_group)
+            ]
+            kind = tuple(
+                str(one.key_or_group if one in settings else one.input_line)
+                for one in parsed.values()
+            )
+            if kind in merged:
+                for one in settings:
+                    OmegaConf.update(merged[kind], one.key_or_group, one.value())
+            else:
+                merged[kind] = loader.load_sweep_config(config, list(overrides))
+                HydraConfig.instance().set_config(merged[kind])
+            composed = merged[kind]
+            values = plain(composed)
+            # Null removes the limit; without an override the default holds.
+            if values["time_limit_s"] is None and "time_limit_s" not in parsed:
+                values["time_limit_s"] = TIME_LIMIT_S
+            values["factors"] = {
+                **{key: _factor(one) for key, one in parsed.items() if key in varied},
+                **values["factors"],
+            }
+            # Equal parts are shared, so that many configurations fit into memory.
+            shared = planned[0].values if planned else {}
+            for key in values.keys() & shared.keys():
+                # As JSON, because 1 equals 1.0.
+                if json.dumps(values[key]) == json.dumps(shared[key]):
+                    values[key] = shared[key]
+            config_hash = hash_of(values)
+            with read_write(composed.hydra), open_dict(composed.hydra):
+                composed.hydra.job.id = composed.hydra.job.num = number
+            subdir = config_hash[:HASH_DIGITS] if by_hash else str(composed.hydra.sweep.subdir)
+            folder = Path(str(composed.hydra.sweep.dir)) / subdir
+            published = publish_as(values, overrides, swept)
+            planned.append(Request(values, config_hash, folder, published, tuple(overrides)))
     sweep: Any = OmegaConf.to_container(config.sweep, resolve=True)
     return Plan(
         name=str(config.name),

@@ -20,7 +20,7 @@ from experiments.common.records.record import Record, here_and_now
 from experiments.runner.jobs import Request, failed_record, last_record
 from experiments.sweeps.collected import Sweep, SweptJob, head_of
 from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import config_hash, git_state, write_json
+from mvest.provenance import config_hash, write_json
 from mvest.reading.documents import read_mapping
 from mvest.reading.text import one_line
 
@@ -193,8 +193,6 @@ class Plan:
         """How many jobs are done and left, and how long they will take, in one line."""
         left, done = len(self.to_run), self.done
         failed, size = len(self.before) - len(done), self.sweep.get("size")
-        present = git_state(Path(__file__).resolve().parent)["sha"]
-        stale = sum(record.provenance.git.sha != present for record in done.values())
         takes = "nothing left"
         if left and done:
             mean = fmean(record.seconds_total for record in done.values())
@@ -202,10 +200,9 @@ class Plan:
             takes = f"about {total}, {self.workers} at a time"
         elif left:
             takes = "time unknown: no job has finished yet"
-        remark = f" ({stale} of the done ones by another commit; force=true redoes)"
         return (
             f"{self.name}{f' ({size})' if size else ''}: {len(self.jobs)} jobs, {len(done)} done, "
-            f"{failed} failed before, {left} to run{remark if stale else ''}; {takes}"
+            f"{failed} failed before, {left} to run; {takes}"
         )
 
     def listing(self) -> str:

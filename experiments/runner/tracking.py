@@ -26,9 +26,8 @@ from urllib.parse import quote
 
 from filelock import FileLock
 from omegaconf import OmegaConf
-from tqdm import tqdm
 
-from experiments.common.progress import say
+from experiments.common.progress import PartBar, say
 from experiments.common.records.record import read_record
 from experiments.runner.jobs import CONFIG, RESULT, is_done
 from experiments.runner.metrics import Values, implausible, metrics, settings_of
@@ -206,14 +205,18 @@ def _log(folder: Path, outputs: Path, config: Values) -> Counter[str]:
         return counts
     plan: Any = read_mapping(folder / PLAN) if (folder / PLAN).is_file() else None
     jobs: Any = plan["jobs"] if plan else [{"folder": "", "overrides": _typed(folder)}]
-    with opened(tracking["uri"], outputs, name):
+    shown = jobs if len(jobs) <= MANY else []
+    with (
+        PartBar(f"{name}, to MLflow", len(shown), "run") as bar,
+        opened(tracking["uri"], outputs, name),
+    ):
         known = runs_of(name, "" if plan else f"tags.folder = '{folder.resolve().name}'")
         parent = None
         if plan:
             parent, done = _put(_sweep(folder, plan), known, None)
             counts[done] += 1
-        shown = jobs if len(jobs) <= MANY else []
-        for job in tqdm(shown, "to MLflow", disable=None, leave=False):
+        for job in shown:
+            bar.step()
             place = folder / job["folder"]
             try:
                 if (place / RESULT).is_file() and (entry := _job(place, job)):

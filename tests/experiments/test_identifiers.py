@@ -1,6 +1,5 @@
 """No name, number or date of a patient gets out of what is read into what is written."""
 
-import json
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -9,12 +8,11 @@ import nibabel
 import numpy as np
 import pytest
 
-from experiments.common.config import without_places
 from mvest.exchange.volumes import read_volume
 from mvest.imaging.volume import Modality
 from tests.exchange import volume_variants
 from tests.exchange.volumes import volumes as v
-from tests.experiments.common.test_inputs import own_program, own_volume, typed
+from tests.experiments.common.test_inputs import own_program, typed
 
 NAME, NUMBER, DATE = "DOE^JANE", "MRN0815", "19700131"
 SECRETS = (NAME, "DOE_JANE", NUMBER, DATE)
@@ -90,18 +88,3 @@ def test_no_name_of_a_file_is_in_a_run_or_its_store(tmp_path: Path, monkeypatch)
     names = {path.name for path in (tmp_path / "here").rglob("*")}
     assert names >= {"config.json", "result.json", "mlflow.db"}
     assert leaks(tmp_path / "here") == []
-
-
-def test_what_a_configuration_says_of_files_is_their_content(tmp_path: Path) -> None:
-    place = tmp_path / "DOE_JANE"
-    place.mkdir()
-    words = own_volume(place)
-    assert "DOE_JANE" in words[1]
-    values = {
-        "study": "volume", "volume": words[1].partition("=")[2], "paths": {"outputs": str(place)},
-        "imaged": {"name": "valve 7", "pressure_curve": words[2].partition("=")[2]},
-    }  # fmt: skip
-    kept = without_places(values)
-    assert "DOE_JANE" not in json.dumps(kept)
-    assert "sha256" in json.dumps(kept["volume"])
-    assert kept["imaged"]["name"] == "valve 7"

@@ -241,7 +241,9 @@ def check(values: Values, case: ValveCase, folder: Path, *, gate: bool = False) 
     drawn = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")
     lines = _described(case)
     if gate:
-        lines += gate_lines(gate_case(case, settings, mesh_store(values)))
+        with PartBar(f"{case.name}, gate", 1, "test") as bar:
+            lines += gate_lines(gate_case(case, settings, mesh_store(values)))
+            bar.step()
     strange = implausible_values(case)
     lines += [f"{'MISTAKE?' if one.mistake else 'implausible'}: {one}" for one in strange]
     lines.append(

@@ -120,15 +120,3 @@ def test_a_population_is_drawn_from_what_its_estimator_states() -> None:
     modulus = known["unknowns"]["E_f.anterior"]
     log_std = np.sqrt(np.log1p((modulus["std"] / modulus["mean"]) ** 2))
     assert patient["moduli_spread"] == pytest.approx(log_std, abs=0.005)
-
-
-@pytest.mark.parametrize("name", ["own_valve", "patients", "calibration"])
-def test_what_is_not_known_is_carried_by_default(name: str) -> None:
-    personal = plain(composed(f"experiment={name}"))["personal"]
-    assert personal["nuisance_geometry"]["thickness"] == 0.2
-    assert set(personal["nuisance_law"]) == {"anterior", "posterior"}
-    assert personal["unknowns"]["pressure_scale"]["std"] == 0.15
-    assert personal["nuisance_geometry"]["renewals"] > 0
-    known = plain(composed(f"experiment={name}", "personal=nuisances"))["personal"]
-    assert known["nuisance_geometry"] is None
-    assert known["nuisance_law"] == {}

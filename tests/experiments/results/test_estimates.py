@@ -59,16 +59,6 @@ def test_a_row_for_each_unknown_of_a_case(tmp_path: Path) -> None:
     assert np.isnan(table["relative_error"][1])
 
 
-def test_failures_are_rows_and_other_records_are_none(tmp_path: Path) -> None:
-    record(tmp_path / "died", status="failed", reason="it\nbuckled")
-    record(tmp_path / "other", numbers={"gap_mm": 1.0})
-    table = estimate_table(tmp_path)
-    assert set(table["record"]) == {"died/result.json"}
-    assert set(table["status"]) == {"failed"}
-    assert set(table["reason"]) == {"it buckled"}
-    assert table["estimate"].isna().all()
-
-
 def test_a_sweep_stands_for_its_jobs(tmp_path: Path) -> None:
     record(tmp_path / "sweep" / "jobs" / "a", estimates=(made_up_estimate(),))
     write_sweep_file(tmp_path / "sweep" / "sweep.json", swept())

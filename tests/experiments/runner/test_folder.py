@@ -92,6 +92,7 @@ def test_another_configurations_result_stays_until_it_is_replaced(tmp_path):
     finish(asked, 1.0)
     jobs.make_way(Request(asked.values, "1" * 64, tmp_path))
     assert number(asked) == 1.0
+    assert jobs.last_record(tmp_path, "1" * 64) is None
 
 
 def test_a_request_keeps_its_overrides(tmp_path):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.records.record import VERSION, Record, stamp, write_record
+from experiments.common.records.record import Record, stamp, write_record
 from experiments.common.study import Result
 from experiments.runner import job as child
 from experiments.runner.engine import WorkerProcess
@@ -25,7 +25,7 @@ from experiments.runner.jobs import (
     mark_done,
 )
 from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import sealed, write_json
+from mvest.provenance import write_json
 from tests.places import ROOT
 
 OBEDIENT = """
@@ -171,16 +171,6 @@ def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_pat
         f"note: {tmp_path / 'result.json'}: its content is not what was written (SHA-256 does not "
         "match); it is computed again"
     ]
-
-
-def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
-    record = converged(request(tmp_path))
-    assert last_record(tmp_path, "0" * 64) is None
-    mark_done(tmp_path)
-    assert last_record(tmp_path, "0" * 64) == record
-    older = sealed(changed(tmp_path, version=VERSION - 1))
-    write_json(tmp_path / "result.json", older)
-    assert last_record(tmp_path, "0" * 64) is None, "a layout that nothing here reads"
 
 
 @pytest.mark.parametrize("order", [{"signal": int(signal.SIGKILL)}, {"reason": "no space left"}])

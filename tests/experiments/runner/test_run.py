@@ -6,7 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-import yaml
 
 from experiments import cli
 from experiments.common.records.record import read_record
@@ -201,27 +200,6 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     capsys.readouterr()
     again = {path.name: path.read_bytes() for path in (tmp_path / "published").glob("table1*")}
     assert again == kept
-
-
-def test_a_forced_run_that_is_interrupted_leaves_the_former_result(
-    run, tmp_path, instead_of_closing
-) -> None:
-    def interrupted(m, rest) -> Prediction:
-        raise KeyboardInterrupt
-
-    usual = ("experiment=debug", "tracking.enabled=false", "hydra.run.dir=here")
-    instead_of_closing(shrinking)
-    assert run(*usual)[0] == 0
-    places = [tmp_path / "here" / name for name in ("result.json", "done", "fields.npz")]
-    before = [place.read_bytes() for place in places]
-    instead_of_closing(interrupted)
-    assert run(*usual, "force=true")[0] == 130
-    assert [place.read_bytes() for place in places] == before
-    status, out, _ = run(*usual)
-    assert status == 0
-    assert "force=true runs it again" in out
-    overrides = (tmp_path / "here" / ".hydra" / "overrides.yaml").read_text()
-    assert yaml.safe_load(overrides) == [*usual[:2], "force=true"]
 
 
 FAILURES = {

@@ -128,22 +128,6 @@ def ran(overrides: tuple[str, ...], folder: Path) -> Result:
     return run_twin(Job(config, Settings(), folder, config_hash))
 
 
-@pytest.mark.parametrize("name", ["discrepancy", "filter"])
-def test_a_job_of_a_sweep_runs(configuration, tmp_path, name: str) -> None:
-    overrides = jobs(name, "small")[-1]
-    settings = (*DEBUG, "repeats=2", f"paths.outputs={tmp_path}", "filter.R=1e-4")
-    job = (f"sweep={name}", *overrides, *settings)
-    result = ran(job, tmp_path / "job")
-    assert not (tmp_path / "job").exists(), "nothing is drawn, so nothing is kept to draw"
-    seed = composed(*job)[1]["seed"]
-    assert [entry.seed for entry in result.estimates] == [seed, seed + 1]
-    for entry in result.estimates:
-        json.dumps(entry.model_dump(mode="json"), allow_nan=False)
-        assert all(None not in (own.estimate, own.bound) for own in entry.moduli)
-        assert len(entry.iterates) == len(entry.iterate_std) == entry.iterations + 1
-    assert result.estimates[0].reason == result.reason
-
-
 @pytest.mark.parametrize(
     ("override", "words"),
     [

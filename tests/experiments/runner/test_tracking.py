@@ -256,18 +256,6 @@ def test_again_changes_nothing_and_another_result_takes_the_place(tmp_path) -> N
     assert run.data.metrics["estimate.anterior"] == 6.1
 
 
-def test_a_run_that_was_cut_short_is_made_anew(tmp_path, monkeypatch, capsys) -> None:
-    job = make_job(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr("mlflow.log_artifact", lambda *_, **__: 1 / 0)
-        log_run(job, make_config(tmp_path))
-    assert "division by zero" in capsys.readouterr().err
-    (cut,) = stored(tmp_path)
-    log_run(job, make_config(tmp_path))
-    (run,) = stored(tmp_path)
-    assert (run.info.status, run.info.run_id == cut.info.run_id) == ("FINISHED", False)
-
-
 # --- a sweep ------------------------------------------------------------------------------------
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.sweeps.collected import Sweep, head_of, read_sweep, read_sweeps, write_sweep_file
+from experiments.sweeps.collected import Sweep, head_of, read_sweep, write_sweep_file
 from experiments.sweeps.report import write_sweep
 from mvest.errors import InputError
 from tests.experiments.studies.made_up import SOURCE
@@ -60,17 +60,6 @@ def test_a_damaged_sweep_is_named(tmp_path, damage, words):
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match=words):
         read_sweep(path)
-
-
-def test_published_sweeps_are_read_in_their_order(tmp_path):
-    assert read_sweeps(tmp_path) == []
-    (tmp_path / "sweeps").mkdir()
-    for whole in (noise(2), small()):
-        write_sweep_file(tmp_path / "sweeps" / f"{whole.name}.json", whole)
-    assert [whole.name for whole in read_sweeps(tmp_path)] == ["filter", "noise"]
-    (tmp_path / "sweeps" / "a.json").write_text("{", encoding="utf-8")
-    with pytest.raises(InputError, match=r"a\.json is not JSON"):
-        read_sweeps(tmp_path)
 
 
 def test_equal_sweeps_give_equal_files_whenever_they_ran(tmp_path):

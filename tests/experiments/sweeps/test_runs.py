@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pandas import read_csv
 
-from experiments.sweeps.report import by_setting, factors_of, runs_of, shortened
+from experiments.sweeps.report import by_setting, runs_of, shortened
 from mvest.estimation.estimate import NOT_THE_POSTERIOR
 from tests.experiments.sweeps.made_up_sweeps import (
     TRUTH,
@@ -96,15 +96,6 @@ def test_the_file_is_plain_and_free_of_times():
     assert list(back.columns)[:2] == ["truth", "start anterior [MPa]"]
     assert set(back["truth"]) == {"finer mesh"}
     assert list(back["true value [MPa]"]) == TRUTH.tolist()
-
-
-def test_names_of_factors_carry_units_and_hide_no_column():
-    factors = {"noise_mm": 1, "start_anterior": 1, "kind": "a", "P0": 1, "std": 2, "seed": 3}
-    found = factors_of(sweep("x", [job(factors, [])]))
-    assert list(found.values()) == [
-        ("noise", "mm"), ("start anterior", "MPa"), ("kind", ""), ("P0", "filter coordinates²"),
-        ("std (factor)", ""), ("seed", ""),
-    ]  # fmt: skip
 
 
 def test_a_row_for_each_setting_below_the_papers():

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 from experiments.common.building.closure import (
     anatomy_of,
     build_mesh,
-    closure_model,
 )
 from experiments.common.building.gate import anatomy_digest
-from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of, plain
 from mvest.cases.folder import read_case, write_case
 from mvest.errors import ConfigurationError, InputError
@@ -97,23 +95,6 @@ def test_the_annulus_narrows_as_stated_and_as_a_closed_frame_shows(folder, tmp_p
     )
     with pytest.raises(ConfigurationError, match="whose annulus is known; expected 0"):
         anatomy_of(values_of(both, "valve.annulus_contraction=0.1"))
-
-
-def test_it_is_closed_guided_and_estimated_as_the_template_is(folder):
-    values = values_of(folder, *SMALL, experiment="twin")
-    model = closure_model(values)
-    assert (len(model.valve.surface.vertices), model.mesh.element_type) == (400, "hex18")
-    assert build_twin(values_of(folder, *SMALL[2:], experiment="twin")).model.guide is not None
-    other = build_twin({**values, "truth": {**values["truth"], "element": "tet10"}})
-    assert other.truth_model.mesh.element_type == "tet10"
-    finer = closure_model(values, next(c for c in _cases() if c.mesh > 1))
-    assert len(finer.mesh.elements) > len(model.mesh.elements)
-
-
-def _cases():
-    from mvest.closure.robustness import GATE_CASES
-
-    return GATE_CASES
 
 
 def test_an_unstructured_mesh_is_made_of_the_surface_that_was_given(folder, tmp_path):
