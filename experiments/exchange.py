@@ -10,13 +10,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import textwrap
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.common.progress import wrapped
+from experiments.common.progress import WIDTH
 from experiments.common.schema import defaults_of, from_words
 from experiments.console import Parser
 from mvest.cases.folder import require_new, write_case
@@ -57,7 +58,8 @@ def _parsed(
             found[one.name] = function, (module.__doc__ or "").partition("\n")[0]
     name = given[0] if given else "--help"
     if name not in found:
-        names = wrapped("\n".join(f"  {key:<12} {text}" for key, (_, text) in found.items()))
+        form = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent=" " * 15)
+        names = "\n".join(form.fill(f"{key:<12} {text}") for key, (_, text) in found.items())
         more = f"mvest {verb} NAME --help lists the options of each."
         usage = f"mvest {verb} NAME SOURCE {metavar} [OPTION=VALUE ...]"
         parser = Parser(f"mvest {verb}", f"{names}\n\n{more}", EXAMPLES[verb], usage)

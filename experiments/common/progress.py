@@ -37,11 +37,13 @@ def duration(seconds: float) -> str:
 
 
 def wrapped(text: str) -> str:
-    """Text with its lines broken at spaces where they are longer than `WIDTH`."""
+    """Text with its sentences broken at spaces to lines of at most `WIDTH`; not rows of tables."""
     fill = TextWrapper(
         WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     ).fill
-    return "\n".join(fill(line) if len(line) > WIDTH else line for line in text.splitlines())
+    lines = text.splitlines()
+    long = [len(line) > WIDTH and "  " not in line.strip() for line in lines]
+    return "\n".join(fill(line) if one else line for line, one in zip(lines, long, strict=True))
 
 
 def say(text: str) -> None:

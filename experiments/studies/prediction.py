@@ -191,7 +191,7 @@ def _patient(
     """One simulated patient: the estimate, and what is predicted by the titles of scenarios."""
     rng = np.random.default_rng(seed)
     truth = _draw_truth(twin, settings, rng)
-    data = twin.observe(twin.source, truth, rng)
+    data = twin.observe(twin.source, values=truth, rng=rng)
     step()
     if data.observation is None:
         return StudyResult.failed(twin.problem, data.reason), {}

@@ -25,7 +25,7 @@ from experiments.common.schema import Values
 from mvest.closure.anchors import content_digest
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.prediction import ObservationModel, SharedStart
+from mvest.estimation.prediction import SharedStart
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
@@ -154,11 +154,8 @@ class Twin:
     truth_values : (p,)
     valve : Valve
         The observed surface.
-    variance : float or (f,) mm²
-    correlation : SpatialCorrelation or None
-        Of the assumed noise.
-    frames : tuple of str
-    errors : tuple of ObservationError
+    observe : callable
+        (model, values= ``(p,)``, rng=) -> an observation of what the model predicts there.
     """
 
     problem: Problem
@@ -167,25 +164,7 @@ class Twin:
     source: StoredModel | Extrapolated
     truth_values: FloatArray
     valve: Valve
-    variance: float | FloatArray
-    correlation: SpatialCorrelation | None
-    frames: tuple[str, ...]
-    errors: tuple[ObservationError, ...]
-
-    def observe(
-        self, model: ObservationModel, values: FloatArray, rng: np.random.Generator
-    ) -> TwinData:
-        """An observation made from the prediction of a model at parameters ``(p,)``."""
-        return simulate_observation(
-            model,
-            self.problem.parameters,
-            values,
-            frames=self.frames,
-            variance=self.variance,
-            correlation=self.correlation,
-            errors=self.errors,
-            rng=rng,
-        )
+    observe: Callable[..., TwinData]
 
 
 def build_twin(config: Values) -> Twin:
@@ -236,10 +215,14 @@ def build_twin(config: Values) -> Twin:
         source=source,
         truth_values=values,
         valve=valve,
-        variance=variance,
-        correlation=correlation,
-        frames=frames,
-        errors=errors,
+        observe=partial(
+            simulate_observation,
+            parameters=parameters,
+            frames=frames,
+            variance=variance,
+            correlation=correlation,
+            errors=errors,
+        ),
     )
 
 
@@ -259,7 +242,8 @@ def estimate_twin(twin: Twin, seeds: Sequence[int], name: str = "") -> list[Stud
     with SolveBar(f"estimation{of_name}", steps, solves, problem.parameters) as bar:
         twin.model.on_step = bar.step
         for seed in seeds:
-            data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
+            rng = np.random.default_rng(seed)
+            data = twin.observe(lambda m: truth, values=twin.truth_values, rng=rng)
             if data.observation is None:
                 return [StudyResult.failed(twin.problem, data.reason) for _ in seeds]
             result = estimate(problem, data.observation, on_iterate=bar.iterate)
@@ -276,7 +260,7 @@ def expect_twin(config: Values, _folder: Path | None = None) -> str:
         twin.model.on_step = bar.step
         first = model(start)
     title = f"{config['name']}, {config['row']}"
-    data = twin.observe(model, start, np.random.default_rng(0))
+    data = twin.observe(model, values=start, rng=np.random.default_rng(0))
     if data.observation is None:
         return unknown_text(title, first.reason)
     std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))

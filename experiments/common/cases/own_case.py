@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from experiments.common.building.closure import mechanics_of, mesh_store
-from experiments.common.progress import PartBar, SolveBar
+from experiments.common.progress import PartBar, SolveBar, say
 from experiments.common.records.record import (
     FIELDS,
     NOT_GATED,
@@ -123,9 +122,9 @@ def run_case(
 ) -> Result:
     """Personalise a case; ``gate`` is the verdict of the gate on its anatomy."""
     for sentence in () if images else case.derived:
-        print(f"derived: {sentence}", file=sys.stderr)
+        say(f"derived: {sentence}")
     for value in implausible_values(case):
-        print(f"implausible: {value}", file=sys.stderr)
+        say(f"implausible: {value}")
     settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if not u.fixed]
@@ -170,7 +169,7 @@ def run_volume(
 
     detected = find_valve(file, imaged, folder)
     for sentence in detected.sentences:
-        print(sentence, file=sys.stderr)
+        say(sentence)
     images = write_image_step(detected, folder)
     return run_case(values, personal, read_case(folder / CASE), images)
 

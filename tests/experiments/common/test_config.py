@@ -83,8 +83,8 @@ def test_the_usual_overrides_reach_the_objects() -> None:
     assert type(twin.problem.filter).__name__ == "IteratedFilter"
     assert twin.model.mesh.element_type == "tet4"
     assert {tissue.reading for tissue in twin.model.settings.tissue.values()} == {"C"}
-    assert twin.errors == (WhiteNoise(0.5),)
-    assert list(twin.variance) == [0.01, 0.25]  # type: ignore[arg-type]
+    assert twin.observe.keywords["errors"] == (WhiteNoise(0.5),)
+    assert list(twin.observe.keywords["variance"]) == [0.01, 0.25]
     # Truth and estimator share the mesh here, but no object that could carry a value across.
     assert twin.truth_model is not twin.model
     assert twin.truth_model.fixed is not twin.model.fixed

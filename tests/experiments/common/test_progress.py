@@ -117,3 +117,5 @@ def test_no_line_is_longer_than_a_terminal():
     text = wrapped(f"short\n{'word ' * 50}")
     assert max(map(len, text.splitlines())) <= 100
     assert text.split() == ["short", *["word"] * 50]
+    row = "a  b  " * 20
+    assert wrapped(row) == row, "a table"

@@ -65,7 +65,7 @@ def test_every_job_composes_and_is_distinct(configuration, name: str) -> None:
     size = "full"
     planned = jobs(name, size)
     # Composing takes a tenth of a second: the last job and a regular choice of the others.
-    chosen = [*planned[: -1 : len(planned) // 12 + 1], planned[-1]]
+    chosen = [*planned[: -1 : len(planned) // 4 + 1], planned[-1]]
     hashes, seen = set(), {}
     for overrides in chosen:
         config_hash, config = composed(f"sweep={name}", f"sweep.size={size}", *overrides)
@@ -154,7 +154,7 @@ def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> No
     assert all("seed=2001" in job for job in planned[: len(misspecifications)])
     alone = composed("sweep=calibration", "misspecification=reference", "row=r")[1]
     made, labels = [], set()
-    for misspecification in misspecifications:
+    for misspecification in misspecifications[::3]:
         config = composed("sweep=calibration", f"misspecification={misspecification}", "row=r")[1]
         require_in_range(config)
         made.append(build(PatientSettings, config["patient"]))
@@ -164,4 +164,4 @@ def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> No
             key: value for key, value in alone.items() if key not in SECRET
         }
     simulations = {repr(one.simulation) for one in made}
-    assert len(simulations) == len(labels) == len(misspecifications)
+    assert len(simulations) == len(labels) == len(made)
