@@ -274,5 +274,5 @@ STUDY = Study(
         "frames, and estimates with 2 standard deviations. Simulated."
     },
     keeps_failures=True,
-    checks=lambda: (expect_cycle,),
+    check=expect_cycle,
 )

@@ -288,5 +288,5 @@ STUDY = Study(
     run=run,
     figure=figure,
     captions={"": "Parameters after each iteration, with each model."},
-    checks=lambda: (check_external,),
+    check=check_external,
 )

@@ -193,7 +193,7 @@ STUDY = Study(
         "valve": "The fitted valve by its distance from the observed one. Simulated.",
     },
     latex=("table1",),
-    checks=lambda: (expect_twin,),
+    check=expect_twin,
     require=require_twin,
     keeps_failures=True,
 )

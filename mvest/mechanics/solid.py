@@ -20,11 +20,11 @@ one in a frame that rotates with the element and replaces F.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mvest._compiling import announce_compilation
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.element import (
@@ -39,6 +39,8 @@ from mvest.mechanics.law import Law, Points
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
+
+announce_compilation()
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Tensor entries of the components of a six-vector."""
@@ -263,12 +265,6 @@ def _polar(a: FloatArray) -> FloatArray:
     u, _, v = np.linalg.svd(a)
     u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
     return u @ v
-
-
-def kernels_are_compiled() -> bool:
-    """Whether numba's cache holds the compiled kernels; if not, first use compiles them."""
-    place = add_tangents.stats.cache_path
-    return place is not None and any(Path(place).glob("element.add_tangents-*.nbi"))
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:
