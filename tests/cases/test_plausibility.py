@@ -56,10 +56,6 @@ def test_errors_of_an_image_are_no_mistake(case, seed):
         assert implausible_values(moved(case, lambda x, error=error: x + error)) == ()
 
 
-def exchanged_leaflets(case):
-    return with_surface(case, region=1 - case.surface.region)
-
-
 def exchanged_frames(case):
     """Open and closed shapes in each other's place."""
     open_, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
@@ -82,10 +78,6 @@ def shuffled(case):
     return with_frame(case, Role.CLOSED, vertices=closed.vertices[order])
 
 
-def thin(case):
-    return with_surface(case, thickness=0.1 * case.surface.thickness)
-
-
 def under(mmhg):
     return lambda case: with_frame(case, Role.CLOSED, pressure_mmHg=mmhg)
 
@@ -95,33 +87,34 @@ def tips_away(case):
     return with_frame(case, Role.CLOSED, papillary_tips=tips - [0.0, 0.0, 20.0])
 
 
-def slack_chordae(case):
-    chordae = replace(case.chordae, rest_length=2.0 * case.chordae.rest_length)
-    return replace(case, chordae=chordae)
-
-
 @pytest.mark.parametrize(
     ("made", "field", "words", "mistake"),
     [
-        (exchanged_leaflets, "regions", "are they exchanged?", True),
+        (
+            lambda case: with_surface(case, region=1 - case.surface.region),
+            "regions", "are they exchanged?", True,
+        ),
         (exchanged_frames, "frames", "are the frames exchanged?", True),
         (shrunken, "frames.closed.surface", "area of the anterior leaflet", False),
         (shuffled, "frames.closed.surface", "do its vertices correspond?", True),
-        (thin, "thickness", "is it in cm?", True),
+        (
+            lambda case: with_surface(case, thickness=0.1 * case.surface.thickness),
+            "thickness", "is it in cm?", True,
+        ),
         (under(16.0), "frames.pressure", "is it in kPa?", True),
         (under(40.0), "frames.pressure", "is 40 mmHg, expected 60 to 200 mmHg", False),
         (tips_away, "frames.closed.papillary_tips", "motion of a tip is 20 mm", False),
-        (slack_chordae, "frames.closed.papillary_tips", "half of the chordae", False),
+        (
+            lambda case: replace(
+                case, chordae=replace(case.chordae, rest_length=2 * case.chordae.rest_length)
+            ),
+            "frames.closed.papillary_tips", "half of the chordae", False,
+        ),
     ],
-)
+)  # fmt: skip
 def test_each_mistake_is_named(case, made, field, words, mistake):
-    found = [
-        doubt
-        for doubt in implausible_values(made(case))
-        if doubt.field == field and words in doubt.text
-    ]
-    assert found
-    assert all(doubt.mistake is mistake for doubt in found)
+    found = [v for v in implausible_values(made(case)) if v.field == field and words in v.text]
+    assert {value.mistake for value in found} == {mistake}
 
 
 def with_second(case, pressure, rise):

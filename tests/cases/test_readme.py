@@ -10,9 +10,8 @@ import pytest
 import mvest.cases
 from mvest.cases.folder import read_case
 from mvest.cases.schema import CaseFile, FrameEntry
-from mvest.exchange.surfaces import write_surface
 from mvest.valve.anatomy.template import Template
-from tests.cases.folders import closing, save
+from tests.cases.folders import closing, save, save_frames
 
 README = (Path(mvest.cases.__file__).parent / "README.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```yaml\n(.*?)```", README, flags=re.DOTALL)
@@ -24,16 +23,8 @@ def test_every_field_is_in_the_readme_and_no_other():
     assert names == set(CaseFile.model_fields) | set(FrameEntry.model_fields)
 
 
-def position(share, surface):
-    return surface.vertices if share == 0 else closing(surface.vertices, share)
-
-
 def test_the_smallest_example_is_read(tmp_path):
-    surface = Template().valve(24, 8).surface
-    for name, share in (("open", 0.0), ("closed", 1.0)):
-        file = tmp_path / f"{name}.vtp"
-        x = position(share, surface)
-        write_surface(file, x, surface.triangles, None, {"region": surface.region})
+    save_frames(tmp_path)
     case = read_case(save(tmp_path, EXAMPLES[0]))
     assert [frame.corresponds for frame in case.frames] == [True, True]
     assert len(case.chordae) == 34
@@ -44,7 +35,7 @@ def test_the_example_without_correspondence_is_read(tmp_path):
     for name, share, size in (("open", 0.0, 40), ("closing", 0.7, 48), ("closed", 1.0, 56)):
         surface = Template().valve(size, 12).surface
         for number, region in enumerate(surface.region_names):
-            x = position(share, surface) / 10.0
+            x = closing(surface.vertices, share) / 10.0
             file = tmp_path / f"{name}_{region}.stl"
             own = surface.triangles[surface.region == number]
             meshio.Mesh(x, [("triangle", own)]).write(file)

@@ -1,7 +1,4 @@
-"""All frames together: the consistent path, smoothing in time, landmarks by hand, no valve.
-
-Smoothing in time: what goes, what stays, and by whose weight.
-"""
+"""All frames together: path, smoothing in time, no valve; and the fit of one frame."""
 
 from dataclasses import replace
 
@@ -16,6 +13,13 @@ from mvest.imaging.detection.tracking import detect_valve, smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.volume import VolumeSequence
 from tests.imaging.detection import made_up as made
+from tests.imaging.detection.made_up import (
+    NumberedFrame,
+    oracle_model,
+    placed,
+    poses,
+    use_geometry,
+)
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
 FRAMES = [made.NumberedFrame(k) for k in range(4)]
@@ -207,3 +211,61 @@ def test_frames_without_a_field_of_view_show_no_valve(shape, truths, monkeypatch
     monkeypatch.setattr(pose_search, "_places", lambda frame: np.zeros((0, 3)))
     with pytest.raises(NoValveError, match="no valve found"):
         detected(shape, truths)
+
+
+MISSED = np.array([[2.0, -1.5, 1.0, 0.1, -0.08, 0.1, 0.04]])
+
+
+def mean_gap(a, b):
+    return np.linalg.norm(a - b, axis=1).mean()
+
+
+@pytest.fixture
+def true(shape, monkeypatch):
+    b = np.random.default_rng(3).standard_normal(8) * shape.std[:8]
+    found = placed(shape, poses(1, 2), b)
+    use_geometry(monkeypatch, [found])
+    return found
+
+
+def fitted(shape, true, pose=None, **more):
+    return fit_frame(NumberedFrame(), oracle_model(shape, [true]), pose or true.pose, **more)
+
+
+def test_the_fit_arrives_at_the_true_valve(shape, true):
+    # Pulls along wrong normals, or coefficients lost between rounds, stop short of it.
+    found = fitted(shape, true, true.pose.moved(MISSED))
+    assert mean_gap(found.vertices, true.vertices) < 0.3
+    np.testing.assert_allclose(found.tips, true.tips, atol=1e-3)
+    # Of the modes of each round so many as the small model has.
+    assert len(found.coefficients) == len(shape.std)
+    assert found.confidence > 0.9
+    assert np.all(found.vertex_confidence > 0.8)
+    # Vertices are those of pose and coefficients up to the free displacement.
+    shown = found.pose.world(shape.shape(found.coefficients[None]))[0]
+    assert mean_gap(found.vertices, shown) < 0.3
+
+
+def test_the_confidence_is_what_is_seen_of_leaflets_and_part_of_the_pose_rating(shape, true):
+    found = [
+        fit_frame(NumberedFrame(), oracle_model(shape, [true], best=best, seen=0.8), true.pose)
+        for best in (0.0, 0.4)
+    ]
+    seen = [valve.vertex_confidence.mean() for valve in found]
+    strange = [
+        max(0.0, ((valve.coefficients / shape.std[: len(valve.coefficients)]) ** 2).mean() - 1.0)
+        for valve in found
+    ]
+    assert found[0].confidence == pytest.approx(seen[0] - 0.15 * strange[0])
+    rating = (found[1].confidence + 0.15 * strange[1] - seen[1]) / 0.3
+    assert 0.3 < rating <= 0.4
+
+
+def test_a_shape_that_no_valve_has_is_believed_less(shape, monkeypatch):
+    # Seen as well as any, but three deviations from the mean along every mode.
+    believed = []
+    for far in (0.0, 3.0):
+        strained = placed(shape, poses(1, 2), far * shape.std[:8])
+        use_geometry(monkeypatch, [strained])
+        believed.append(fitted(shape, strained).confidence)
+    assert believed[1] < believed[0] - 0.3
