@@ -68,12 +68,8 @@ SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
 ERRORS_MMHG = (0.0, 2.0, 5.0, 10.0, 20.0)
 """Errors of pressures that designs are compared for."""
 
-KINDS = {
-    "factor": "as a factor on all",
-    "offset": "as an offset of all",
-    "each": "of each by itself",
-}
-"""Kinds of errors of pressures, and their descriptions."""
+KINDS = ("factor", "offset", "each")
+"""Kinds of errors of pressures: a factor on all, an offset of all, and of each by itself."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "the pressures": (SCALE, OFFSET, ERROR),
@@ -89,8 +85,7 @@ Errors: TypeAlias = Mapping[str, float]
 
 def errors_of(kind: str, mmhg: float, pressure_mmHg: float) -> dict[str, float]:
     """Errors of only one of `KINDS`, with a size under a pressure."""
-    relative = mmhg / pressure_mmHg if kind == "factor" else 0.0
-    return {"factor": relative} | {k: mmhg * (k == kind) for k in ("offset", "each")}
+    return dict.fromkeys(KINDS, 0.0) | {kind: mmhg / pressure_mmHg if kind == "factor" else mmhg}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,11 +33,10 @@ from mvest.personalisation.geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.model import CaseClosure
+from mvest.personalisation.model import CaseClosure, contact_annulus
 from mvest.personalisation.sources import ClosedValve, geometry_sources, sample_frames
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.problem.verdict import CHECKS
-from mvest.valve.anatomy.band import Band
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 from tests.made_up_closure import (
@@ -434,10 +433,8 @@ def test_samples_of_frames_move_the_valve_as_a_displaced_geometry_does(monkeypat
     found = sample_frames(case, ClosedValve(registered, AT, registered(AT).y))
     np.testing.assert_array_equal(used[0][1], tips[None, 1])
     geometry = RestGeometry(model)
-    band, rest = Band(valve), surface.vertices[valve.annulus]
-    phi = 360.0 * np.arange(len(model.contact_valve.annulus)) / len(model.contact_valve.annulus)
-    moved = band.annulus_positions(phi, rest + closed[valve.annulus])
-    annulus = moved - band.annulus_positions(phi, rest)
+    rest = surface.vertices[valve.annulus]
+    annulus = contact_annulus(model, rest + closed[valve.annulus]) - contact_annulus(model, rest)
     parts = {"shape": shape_, "annulus": annulus, "tips": tips[1]}
     variation = geometry.variation({name: part[None] for name, part in parts.items()})
     expected = geometry.change(AT, variation)[1, ..., 0]
