@@ -11,7 +11,7 @@ from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.problem.fields import case_fields
 from mvest.problem.record import EstimateRecord
-from mvest.problem.verdict import ONE_STATE
+from mvest.problem.verdict import NONE, ONE_STATE
 from tests.made_up_closure import TISSUE, made_up_case, settings, unknowns, use
 
 
@@ -114,6 +114,8 @@ def test_a_failed_estimation_has_a_record_too():
     assert record.unknowns[0].prior_mean == 6.23
     assert not record.alternatives["moduli_only"].converged
     assert not {"narrower", "errors", "known"} & set(record.details)
+    assert record.verdict.trust == NONE
+    assert record.reason in record.verdict.failed_checks[0].text
     assert arrays_of_case(fit) == {}
 
 
