@@ -296,14 +296,9 @@ def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
         return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, frame][:, chordae.tip])
 
     rest_lengths = rest_lengths_by_ends(case, from_tips(opened), from_tips(closed))
-    variation = RestVariation.summed(
-        [
-            geometry.shape(moves[:, opened]),
-            geometry.annulus(np.stack(moved) - still),
-            geometry.tips(tips[:, closed], rest_lengths),
-        ]
-    )
-    change = geometry.change(at, variation, states, TOLERANCE)
+    shape, annulus = geometry.shape(moves[:, opened]), geometry.annulus(np.stack(moved) - still)
+    parts = [shape, annulus, geometry.tips(tips[:, closed], rest_lengths)]
+    change = geometry.change(at, RestVariation.summed(parts), states, TOLERANCE)
     if isinstance(change, str):
         return change
     return FrameSamples(np.moveaxis(change[-1], -1, 0), moves[:, closed], moves[:, opened])
