@@ -68,12 +68,8 @@ SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
 ERRORS_MMHG = (0.0, 2.0, 5.0, 10.0, 20.0)
 """Errors of pressures that designs are compared for."""
 
-KINDS = {
-    "factor": "as a factor on all",
-    "offset": "as an offset of all",
-    "each": "of each by itself",
-}
-"""Kinds of errors of pressures, and their descriptions."""
+KINDS = ("factor", "offset", "each")
+"""Kinds of errors of pressures: a factor on all, an offset of all, and of each by itself."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "the pressures": (SCALE, OFFSET, ERROR),
@@ -89,8 +85,7 @@ Errors: TypeAlias = Mapping[str, float]
 
 def errors_of(kind: str, mmhg: float, pressure_mmHg: float) -> dict[str, float]:
     """Errors of only one of `KINDS`, with a size under a pressure."""
-    relative = mmhg / pressure_mmHg if kind == "factor" else 0.0
-    return {"factor": relative} | {k: mmhg * (k == kind) for k in ("offset", "each")}
+    return dict.fromkeys(KINDS, 0.0) | {kind: mmhg / pressure_mmHg if kind == "factor" else mmhg}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,16 +193,10 @@ def design_case(
     model = build_model(case, settings) if model is None else model
     closed = case.frame(Role.CLOSED)
     pressures = tuple(share * closed.pressure_mmHg for share in SHARES)
-    frames = [
-        replace(
-            closed,
-            name=str(k),
-            time=closed.time + k,
-            role=Role.FITTED if k else Role.CLOSED,
-            pressure_mmHg=pressure,
-        )
-        for k, pressure in enumerate(pressures)
-    ]
+    frames = [replace(closed, name="0")]
+    for k, p in enumerate(pressures[1:], start=1):
+        time, role = closed.time + k, Role.FITTED
+        frames.append(replace(closed, name=str(k), time=time, role=role, pressure_mmHg=p))
     case = replace(case, frames=(case.frame(Role.REFERENCE), *frames), error_samples=None)
     stated = settings.pressures or PressureErrors(0.0, 0.0)
     # Errors of pressures are unknowns for their derivatives; the designs set their size.
@@ -235,14 +224,6 @@ def design_case(
     of_frame = np.repeat([int(frame.name) for frame in problem.fitted.frames], observation.sizes)
     white = [noise.whiten(np.where(of_frame[:, None] == k, H, 0.0)) for k in range(len(frames))]
     triangles = np.stack([np.linalg.qr(own, mode="r") for own in white])
-    return FrameDesigns(
-        pressures,
-        (*problem.names, *modes),
-        triangles,
-        knowledge,
-        {
-            "factor": knowledge.get(SCALE, 0.0),
-            "offset": stated.offset_mmHg,
-            "each": stated.each_mmHg,
-        },
-    )
+    factor = knowledge.get(SCALE, 0.0)
+    sizes = {"factor": factor, "offset": stated.offset_mmHg, "each": stated.each_mmHg}
+    return FrameDesigns(pressures, (*problem.names, *modes), triangles, knowledge, sizes)

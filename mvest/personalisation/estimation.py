@@ -208,18 +208,9 @@ class CaseProblem:
         self, point: LinearisationPoint, filter_: Filter, observation: Observed
     ) -> StudyResult:
         """All unknowns by one run of a filter, with the closure and the errors of a point."""
-        return self._estimated(
-            point,
-            Problem(
-                self.names,
-                point.closure.shared,
-                self.prior,
-                filter_,
-                self.transform,
-                self.settings.mechanics.tissue,
-            ),
-            observation,
-        )
+        model, tissue = point.closure.shared, self.settings.mechanics.tissue
+        whole = Problem(self.names, model, self.prior, filter_, self.transform, tissue)
+        return self._estimated(point, whole, observation)
 
     def alternatives(self, point: LinearisationPoint) -> dict[str, StudyResult]:
         """The moduli alone: all else at its prior mean, with geometry and law known exactly.
@@ -232,14 +223,9 @@ class CaseProblem:
         stiffens = [u.name.startswith(STIFFENS) for u in self.unknowns]
         known = np.where(stiffens, 0.0, shared.start)
         prior = Gaussian(self.prior.mean[moduli], self.prior.covariance[np.ix_(moduli, moduli)])
-        plain = Problem(
-            tuple(self.names[k] for k in moduli),
-            of_some(shared, known, moduli, snap=1e-14),
-            prior,
-            self.filter(settings.tolerance),
-            Log(),
-            settings.mechanics.tissue,
-        )
+        names, filter_ = tuple(self.names[k] for k in moduli), self.filter(settings.tolerance)
+        model, tissue = of_some(shared, known, moduli, snap=1e-14), settings.mechanics.tissue
+        plain = Problem(names, model, prior, filter_, Log(), tissue)
         if settings.moduli_only:
             found["moduli_only"] = self._estimated(point, plain, point.errors.observation())
         if (paper := settings.paper) is not None:

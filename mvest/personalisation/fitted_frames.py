@@ -21,7 +21,7 @@ from mvest.observation.surfaces import (
 )
 from mvest.observation.vertices import Observation
 from mvest.personalisation.settings import PaperSettings, PersonaliseSettings
-from mvest.typing import BoolArray, IntArray
+from mvest.typing import BoolArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.triangles import directed_edges
 
@@ -126,8 +126,12 @@ class FittedFrames:
 
     def _points(self, name: str, frame: Frame) -> ObservedSurface:
         """The compared points of a frame without correspondence."""
-        uncertainty, region = self.case.uncertainty, _vertex_region(frame)
-        border, some = BORDER * uncertainty.typical_mm, _thinned(len(frame.vertices))
+        n, uncertainty = len(frame.vertices), self.case.uncertainty
+        low, high = np.full(n, np.iinfo(np.int64).max), np.full(n, -1)
+        np.minimum.at(low, frame.triangles.ravel(), np.repeat(frame.region, 3))
+        np.maximum.at(high, frame.triangles.ravel(), np.repeat(frame.region, 3))
+        region = np.where(low == high, low, UNKNOWN)
+        border, some = BORDER * uncertainty.typical_mm, _thinned(n)
         points = ObservedSurface(name, frame.vertices[some], region[some], frame.free_edge)
         if self.settings.errors is not None or uncertainty.correlation_length_mm > 0:
             # Beyond its border the surface is extended, but does not bend as the leaflet does.
@@ -146,12 +150,3 @@ def _thinned(n: int) -> BoolArray:
     some = np.zeros(n, dtype=np.bool_)
     some[:: -(-n // MAX_VERTICES)] = True
     return some
-
-
-def _vertex_region(frame: Frame) -> IntArray:
-    """The leaflet of each vertex of a frame ``(q,)``, ``UNKNOWN`` on the line between two."""
-    n = len(frame.vertices)
-    low, high = np.full(n, np.iinfo(np.int64).max), np.full(n, -1)
-    np.minimum.at(low, frame.triangles.ravel(), np.repeat(frame.region, 3))
-    np.maximum.at(high, frame.triangles.ravel(), np.repeat(frame.region, 3))
-    return np.where(low == high, low, UNKNOWN)

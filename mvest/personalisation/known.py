@@ -269,12 +269,9 @@ def narrower(problem: CaseProblem, model: LinearModel) -> Iterator[Row]:
     then[EXACTLY] = std(exact, np.inf if has_floor else BEATS)
     for what, stds in then.items():
         for k in model.moduli:
-            yield {
-                "what": f"{label_of(model.names[k])}, {what}",
-                "parameter": model.names[k],
-                "std_now": float(now[k]),
-                "std_if_known": float(stds[k]),
-            }
+            name = model.names[k]
+            row = {"what": f"{label_of(name)}, {what}", "parameter": name}
+            yield {**row, "std_now": float(now[k]), "std_if_known": float(stds[k])}
 
 
 def _measurable(problem: CaseProblem, model: LinearModel) -> Iterator[tuple[str, dict[str, float]]]:
@@ -393,14 +390,10 @@ def strains(problem: CaseProblem, estimate: CaseEstimate, model: LinearModel) ->
     reach = 100.0 * REACH * np.sqrt(model.variance_of(slopes_))
     for r, region in enumerate(surface.region_names):
         for d, way in enumerate(("along its fibres", "across its fibres")):
-            yield {
-                "name": f"strain of the {region} leaflet {way}",
-                "unit": "%",
-                "estimate": float(values[r, d]),
-                "low": float(values[r, d] - reach[r, d]),
-                "high": float(values[r, d] + reach[r, d]),
-                "generic": None,
-            }
+            mean, half = float(values[r, d]), float(reach[r, d])
+            about = {"name": f"strain of the {region} leaflet {way}", "unit": "%"}
+            ends = {"estimate": mean, "low": mean - half, "high": mean + half}
+            yield {**about, **ends, "generic": None}
 
 
 def geometry_shifts(problem: CaseProblem, estimate: CaseEstimate) -> Iterator[Row]:

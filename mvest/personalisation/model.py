@@ -36,12 +36,18 @@ def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> Personalis
     return replace(settings, unknowns=(*own, *settings.pressures.unknowns(frames)))
 
 
+def contact_annulus(model: ClosureModel, annulus: FloatArray) -> FloatArray:
+    """Annulus of the contact valve ``(k, 3)`` mm from that of the observed valve ``(n, 3)``."""
+    contact = model.contact_valve
+    if contact is model.valve:
+        return annulus
+    phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
+    return Band(model.valve).annulus_positions(phi, annulus)
+
+
 def held_state(model: ClosureModel, frame: Frame) -> HeldState:
-    """The loads of a further frame, on the contact valve's annulus."""
-    contact, annulus = model.contact_valve, frame.annulus
-    if contact is not model.valve:
-        phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
-        annulus = Band(model.valve).annulus_positions(phi, frame.annulus)
+    """The loads of a further frame."""
+    annulus = contact_annulus(model, frame.annulus)
     return HeldState(frame.pressure_mmHg, annulus, frame.papillary_tips)
 
 

@@ -114,27 +114,18 @@ def _details(fit: Personalised) -> dict[str, tuple[Row, ...]]:
     """Name -> rows, as far as `Personalised.details` lacks them."""
     case, filtered = fit.case, fit.result.filtered
     check = None if filtered is None else filtered.check
-    about = {
-        "description": case.description,
-        "source": case.source,
-        "licence": case.licence,
-        "sha256": case.sha256,
+    about: dict[str, Any] = {
+        **{name: getattr(case, name) for name in ("description", "source", "licence", "sha256")},
         "regions": list(case.surface.region_names),
         "derived": list(case.derived),
         "implausible": list(map(str, implausible_values(case))),
-        "confirmed_mm": fit.confirmed_mm,
-        "law_share": fit.law_share,
-        "error_samples": fit.error_samples,
+        **{name: getattr(fit, name) for name in ("confirmed_mm", "law_share", "error_samples")},
     }
-    checked = check and {
-        "compared": check.compared,
-        "value": finite(check.value),
-        "limit": check.limit,
-    }
+    checked = check and {name: getattr(check, name) for name in ("compared", "value", "limit")}
     return {
         "about": (about,),
         "settings": tuple(_settings("", asdict(fit.settings))),
-        "check": (checked,) if checked else (),
+        "check": (checked | {"value": finite(checked["value"])},) if checked else (),
         "errors": tuple(_errors(fit.result)),
         "measurements": tuple(_measurements(fit)),
     }

@@ -30,10 +30,10 @@ from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import Simulation
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalisation.geometry import GeometryModes, rest_lengths_by_ends
+from mvest.personalisation.model import contact_annulus
 from mvest.problem.estimate import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.band import Band
 from mvest.valve.geometry.proximity import closest_points
 
 LAW, MESH = "law", "mesh"
@@ -286,13 +286,9 @@ def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
     roles = [frame.role for frame in case.frames]
     opened, closed = (roles.index(role) for role in (Role.REFERENCE, Role.CLOSED))
     moves, tips = samples.vertices, samples.tips
-    annulus = moves[:, closed][:, case.annulus]
-    if model.contact_valve is not model.valve:
-        band, rest = Band(model.valve), model.valve.surface.vertices[model.valve.annulus]
-        count = len(model.contact_valve.annulus)
-        phi = 360.0 * np.arange(count) / count
-        still = band.annulus_positions(phi, rest)
-        annulus = np.stack([band.annulus_positions(phi, rest + own) - still for own in annulus])
+    rest = model.valve.surface.vertices[model.valve.annulus]
+    still = contact_annulus(model, rest)
+    moved = [contact_annulus(model, rest + own) for own in moves[:, closed][:, case.annulus]]
     place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
 
     def from_tips(frame: int) -> FloatArray:
@@ -300,14 +296,9 @@ def sample_frames(case: ValveCase, valve: ClosedValve) -> FrameSamples | str:
         return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, frame][:, chordae.tip])
 
     rest_lengths = rest_lengths_by_ends(case, from_tips(opened), from_tips(closed))
-    variation = RestVariation.summed(
-        [
-            geometry.shape(moves[:, opened]),
-            geometry.annulus(annulus),
-            geometry.tips(tips[:, closed], rest_lengths),
-        ]
-    )
-    change = geometry.change(at, variation, states, TOLERANCE)
+    shape, annulus = geometry.shape(moves[:, opened]), geometry.annulus(np.stack(moved) - still)
+    parts = [shape, annulus, geometry.tips(tips[:, closed], rest_lengths)]
+    change = geometry.change(at, RestVariation.summed(parts), states, TOLERANCE)
     if isinstance(change, str):
         return change
     return FrameSamples(np.moveaxis(change[-1], -1, 0), moves[:, closed], moves[:, opened])

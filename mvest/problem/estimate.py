@@ -249,11 +249,11 @@ def estimate(
             names=problem.parameters,
         )
     return StudyResult(
-        parameters=problem.parameters,
-        tissue=problem.tissue,
-        observation=observation,
-        filtered=filtered,
-        identifiability=bound,
+        problem.parameters,
+        problem.tissue,
+        observation,
+        filtered,
+        bound,
         reason=filtered.why,
         detail=filtered.detail,
         converged=filtered.converged,

@@ -277,18 +277,12 @@ class EstimateRecord(Frozen):
             return {f"{name}_{k}": v for k, v in part or ()}
 
         whole = {
-            "case": self.case,
-            "seed": self.seed,
-            "simulated": self.simulated,
-            "status": self.status,
-            "reason": self.reason,
+            **{k: getattr(self, k) for k in ("case", "seed", "simulated", "status", "reason")},
             "verdict": None if self.verdict is None else self.verdict.trust,
             **columns("distance", self.distance_mm),
             **columns("distance_to_truth", self.distance_to_truth_mm),
             "nis": None if self.innovation is None else self.innovation.nis,
-            "iterations": self.iterations,
-            "forward_solves": self.forward_solves,
-            "seconds": self.seconds,
+            **{k: getattr(self, k) for k in ("iterations", "forward_solves", "seconds")},
         }
         rows = [
             {

@@ -91,15 +91,6 @@ def test_the_pattern_is_that_of_the_last_surface(smooth):
     assert (_alike(seen, values) > 0.3) == (smooth == 1)
 
 
-def test_without_an_estimate_there_is_its_reason(monkeypatch):
-    use(monkeypatch, fails_above=1.0)
-    found = personalise(made_up_case(0.3), settings())
-    seen = diagnostics_of(found)
-    ((_, words),) = seen["failed"]
-    assert found.result.reason in words["what"]
-    assert judge(seen).trust == NONE
-
-
 @pytest.mark.parametrize(("times", "doubtful"), [(3.0, True), (1.9, False)])
 def test_a_posterior_that_the_filter_misses_is_doubtful(times, doubtful):
     # The check is of the worst direction among all unknowns, so twice its limit is admitted.

@@ -1,28 +1,20 @@
 """Uncertain geometry: modes, columns of an observation, and wider intervals."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import ClassVar
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from mvest.cases.case import Role
 from mvest.cases.tissue import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
-from mvest.errors import GeometryError, InputError
-from mvest.estimation.gaussian import Gaussian
+from mvest.errors import InputError
 from mvest.estimation.noise import observation_noise
-from mvest.estimation.prediction import Prediction
-from mvest.estimation.transform import Log, to_filter
-from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import estimation, personalise
-from mvest.personalisation.chain import predicted_frames
-from mvest.personalisation.estimation import SETTLED, CaseProblem, linearised
+from mvest.personalisation import personalise
 from mvest.personalisation.geometry import (
     GeometryModes,
     NuisanceGeometry,
@@ -33,23 +25,16 @@ from mvest.personalisation.geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalisation.model import CaseClosure
+from mvest.personalisation.model import CaseClosure, contact_annulus
 from mvest.personalisation.sources import ClosedValve, geometry_sources, sample_frames
-from mvest.problem.registration import REGISTRATION, RegisteredModel
-from mvest.problem.verdict import CHECKS
-from mvest.valve.anatomy.band import Band
+from mvest.problem.registration import RegisteredModel
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 from tests.made_up_closure import (
     FIELDS,
-    PRIORS,
-    TRUE,
-    MadeUpClosure,
     error_source,
     made_up_case,
     settings,
-    shape,
-    unknowns,
     use,
 )
 
@@ -240,138 +225,6 @@ def test_uncertain_geometry_widens_the_intervals(monkeypatch):
     np.testing.assert_allclose(where[0], known.result.estimate, rtol=0.05, atol=0.2)
 
 
-BENT, CURVED = FIELDS["loose"].ravel(), FIELDS["E_f.anterior"].ravel()
-"""Effect of the one mode on the closed valve (mm), and of its square: like another modulus."""
-
-
-class BentGeometry:
-    """Stands for a `RestGeometry`."""
-
-    curve: ClassVar[float] = 1.0
-
-    def __init__(self, model):
-        self.model = model
-
-    def displaced(self, parts):
-        (bend,) = parts["shape"]
-        return BentClosure(self.model.names, self.model.fixed, bend=bend)
-
-
-def bent(x, bend):
-    """A closed valve ``(3 n,)`` that is displaced by the one mode."""
-    return x + BENT * bend + BentGeometry.curve * CURVED * bend**2
-
-
-@dataclass(eq=False)
-class BentClosure(MadeUpClosure):
-    """The formula for a valve that is displaced by one mode."""
-
-    bend: float = 0.0
-
-    def __call__(self, m):
-        plain = super().__call__(m)
-        if not plain.converged:
-            return plain
-        rest, closed = np.split(plain.y, 2)
-        return replace(plain, y=np.concatenate([rest, bent(closed, self.bend)]))
-
-
-def bent_case(monkeypatch, curve, std=0.5):
-    """A case whose valve is displaced by 0.6 of the one mode, and its nuisances, all known."""
-    use(monkeypatch)
-    monkeypatch.setattr(BentGeometry, "curve", curve)
-
-    def sources(modes, valve, observation, noise, seen):
-        bend = getattr(valve.registered.model, "bend", 0.0)
-        slope = (BENT + 2.0 * curve * bend * CURVED)[:, None]
-        return (error_source(slope, MODE),)
-
-    monkeypatch.setattr("mvest.personalisation.errors.geometry_sources", sources)
-    monkeypatch.setattr("mvest.personalisation.model.RestGeometry", BentGeometry)
-    straight = made_up_case(std, displaced=False)
-    closed = straight.frame(Role.CLOSED)
-    frame = replace(closed, vertices=bent(closed.vertices.ravel(), 0.6).reshape(-1, 3))
-    known = {name: value for name, value in TRUE.items() if not name.startswith("E_f.")}
-    known |= dict.fromkeys(REGISTRATION, 0.0)
-    frames = tuple(frame if f is closed else f for f in straight.frames)
-    return replace(straight, frames=frames), known
-
-
-def renewed(case, known, renewals, **changes):
-    geometry = NuisanceGeometry(renewals=renewals)
-    given = unknowns(fixed=True, **known)
-    return personalise(case, settings(*given, nuisance_geometry=geometry, **changes))
-
-
-@pytest.fixture
-def steps(monkeypatch):
-    """The steps of relinearisation: problem, estimate, point and what was found."""
-    taken, nearer = [], estimation._nearer
-
-    def followed(problem, result, point):
-        taken.append((problem, result, point, nearer(problem, result, point)))
-        return taken[-1][-1]
-
-    monkeypatch.setattr(estimation, "_nearer", followed)
-    return taken
-
-
-@pytest.mark.parametrize("curve", [1.0, 6.0, 100.0])
-def test_relinearisation_ends_at_the_joint_mode_of_moduli_and_geometry(monkeypatch, steps, curve):
-    case, known = bent_case(monkeypatch, curve)
-    seen = case.frame(Role.CLOSED).vertices.ravel()
-    log = [to_filter(Log(), Gaussian.from_variance([m], s**2))
-           for m, s in (PRIORS[name] for name in MODULI)]  # fmt: skip
-
-    def objective(z):
-        x = shape(known | dict(zip(MODULI, np.exp(z[:2]), strict=True))).ravel()
-        prior = [(z[k] - log[k].mean[0]) / log[k].std[0] for k in range(2)]
-        return np.concatenate([(bent(x, z[2]) - seen) / 0.5, prior, z[2:]])
-
-    mode = least_squares(objective, [1.5, 1.0, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
-
-    def misfit(point):
-        bend = point.errors.displaced_by or np.zeros((1, 1))
-        return np.sum(objective([*np.log(point.m), bend[0][0]]) ** 2)
-
-    errors = []
-    for renewals in (0, 1, 2, 12):
-        steps.clear()
-        fit = renewed(case, known, renewals, tolerance=1e-9)
-        assert (len(steps) == 0) == (renewals == 0) == (fit.moved is None)
-        for _, _, before, after in steps:
-            assert misfit(after) < misfit(before)
-        errors.append(np.abs(np.log(fit.result.estimate) - mode[:2]).max())
-    assert errors[0] > 0.05
-    # Estimates of the steps are rough, so the end is not the mode to the last digit.
-    assert max(errors[2:]) < max(errors[1], 1e-3) < errors[0]
-    assert errors[3] < 0.1 * fit.result.filtered.transformed.std.max()
-    if curve < 100.0:
-        assert fit.moved < SETTLED
-    else:
-        # Twelve steps do not reach the end of such a valley, although the estimate is there.
-        assert fit.moved > CHECKS["moved"].limits[0]
-
-
-def test_a_point_at_the_mode_leaves_nothing_unaccounted(monkeypatch, steps):
-    case, known = bent_case(monkeypatch, curve=0.0)
-    monkeypatch.setattr(estimation, "ROUGH", 0.0)
-    fit = renewed(case, known, 6, tolerance=1e-9)
-    # In a straight valley the first step is the last.
-    ((problem, before, first, last),) = steps
-    last = linearised(last, problem)
-    assert fit.moved < 1e-4
-    assert fit.unaccounted == ()
-    # As if nothing else were better: the last point is the mode, the first one is not.
-    for result, point, expected in (
-        (fit.result, last, last),
-        (before, first, "no step towards it fits the observation better"),
-    ):
-        monkeypatch.setattr(estimation, "_displaced", lambda *_: (np.inf, None))
-        found = estimation._nearer(problem, result, point)
-        assert found is expected or found == expected
-
-
 def test_all_closed_frames_are_displaced_as_their_derivatives_say():
     model = model_of(GENTLE, **SMALL)
     motion = model.contact_valve.motion
@@ -434,10 +287,8 @@ def test_samples_of_frames_move_the_valve_as_a_displaced_geometry_does(monkeypat
     found = sample_frames(case, ClosedValve(registered, AT, registered(AT).y))
     np.testing.assert_array_equal(used[0][1], tips[None, 1])
     geometry = RestGeometry(model)
-    band, rest = Band(valve), surface.vertices[valve.annulus]
-    phi = 360.0 * np.arange(len(model.contact_valve.annulus)) / len(model.contact_valve.annulus)
-    moved = band.annulus_positions(phi, rest + closed[valve.annulus])
-    annulus = moved - band.annulus_positions(phi, rest)
+    rest = surface.vertices[valve.annulus]
+    annulus = contact_annulus(model, rest + closed[valve.annulus]) - contact_annulus(model, rest)
     parts = {"shape": shape_, "annulus": annulus, "tips": tips[1]}
     variation = geometry.variation({name: part[None] for name, part in parts.items()})
     expected = geometry.change(AT, variation)[1, ..., 0]
@@ -445,60 +296,6 @@ def test_samples_of_frames_move_the_valve_as_a_displaced_geometry_does(monkeypat
     np.testing.assert_allclose(found.predicted[0], expected, atol=1e-3 * np.abs(expected).max())
     np.testing.assert_array_equal(found.seen[0], closed)
     np.testing.assert_array_equal(found.opened[0], shape_)
-
-
-def test_held_out_frames_have_the_displaced_boundary(monkeypatch):
-    case, known = bent_case(monkeypatch, curve=1.0)
-    closed = case.frame(Role.CLOSED)
-    later = replace(closed, name="later", time=1.0, role=Role.HELD_OUT)
-    case = replace(case, frames=(*case.frames, later))
-    parts = {"annulus": np.full(closed.annulus.shape, 0.3), "tips": np.full((1, 3), -0.4)}
-    problem = CaseProblem.of(case, settings(*unknowns(fixed=True, **known)))
-    stated = problem.generic()
-    off = replace(stated, closure=replace(stated.closure, displacement=parts))
-    predicted_frames(problem, off, off.m, off.prediction.y)
-    held = problem.stated.model.states[-1]
-    np.testing.assert_allclose(held.annulus, closed.annulus + 0.3)
-    np.testing.assert_allclose(held.papillary_tips, closed.papillary_tips - 0.4)
-    assert held.pressure_mmHg == closed.pressure_mmHg
-
-
-@dataclass(eq=False)
-class OnceClosed(BentClosure):
-    """Closes once, and then no more."""
-
-    def __call__(self, m):
-        return Prediction.failed("stuck") if len(self.calls) > 1 else super().__call__(m)
-
-
-@pytest.mark.parametrize("why", ["no equilibrium", "thickness is -0.1 mm, expected > 0", "stuck"])
-def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_its_reason(monkeypatch, why):
-    case, known = bent_case(monkeypatch, curve=1.0)
-
-    def displaced(self, parts):
-        if why.startswith("thickness"):
-            raise GeometryError(why)
-        kind = OnceClosed if why == "stuck" else BentClosure
-        limit = 0.0 if why == "no equilibrium" else np.inf
-        (bend,) = parts["shape"]
-        return kind(self.model.names, self.model.fixed, bend=bend, fails_above=limit)
-
-    monkeypatch.setattr(BentGeometry, "displaced", displaced)
-    plain, failed = (renewed(case, known, renewals) for renewals in (0, 2))
-    np.testing.assert_array_equal(failed.result.estimate, plain.result.estimate)
-    assert failed.moved is None
-    (reason,) = failed.unaccounted
-    assert reason.startswith("about the expected geometry: ")
-    assert why in reason
-
-
-def test_other_unaccounted_errors_do_not_stop_relinearisation(monkeypatch):
-    case, known = bent_case(monkeypatch, curve=1.0)
-    monkeypatch.setattr("mvest.personalisation.errors.law_and_mesh_sources", lambda *_: "no law")
-    law = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
-    fit = renewed(case, known, 2, nuisance_law=law)
-    assert fit.unaccounted == ("no law",)
-    assert fit.moved < SETTLED
 
 
 @pytest.mark.parametrize(

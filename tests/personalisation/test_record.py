@@ -1,6 +1,7 @@
 """The record of a personalised case: unknowns, frames, errors, and its arrays."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +11,14 @@ from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, record_of_case
 from mvest.problem.fields import case_fields
 from mvest.problem.record import EstimateRecord
-from mvest.problem.verdict import ONE_STATE
+from mvest.problem.verdict import NONE, ONE_STATE
 from tests.made_up_closure import TISSUE, made_up_case, settings, unknowns, use
 
 
-def personalised(*given, fails_above=np.inf, corresponds=True, **changes):
+def personalised(*given, fails_above=np.inf, **changes):
     with pytest.MonkeyPatch.context() as patch:
         use(patch, fails_above=fails_above)
-        case = made_up_case(0.3, 8.0, np.random.default_rng(1), corresponds=corresponds)
+        case = made_up_case(0.3, 8.0, np.random.default_rng(1))
         return personalise(case, settings(*given, **changes))
 
 
@@ -113,12 +114,15 @@ def test_a_failed_estimation_has_a_record_too():
     assert record.unknowns[0].prior_mean == 6.23
     assert not record.alternatives["moduli_only"].converged
     assert not {"narrower", "errors", "known"} & set(record.details)
+    assert record.verdict.trust == NONE
+    assert record.reason in record.verdict.failed_checks[0].text
     assert arrays_of_case(fit) == {}
 
 
 @pytest.mark.parametrize("corresponds", [True, False])
 def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
-    fit = fit if corresponds else personalised(*unknowns(fixed=True), corresponds=False)
+    frames = [replace(o, frame=replace(o.frame, corresponds=corresponds)) for o in fit.frames]
+    fit = replace(fit, frames=tuple(frames))
     arrays = arrays_of_case(fit)
     # Studies compare all three closed valves with the truth.
     assert {"generic", "registered", "fitted"} <= arrays.keys()
