@@ -30,9 +30,8 @@ Importers recognise leaflets by words in names, upper or lower case: `anterior`,
 """
 FOOT = """
 [SlicerHeart folders](slicer.md) and [FEBio](febio.md) have pages of their own. If a file does not
-state something (units, times, which leaflet is which), an error of one line asks for it. Files are
-read by a child process with limited memory and time. This page is written by `python -m
-tests.exchange.variants`.
+state something (units, times, which leaflet is which), an error of one line asks for it. This page
+is written by `python -m tests.exchange.variants`.
 """
 
 
